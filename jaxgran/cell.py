@@ -1,0 +1,48 @@
+"""The sheared periodic cell (Lees–Edwards): a square of side L whose image rows slide along x.
+
+The lattice vectors are (L, 0) and (tilt·L, L), with the tilt in [−½, ½): shearing by a whole period gives the
+same lattice, so the tilt is only ever known up to an integer. Velocities are peculiar (SLLOD): the same for all
+images of a grain; the image's velocity jump enters through γ̇·y of the separation.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
+    """Side L of the square cell in which the discs have the given packing fraction."""
+    return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
+
+
+def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
+    """The same lattice with its tilt in [−½, ½)."""
+    return tilt - jnp.floor(tilt + 0.5)
+
+
+def displacement(to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array) -> Float[Array, "*n 2"]:
+    """Minimum-image separation ``to − origin``; exact for separations shorter than half the side."""
+    d = to - origin
+    rows = jnp.round(d[..., 1] / side)
+    x = d[..., 0] - rows * tilt * side
+    return jnp.stack([x - side * jnp.round(x / side), d[..., 1] - rows * side], axis=-1)
+
+
+def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
+    """The images of the positions with x and y in [0, L)."""
+    rows = jnp.floor(positions[:, 1] / side)
+    x = positions[:, 0] - rows * tilt * side
+    wrapped = jnp.stack([x - side * jnp.floor(x / side), positions[:, 1] - rows * side], axis=-1)
+    return jnp.where(wrapped >= side, 0, wrapped)  # a tiny negative number plus L rounds to L
+
+
+def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:
+    """The vectors with strain·y added to x."""
+    return vectors + strain * vectors[..., ::-1] * jnp.asarray([1, 0], vectors.dtype)
+
+
+def relative_velocity(
+    velocities: Float[Array, "grains 2"], i: Array, j: Array, separations: Float[Array, "pairs 2"], shear_rate: Array
+) -> Float[Array, "pairs 2"]:
+    """Relative velocity of grain i seen from (the image of) grain j in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
+    shear = separations[:, ::-1] * jnp.asarray([1, 0], separations.dtype)
+    return velocities[i] - velocities[j] + shear_rate * shear

@@ -1,0 +1,107 @@
+"""ShearFlow: the parameters of one simple shear flow, with their units and accepted ranges."""
+
+from dataclasses import dataclass, field, fields
+from typing import Literal, get_args
+
+import jax
+import numpy as np
+
+Activation = Literal["midpoint", "touching"]
+Solver = Literal["nesterov", "jacobi"]
+
+MAX_PACKING_FRACTION = 0.83
+MIN_GRAINS = 16
+
+
+def _static(**kwargs):
+    return field(metadata={"static": True}, **kwargs)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ShearFlow:
+    """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
+
+    Units: length in mean grain diameters σ, mass in masses m of a grain of diameter σ. ``grains``,
+    ``activation`` and ``solver`` are static; all else is traced, so that a change recompiles nothing and a
+    batch of flows is one ``ShearFlow`` whose numbers carry a leading ``(replicas,)`` axis.
+
+    ================  =================  ===============================================================
+    field             unit               meaning
+    ================  =================  ===============================================================
+    grains            –                  number of discs N, at least 16
+    restitution       –                  α in [0, 1], ratio of normal velocities after and before
+    packing_fraction  –                  ν in (0, 0.83], area of the grains over the area of the cell
+    timestep          1/shear_rate = 1   dt, at most 0.1
+    shear_rate        1/time             γ̇ > 0
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ
+    tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
+    max_iterations    –                  cap of one contact solve
+    activation        –                  "midpoint": contact if half a step of free flight overlaps;
+                                         "touching": contact if the grains overlap
+    solver            –                  "nesterov" or "jacobi", both with the spectral bound
+    ================  =================  ===============================================================
+
+    Raises:
+      ValueError: a number is outside the range above (checked where it is known, that is outside ``jit``).
+    """
+
+    grains: int = _static()
+    restitution: float | jax.Array
+    packing_fraction: float | jax.Array
+    timestep: float | jax.Array
+    shear_rate: float | jax.Array = 1.0
+    polydispersity: float | jax.Array = 0.26
+    tolerance: float | jax.Array = 1e-4
+    max_iterations: int | jax.Array = 5000
+    activation: Activation = _static(default="midpoint")
+    solver: Solver = _static(default="nesterov")
+
+    def __post_init__(self):
+        if not isinstance(self.grains, (int, np.integer)) or isinstance(self.grains, bool) or self.grains < MIN_GRAINS:
+            raise ValueError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
+        for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be {' or '.join(allowed)}, not {getattr(self, name)!r}.")
+        for name, (accepts, words) in _RANGES.items():
+            require(name, getattr(self, name), accepts, words)
+        step = _known(self.timestep), _known(self.shear_rate)
+        if None not in step and np.any(step[0] * step[1] > 0.1):
+            raise ValueError(f"timestep must be at most 0.1 / shear_rate, not {self.timestep!r}.")
+
+    @property
+    def activation_fraction(self) -> float:
+        """θ: the share of a step of free flight over which a pair must overlap to be a contact."""
+        return 0.5 if self.activation == "midpoint" else 0.0
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether the numbers of this flow carry a leading (replicas,) axis."""
+        return any(np.ndim(getattr(self, f.name)) > 0 for f in fields(self) if not f.metadata.get("static"))
+
+
+_RANGES = {
+    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+    "packing_fraction": (lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION), f"above 0 and at most {MAX_PACKING_FRACTION}"),
+    "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
+    "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
+    "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
+    "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
+    "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1), "a whole number of at least 1"),
+}
+
+
+def _known(value) -> np.ndarray | None:
+    """The value as an array of numbers, or None while it is only traced or a placeholder of a pytree."""
+    if isinstance(value, jax.core.Tracer) or not isinstance(value, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
+        return None
+    return np.asarray(value)
+
+
+def require(name: str, value, accepts, words: str) -> None:
+    """Raise a ValueError that says what is accepted, unless every known number of ``value`` is."""
+    known = _known(value)
+    if known is None:
+        return
+    if known.dtype.kind not in "iuf" or not np.all(accepts(known)):
+        raise ValueError(f"{name} must be {words}, not {value!r}.")

@@ -1,0 +1,15 @@
+"""What can go wrong in a replica, in order of severity: the worst wins."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Outcome of a replica; a larger value is worse. Compiled code carries it as an int32."""
+
+    ok = 0
+    iteration_limit = 1  # some solve ended above the tolerance
+    not_steady = 2  # stationarity was not established
+    deep_overlap = 3  # two grains overlapped by more than 1e-2 mean diameters
+    infeasible = 4  # no impulses satisfy the contact law: the packing is jammed
+    capacity = 5  # more pairs or contacts than the buffers hold
+    nonfinite = 6  # a position, velocity or impulse is not a finite number

@@ -1,0 +1,273 @@
+"""The figures show the map: contours where the excess has its level, error bars, marks, and whole files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib import _pylab_helpers, rcParams
+from matplotlib.container import ErrorbarContainer
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+
+from jaxgran.figures import EXCESS_LEVELS, ratio_contours, ratio_curves, save_figures
+
+FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
+RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
+
+
+def excess_of(restitution: np.ndarray, packing_fraction: np.ndarray) -> np.ndarray:
+    """Return a smooth excess whose isolines are straight: 1 − α + 2ν = constant."""
+    return 0.05 * np.exp(RATE * (1.0 - restitution + 2.0 * packing_fraction - 1.6))
+
+
+def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -> xr.Dataset:
+    """Return a synthetic map with the names and attributes of a measured one."""
+    alpha, nu = np.linspace(0.1, 0.9, alphas), np.linspace(0.3, 0.8, nus)
+    excess = excess_of(alpha[None, :], nu[:, None])
+    dims = ("packing_fraction", "restitution")
+    flags = {"flag_values": np.arange(7), "flag_meanings": FLAGS}
+    return xr.Dataset(
+        {
+            "force_ratio": (dims, 1.0 + excess),
+            "force_ratio_stderr": (dims, relative_error * excess),
+            "status": (dims, np.zeros(excess.shape, int), flags),
+        },
+        coords={"packing_fraction": nu, "restitution": alpha},
+        attrs={"timestep": 3e-4, "activation": "midpoint", "grains": 256, "seeds": 2, "strain": 5.0},
+    )
+
+
+def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
+    """Return the vertices (1 − α, ν) of every labelled contour, by the text of its label."""
+    sets = [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet)]
+    return {float(s.labelTexts[0].get_text()): s.get_paths()[0].vertices for s in sets if not s.filled}
+
+
+def bands_of_contours(figure: Figure) -> list[np.ndarray]:
+    """Return the vertices of every uncertainty band."""
+    sets = [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet)]
+    return [s.get_paths()[0].vertices for s in sets if s.filled and list(s.levels) == [-1.0, 1.0]]
+
+
+def error_bars(figure: Figure) -> list[np.ndarray]:
+    """Return the lower and upper ends of the error bars, an array (points, 2) for each curve."""
+    containers = [c for c in figure.axes[0].containers if isinstance(c, ErrorbarContainer)]
+    return [np.array([s[:, 1] for s in c.lines[2][0].get_segments() if len(s)]) for c in containers]
+
+
+def rings(figure: Figure) -> np.ndarray:
+    """Return the positions (points, 2) of the marks of bad status."""
+    marks = [line for line in figure.axes[0].lines if line.get_markersize() > 8]
+    return np.concatenate([np.empty((0, 2))] + [line.get_xydata() for line in marks])
+
+
+def legend_texts(figure: Figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def caption(figure: Figure) -> str:
+    return figure.get_supxlabel()
+
+
+def no_value(data: xr.Dataset, *points: tuple[int, int]) -> xr.Dataset:
+    """Return the map with missing values at points (packing fraction, restitution)."""
+    data = data.copy(deep=True)
+    for point in points:
+        data.force_ratio[point] = data.force_ratio_stderr[point] = np.nan
+        data.status[point] = 6
+    return data
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(5, 6), (10, 12), (2, 2)])
+def test_contours_lie_on_the_isolines(alphas: int, nus: int) -> None:
+    lines = lines_of_contours(ratio_contours(ratio_dataset(alphas, nus)))
+    assert set(lines) == set(EXCESS_LEVELS)
+    cell = 0.8 / (alphas - 1) + 2.0 * 0.5 / (nus - 1)  # change of 1 − α + 2ν across one cell
+    for level, vertices in lines.items():
+        assert len(vertices) > 1
+        error = np.log(excess_of(1.0 - vertices[:, 0], vertices[:, 1]) / level) / RATE
+        assert np.abs(error).max() < 0.1 * cell**2  # linear interpolation is of second order
+
+
+def test_contours_of_a_linear_contour_variable_are_exact() -> None:
+    data = ratio_dataset()
+    plane = 3.0 * (1.0 - data.restitution) + 9.0 * data.packing_fraction - 4.5
+    data["force_ratio"] = (1.0 + 0.01 * np.sinh(plane)).transpose("packing_fraction", "restitution")
+    for level, vertices in lines_of_contours(ratio_contours(data)).items():
+        values = 3.0 * vertices[:, 0] + 9.0 * vertices[:, 1] - 4.5
+        np.testing.assert_allclose(values, np.arcsinh(level / 0.01), atol=1e-9)
+
+
+def test_band_spans_one_standard_error() -> None:
+    relative_error = 0.2
+    figure = ratio_contours(ratio_dataset(10, 12, relative_error))
+    bands = bands_of_contours(figure)
+    assert len(bands) == len(EXCESS_LEVELS)
+    for level, vertices in zip(EXCESS_LEVELS, bands, strict=True):
+        ratio = excess_of(1.0 - vertices[:, 0], vertices[:, 1]) / level
+        assert ratio.min() == pytest.approx(1.0 / (1.0 + relative_error), rel=0.05)
+        assert ratio.max() == pytest.approx(1.0 / (1.0 - relative_error), rel=0.05)
+
+
+def test_contours_do_not_depend_on_the_order_of_the_grid() -> None:
+    data = ratio_dataset()
+    turned = data.isel(restitution=slice(None, None, -1)).transpose("restitution", "packing_fraction")
+    expected = lines_of_contours(ratio_contours(data))
+    for level, vertices in lines_of_contours(ratio_contours(turned)).items():
+        np.testing.assert_array_equal(vertices, expected[level])
+
+
+def test_negative_excess_from_noise_leaves_the_contours_whole() -> None:
+    data = ratio_dataset()
+    noise = 2e-3 * np.random.default_rng(0).normal(size=data.force_ratio.shape)
+    noisy = data.assign(force_ratio=data.force_ratio + noise - 1e-3)
+    assert (noisy.force_ratio < 1.0).any()
+    for level, vertices in lines_of_contours(ratio_contours(noisy)).items():
+        error = np.log(excess_of(1.0 - vertices[:, 0], vertices[:, 1]) / level) / RATE
+        assert np.abs(error).max() < 0.05
+
+
+def test_levels_not_reached_are_named() -> None:
+    data = ratio_dataset()
+    data["force_ratio"] = 1.0 + 0.1 * (data.force_ratio - 1.0) / (data.force_ratio.max() - 1.0) * 2.0
+    figure = ratio_contours(data)
+    assert set(lines_of_contours(figure)) == {0.05, 0.10}
+    assert "not reached: 0.25, 0.50, 1.00" in caption(figure)
+
+
+def test_error_bars_have_the_length_of_the_standard_error() -> None:
+    data = ratio_dataset()
+    bars = error_bars(ratio_curves(data))
+    assert len(bars) == data.sizes["restitution"]
+    for alpha, ends in zip(data.restitution, bars, strict=True):
+        curve = data.sel(restitution=alpha)
+        expected = curve.force_ratio.values[:, None] + curve.force_ratio_stderr.values[:, None] * [-1.0, 1.0]
+        np.testing.assert_allclose(ends, expected, rtol=1e-12)
+
+
+def test_curves_are_told_apart_without_colour() -> None:
+    lines = [c.lines[0] for c in ratio_curves(ratio_dataset(alphas=14)).axes[0].containers]
+    assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 14
+
+
+def test_ratio_axis_is_logarithmic_only_for_a_wide_range() -> None:
+    data = ratio_dataset()
+    assert ratio_curves(data).axes[0].get_yscale() == "log"
+    narrow = data.assign(force_ratio=1.0 + 0.01 * (data.force_ratio - 1.0))
+    assert ratio_curves(narrow).axes[0].get_yscale() == "linear"
+
+
+def test_points_of_bad_status_are_ringed_and_explained() -> None:
+    data = ratio_dataset()
+    data.status[5, 0], data.status[2, 3] = 1, 2
+    alpha, nu = data.restitution.values, data.packing_fraction.values
+    curves, contours = ratio_curves(data), ratio_contours(data)
+    expected = [[nu[5], data.force_ratio[5, 0]], [nu[2], data.force_ratio[2, 3]]]
+    np.testing.assert_allclose(rings(curves), expected)
+    np.testing.assert_allclose(rings(contours), [[1.0 - alpha[3], nu[2]], [1.0 - alpha[0], nu[5]]])
+    for figure in (curves, contours):
+        assert "status not ok" in legend_texts(figure)
+        assert "Status not ok: not steady (1), iteration limit (1)" in caption(figure)
+
+
+def test_no_mark_is_explained_where_all_is_well() -> None:
+    for figure in (ratio_curves(ratio_dataset()), ratio_contours(ratio_dataset())):
+        assert len(rings(figure)) == 0
+        assert not {"status not ok", "no value"} & set(legend_texts(figure))
+        assert "not ok" not in caption(figure)
+
+
+def test_missing_points_leave_the_rest() -> None:
+    data = no_value(ratio_dataset(), (5, 2))
+    curves, contours = ratio_curves(data), ratio_contours(data)
+    assert [len(ends) for ends in error_bars(curves)] == [6, 6, 5, 6, 6]
+    assert len(lines_of_contours(contours)) == len(EXCESS_LEVELS)
+    assert "no value" in legend_texts(contours)
+    for figure in (curves, contours):
+        assert "1 of 30 points without a value" in caption(figure)
+        assert len(rings(figure)) == 0
+    missing = data.packing_fraction.values[[4, 5]], 1.0 - data.restitution.values[[3, 1]]
+    for vertices in lines_of_contours(contours).values():
+        inside = (vertices[:, 1] > missing[0][0] + 1e-9) & (np.abs(vertices[:, 0] - missing[1].mean()) < 0.2 - 1e-9)
+        assert not inside.any()
+
+
+def test_map_without_any_value_is_drawn() -> None:
+    data = ratio_dataset()
+    empty = no_value(data, *np.ndindex(data.force_ratio.shape))
+    for figure in (ratio_curves(empty), ratio_contours(empty)):
+        figure.canvas.draw()
+        assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_missing_standard_errors_leave_contours_without_bands() -> None:
+    data = ratio_dataset()
+    figure = ratio_contours(data.assign(force_ratio_stderr=data.force_ratio_stderr * np.nan))
+    assert len(lines_of_contours(figure)) == len(EXCESS_LEVELS)
+    assert bands_of_contours(figure) == []
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
+def test_contours_of_a_line_of_points_are_refused(alphas: int, nus: int) -> None:
+    with pytest.raises(ValueError, match=f"at least two .* has {alphas} and {nus}"):
+        ratio_contours(ratio_dataset(alphas, nus))
+
+
+def test_caption_names_what_the_ratio_depends_on() -> None:
+    for figure in (ratio_curves(ratio_dataset()), ratio_contours(ratio_dataset())):
+        for words in ("N=256", "2 seeds", r"3\times 10^{-4}", r"\dot{\gamma}", "midpoint activation", "strain 5"):
+            assert words in caption(figure)
+
+
+def test_nothing_overlaps_on_the_page() -> None:
+    data = ratio_dataset()
+    data.status[5, 0] = 1
+    for figure in (ratio_curves(data), ratio_contours(no_value(data, (5, 2)))):
+        figure.canvas.draw()
+        axes, text = figure.axes[0].get_tightbbox(), figure._supxlabel.get_window_extent()
+        boxes = [axes, text, *(legend.get_window_extent() for legend in figure.legends)]
+        for k, box in enumerate(boxes):
+            assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
+            assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
+
+
+def test_files_are_written_whole(tmp_path: Path) -> None:
+    written = save_figures(ratio_dataset(), tmp_path / "my.map")
+    assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
+    assert sorted(tmp_path.iterdir()) == sorted(written)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
+
+
+def test_line_of_points_writes_only_the_curves(tmp_path: Path) -> None:
+    assert save_figures(ratio_dataset(alphas=1), tmp_path / "line") == [tmp_path / "line_curves.png"]
+
+
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "map_curves.png").write_text("old")
+
+    def broken(self: Figure, name: Path, **_: object) -> None:
+        Path(name).write_text("half")
+        raise OSError("disc full")
+
+    monkeypatch.setattr(Figure, "savefig", broken)
+    with pytest.raises(OSError, match="disc full"):
+        save_figures(ratio_dataset(), tmp_path / "map")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("map_curves.png", "old")]
+
+
+def test_stored_dataset_gives_the_same_figures(tmp_path: Path) -> None:
+    data = ratio_dataset()
+    data.status[5, 0] = 1
+    data.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as stored:
+        figure = ratio_contours(stored)
+        assert caption(figure) == caption(ratio_contours(data))
+        np.testing.assert_array_equal(rings(figure), rings(ratio_contours(data)))
+
+
+def test_global_plotting_state_is_untouched(tmp_path: Path) -> None:
+    before = dict(rcParams)
+    save_figures(ratio_dataset(), tmp_path / "map")
+    assert dict(rcParams) == before
+    assert not _pylab_helpers.Gcf.get_all_fig_managers()
