@@ -1,7 +1,62 @@
 """jaxgran: flows of rigid, frictionless discs in simple shear by contact dynamics, in JAX.
 
+    import jaxgran as jg
+    flow = jg.ShearFlow(grains=256, restitution=0.5, packing_fraction=0.76, timestep=1e-4)
+    state = jg.prepare(flow, jax.random.key(0))          # packed, heated, sheared to its steady state
+    state, sample = jg.sample(flow, state, strain=5.0)
+    sample.force_ratio, sample.errors()["force_ratio"]
+
 Axis contract: grains carry ``(grains, 2)``, near pairs ``(pairs,)``, contacts ``(contacts,)``. Every function of the
 engine is written for one replica; a batch adds a leading ``(replicas,)`` axis through ``jax.vmap`` with
 ``axis_name="replica"`` or through ``jax.lax.map``. Units: mean grain diameter σ, mass m of a grain of that diameter,
 shear rate γ̇.
+
+Importing this package imports nothing heavy and changes no flag of JAX; names are loaded when they are first used.
 """
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxgran.dynamics import State, advance
+    from jaxgran.figures import ratio_contours, ratio_curves, save_figures
+    from jaxgran.flow import ShearFlow
+    from jaxgran.grains import Grains, polydisperse
+    from jaxgran.measure import Sample, sample
+    from jaxgran.packing import pack
+    from jaxgran.protocol import prepare
+    from jaxgran.sweep import ratio_map
+    from jaxgran.status import Status
+    from jaxgran.tally import Tally
+
+__version__ = version("jaxgran")
+
+_HOME = {
+    "ShearFlow": "flow",
+    "Grains": "grains",
+    "polydisperse": "grains",
+    "State": "dynamics",
+    "advance": "dynamics",
+    "pack": "packing",
+    "Tally": "tally",
+    "Status": "status",
+    "Sample": "measure",
+    "sample": "measure",
+    "prepare": "protocol",
+    "ratio_map": "sweep",
+    "ratio_curves": "figures",
+    "ratio_contours": "figures",
+    "save_figures": "figures",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str):
+    if name not in _HOME:
+        raise AttributeError(f"module 'jaxgran' has no attribute {name!r}")
+    return getattr(import_module(f"jaxgran.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_HOME]

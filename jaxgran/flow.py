@@ -5,12 +5,17 @@ from typing import Literal, get_args
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 Activation = Literal["midpoint", "touching"]
 Solver = Literal["nesterov", "jacobi"]
 
 MAX_PACKING_FRACTION = 0.83
 MIN_GRAINS = 16
+
+
+class InputError(ValueError):
+    """A mistake in what a user gave; the message is one sentence that says what is accepted."""
 
 
 def _static(**kwargs):
@@ -43,7 +48,7 @@ class ShearFlow:
     ================  =================  ===============================================================
 
     Raises:
-      ValueError: a number is outside the range above (checked where it is known, that is outside ``jit``).
+      InputError: (a ValueError) a number is outside the range above (checked where it is known, that is outside ``jit``).
     """
 
     grains: int = _static()
@@ -59,15 +64,15 @@ class ShearFlow:
 
     def __post_init__(self):
         if not isinstance(self.grains, (int, np.integer)) or isinstance(self.grains, bool) or self.grains < MIN_GRAINS:
-            raise ValueError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
+            raise InputError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
         for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} must be {' or '.join(allowed)}, not {getattr(self, name)!r}.")
+                raise InputError(f"{name} must be {' or '.join(allowed)}, not {getattr(self, name)!r}.")
         for name, (accepts, words) in _RANGES.items():
             require(name, getattr(self, name), accepts, words)
-        step = _known(self.timestep), _known(self.shear_rate)
-        if None not in step and np.any(step[0] * step[1] > 0.1):
-            raise ValueError(f"timestep must be at most 0.1 / shear_rate, not {self.timestep!r}.")
+        timestep, shear_rate = _known(self.timestep), _known(self.shear_rate)
+        if timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1):
+            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {self.timestep!r}.")
 
     @property
     def activation_fraction(self) -> float:
@@ -82,7 +87,10 @@ class ShearFlow:
 
 _RANGES = {
     "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
-    "packing_fraction": (lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION), f"above 0 and at most {MAX_PACKING_FRACTION}"),
+    "packing_fraction": (
+        lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION),
+        f"above 0 and at most {MAX_PACKING_FRACTION}",
+    ),
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
@@ -93,15 +101,16 @@ _RANGES = {
 
 def _known(value) -> np.ndarray | None:
     """The value as an array of numbers, or None while it is only traced or a placeholder of a pytree."""
-    if isinstance(value, jax.core.Tracer) or not isinstance(value, (bool, int, float, str, np.generic, np.ndarray, jax.Array)):
+    numbers = (bool, int, float, str, np.generic, np.ndarray, jax.Array)
+    if isinstance(value, Tracer) or not isinstance(value, numbers):
         return None
     return np.asarray(value)
 
 
 def require(name: str, value, accepts, words: str) -> None:
-    """Raise a ValueError that says what is accepted, unless every known number of ``value`` is."""
+    """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
     known = _known(value)
     if known is None:
         return
     if known.dtype.kind not in "iuf" or not np.all(accepts(known)):
-        raise ValueError(f"{name} must be {words}, not {value!r}.")
+        raise InputError(f"{name} must be {words}, not {value!r}.")

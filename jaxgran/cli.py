@@ -1,0 +1,388 @@
+"""Command line: ``jaxgran map``, ``plot``, ``run`` and ``info``.
+
+Exit status: 0 done; 2 a mistake in the input; 3 finished, but a point carries a bad status; 130 interrupted.
+"""
+
+import os
+import platform
+import shlex
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from jaxgran.flow import Activation, InputError, Solver
+
+INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
+_PLAIN_PROGRESS_SECONDS = 10
+
+app = typer.Typer(
+    help="Flows of rigid, frictionless discs in simple shear by contact dynamics.",
+    epilog="Example: jaxgran map --restitution 0.1,0.5,0.9 --packing-fraction 0.5:0.8:4 --output ratio.nc",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {
+        "restitution": "0.1,0.25,0.4,0.6,0.8",
+        "packing_fraction": "0.3,0.5,0.6,0.7,0.75,0.79",
+        "grains": 256,
+        "seeds": 2,
+        "timestep": 1e-3,
+        "strain": 6.0,
+    },
+    "paper": {
+        "restitution": "0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9,0.98",
+        "packing_fraction": "0.1,0.2,0.3,0.4,0.5,0.56,0.6,0.65,0.7,0.75,0.8,0.82",
+        "grains": 400,
+        "seeds": 4,
+        "timestep": 1e-5,
+        "strain": 2.0,
+    },
+}
+
+
+def main() -> None:
+    """Entry point: mistakes in the input end with one sentence and exit status 2."""
+    try:
+        app()
+    except InputError as mistake:
+        _stop(str(mistake))
+
+
+def number_list(text: str, name: str) -> tuple[float, ...]:
+    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included."""
+    try:
+        if ":" in text:
+            start, stop, count = text.split(":")
+            steps = int(count) - 1
+            if steps < 1:
+                raise ValueError(count)
+            return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
+        return tuple(float(x) for x in text.split(","))
+    except ValueError:
+        raise InputError(
+            f"{name} must be a list like 0.1,0.5,0.9 or start:stop:count with count >= 2, not {text!r}."
+        ) from None
+
+
+@app.command("map")
+def map_command(
+    preset: Annotated[Literal["quick", "paper"], typer.Option(help="Starting point for all other options.")] = "quick",
+    restitution: Annotated[
+        str | None, typer.Option(help="List of restitutions: 0.1,0.5,0.9 or start:stop:count.")
+    ] = None,
+    packing_fraction: Annotated[str | None, typer.Option(help="List of packing fractions, up to 0.83.")] = None,
+    grains: Annotated[int | None, typer.Option(help="Grains of a replica.")] = None,
+    seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
+    timestep: Annotated[float | None, typer.Option(help="Time step of the sample, in 1/shear rate.")] = None,
+    equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
+    strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Relative residual of a contact solve. [default: 1e-4]")
+    ] = None,
+    solver: Annotated[Solver | None, typer.Option(help="Iteration of the contact solve. [default: nesterov]")] = None,
+    activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
+    batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a cluster scheduler (not available yet).")] = None,
+    output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map (not available yet).")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
+) -> None:
+    """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
+    for name, wanted in (("--scheduler", scheduler is not None), ("--resume", resume)):
+        if wanted:
+            raise InputError(f"{name} is not available yet: run the map on this machine, from the start.")
+    given = {
+        "restitution": restitution,
+        "packing_fraction": packing_fraction,
+        "grains": grains,
+        "seeds": seeds,
+        "timestep": timestep,
+        "equilibrate": equilibrate,
+        "strain": strain,
+        "tolerance": tolerance,
+        "solver": solver,
+        "activation": activation,
+    }
+    chosen = PRESETS[preset] | {name: value for name, value in given.items() if value is not None}
+    for name in ("restitution", "packing_fraction"):
+        chosen[name] = number_list(chosen[name], name)
+    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet)
+
+    from jaxgran.figures import save_figures
+
+    pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
+    _print_table(_ratio_table(data))
+    _finish(data, [output, *pictures], interrupted)
+
+
+@app.command("plot")
+def plot_command(
+    file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
+    output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
+) -> None:
+    """Draw Figures 1 and 2 of a map that has been run."""
+    from jaxgran.dataset import read_dataset
+    from jaxgran.figures import save_figures
+
+    folder = file.parent if output is None else output
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"output must be a folder that exists and can be written to, not {str(folder)!r}.")
+    _say_written(save_figures(read_dataset(file), folder / file.stem))
+
+
+@app.command("run")
+def run_command(
+    restitution: Annotated[float, typer.Option(help="Restitution, 0 to 1.")],
+    packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
+    grains: Annotated[int, typer.Option(help="Number of grains.")] = 256,
+    strain: Annotated[float, typer.Option(help="Sampled strain.")] = 5.0,
+    timestep: Annotated[float, typer.Option(help="Time step of the sample, in 1/shear rate.")] = 1e-3,
+    trajectory: Annotated[Path | None, typer.Option(help="GSD file of the trajectory (not available yet).")] = None,
+    movie: Annotated[Path | None, typer.Option(help="GIF of the flow (not available yet).")] = None,
+    output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
+) -> None:
+    """Run one flow to its steady state, sample it, and print its averages with their errors."""
+    for name, wanted in (("--trajectory", trajectory), ("--movie", movie)):
+        if wanted is not None:
+            raise InputError(f"{name} is not available yet: run without it.")
+    chosen = {
+        "restitution": (restitution,),
+        "packing_fraction": (packing_fraction,),
+        "grains": grains,
+        "seeds": 1,
+        "timestep": timestep,
+        "strain": strain,
+    }
+    data, interrupted = _measure(chosen, "auto", 1, output, quiet=False)
+    _print_table(_summary_table(data))
+    _finish(data, [output] if output else [], interrupted)
+
+
+@app.command("info")
+def info_command() -> None:
+    """Print the versions, devices and folders that a bug report needs."""
+    jax = _configured_jax()
+    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numpy", "xarray", "h5netcdf", "matplotlib")
+    lines = {
+        "python": platform.python_version(),
+        **{name: version(name) for name in packages},
+        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "devices": ", ".join(f"{d.platform}: {d.device_kind}" for d in jax.devices()),
+        "precision": "float64",
+        "compilation cache": jax.config.jax_compilation_cache_dir,
+    }
+    for name, value in lines.items():
+        print(f"{name:18s} {value}")
+
+
+def _stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
+    print(f"jaxgran: {sentence}", file=sys.stderr)
+    raise SystemExit(status)
+
+
+def _configured_jax():
+    """JAX in double precision, with compiled programs kept in the cache folder of the user."""
+    import jax
+    import platformdirs
+
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxgran"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    return jax
+
+
+def _batch(text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError(f"batch must be auto or a whole number of at least 1, not {text!r}.")
+    return int(text)
+
+
+def _measure(
+    chosen: dict[str, Any], batch: int | Literal["auto"], workers: int | None, output: Path | None, quiet: bool
+):
+    """Run a map with progress, write its dataset, and return it and whether it was interrupted."""
+    jax = _configured_jax()
+    from jaxgran.dataset import check_output, map_dataset, write_dataset
+    from jaxgran.settings import MapSettings
+    from jaxgran.sweep import predicted_cost, replicas
+
+    if output is not None:
+        check_output(output)
+    settings = MapSettings(**chosen)
+    on_cpu = jax.default_backend() == "cpu"
+    if workers is not None and workers < 1:
+        raise InputError(f"workers must be at least 1, not {workers}.")
+    if workers is not None and workers > 1 and not on_cpu:
+        raise InputError("workers must be 1 on an accelerator.")
+    count = len(settings.flows()) * settings.seeds
+    workers = min(count, workers or (len(os.sched_getaffinity(0)) if on_cpu else 1))
+    costs = [predicted_cost(flow) for flow in settings.flows()]
+
+    results, start, interrupted = {}, time.perf_counter(), False
+    with _progress(costs, settings.seeds, quiet) as meter:
+        running = replicas(settings, batch, workers, meter.steps)
+        try:
+            for key, replica in running:
+                results[key] = replica
+                meter.replica(key[0])
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            running.close()
+    seconds = time.perf_counter() - start
+    run = {
+        "command": shlex.join(["jaxgran", *sys.argv[1:]]),
+        "wall_time_seconds": seconds,
+        "replica_steps_per_second": meter.done_steps / seconds,
+        "workers": workers,
+    }
+    data = map_dataset(settings, results, run)
+    if output is not None and results:
+        write_dataset(data, output)
+    return data, interrupted
+
+
+class _Meter:
+    """Counts what is done and says so on standard error: a bar on a terminal, a line now and then elsewhere."""
+
+    def __init__(self, costs: list[float], seeds: int, quiet: bool):
+        self.costs, self.seeds, self.quiet = costs, seeds, quiet
+        self.left = [seeds] * len(costs)
+        self.done_steps, self.done_cost = 0.0, 0.0
+        self.start = self.last_line = time.perf_counter()
+        self.console = Console(stderr=True, quiet=quiet)
+        self.bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self.console, transient=False
+        )
+        self.task = self.bar.add_task("compiling", total=sum(costs) * seeds)
+
+    def steps(self, steps: float) -> None:
+        self.done_steps += steps
+        self._show()
+
+    def replica(self, point: int) -> None:
+        self.left[point] -= 1
+        self.done_cost += self.costs[point]
+        self._show()
+
+    def _show(self) -> None:
+        if self.console.is_terminal:
+            self.bar.update(self.task, completed=self.done_cost, description=self._line())
+        elif time.perf_counter() - self.last_line > _PLAIN_PROGRESS_SECONDS:
+            self.last_line = time.perf_counter()
+            self.console.print(self._line(), highlight=False)
+
+    def _line(self) -> str:
+        seconds = time.perf_counter() - self.start
+        points = sum(left == 0 for left in self.left)
+        share = self.done_cost / (sum(self.costs) * self.seeds)
+        left = f"{_duration(seconds / share - seconds)} left" if share > 0 else "estimating the time left"
+        return f"{points}/{len(self.costs)} points, {self.done_steps / seconds:.3g} replica-steps/s, {left}"
+
+
+@contextmanager
+def _progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[_Meter]:
+    meter = _Meter(costs, seeds, quiet)
+    if meter.console.is_terminal and not quiet:
+        with meter.bar:
+            yield meter
+    else:
+        meter.console.print(f"0/{len(costs)} points, compiling", highlight=False)
+        yield meter
+        meter.console.print(meter._line(), highlight=False)
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}"
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.4g} ± {error:.2g}"
+
+
+def _bad_points(data) -> dict[str, list[str]]:
+    """Points by the name of their bad status."""
+    names = dict(
+        zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
+    )
+    bad: dict[str, list[str]] = {}
+    for nu in data.packing_fraction.values:
+        for alpha in data.restitution.values:
+            name = names[int(data.status.sel(packing_fraction=nu, restitution=alpha))]
+            if name != "ok":
+                bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g})")
+    return bad
+
+
+def _ratio_table(data) -> Table:
+    timestep, rule = data.attrs["timestep"], data.attrs["activation"]
+    title = f"Force ratio at dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left")
+    table.add_column("packing fraction")
+    for alpha in data.restitution.values:
+        table.add_column(f"{alpha:g}", justify="right", no_wrap=True)
+    for nu in data.packing_fraction.values:
+        row = data.sel(packing_fraction=nu)
+        marks = ["" if status == 0 else " *" for status in row.status.values]
+        cells = zip(row.force_ratio.values, row.force_ratio_stderr.values, marks, strict=True)
+        table.add_row(f"{nu:g}", *(_with_error(value, error) + mark for value, error, mark in cells))
+    return table
+
+
+def _summary_table(data) -> Table:
+    from jaxgran.observables import OBSERVABLES, TENSORS
+
+    table = Table(box=box.SIMPLE)
+    for name in ("observable", "value ± standard error", "unit"):
+        table.add_column(name)
+    point = data.isel(packing_fraction=0, restitution=0)
+    for name in OBSERVABLES:
+        if name not in TENSORS:
+            unit = OBSERVABLES[name][1]
+            cell = _with_error(float(point[name]), float(point[f"{name}_stderr"]))
+            table.add_row(name.replace("_", " "), cell, "" if unit == "1" else unit)
+    return table
+
+
+def _print_table(table: Table) -> None:
+    """Print a table on standard output, in full width where that is a file."""
+    console = Console()
+    console.print(table) if console.is_terminal else Console(width=40 + 20 * len(table.columns)).print(table)
+
+
+def _say_written(paths: Iterable[Path]) -> None:
+    for path in paths:
+        print(f"wrote {path}", file=sys.stderr)
+
+
+def _finish(data, written: list[Path], interrupted: bool) -> None:
+    """Say what was written and what went wrong, and exit with the status that tells it."""
+    _say_written(path for path in written if path.exists())
+    bad = _bad_points(data)
+    if interrupted:
+        missing = len(bad.get("not_run", []))
+        _stop(
+            f"interrupted with {missing} points missing; what is done is saved. Repeat: {data.attrs['command']}",
+            INTERRUPTED,
+        )
+    if bad:
+        words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
+        _stop(f"finished, but points marked * have a bad status. {words}.", BAD_STATUS)

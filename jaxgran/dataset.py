@@ -1,0 +1,200 @@
+"""The dataset of a ratio map: observables with errors on the grid, statuses, and every parameter of the run."""
+
+import os
+import platform
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+
+from jaxgran.flow import InputError
+from jaxgran.measure import Sample
+from jaxgran.observables import OBSERVABLES, TENSORS, averages
+from jaxgran.settings import MapSettings
+from jaxgran.statistics import jackknife
+from jaxgran.status import Status
+
+NOT_RUN = -1
+Key = tuple[int, int]  # point of the grid, packing fraction first; seed
+_POINT = ("packing_fraction", "restitution")
+_TENSOR_AXES = ("axis_a", "axis_b")
+
+
+class Replica(NamedTuple):
+    """Result of one replica: its sample, its worst status, and the strain that it took to become steady."""
+
+    sample: Sample
+    status: int
+    strain: float
+
+
+def map_dataset(
+    settings: MapSettings, results: Mapping[Key, Replica], run: Mapping[str, str | float | int]
+) -> xr.Dataset:
+    """The dataset of the replicas that are done; points without any are NaN with the status ``not_run``.
+
+    Args:
+      settings: the map.
+      results: replicas by point (packing fraction first) and seed.
+      run: what else to store as attributes: command, wall time, speed.
+    """
+    shape = (len(settings.packing_fraction), len(settings.restitution))
+    count, seeds = shape[0] * shape[1], settings.seeds
+    values = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
+    errors = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
+    by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
+    status = np.full((count, seeds), NOT_RUN, np.int8)
+    strain = np.full((count, seeds), np.nan)
+    for (point, seed), replica in results.items():
+        status[point, seed], strain[point, seed] = replica.status, replica.strain
+        for name, value in replica.sample.averages.items():
+            by_seed[name][point, seed] = value
+    for point in range(count):
+        finite = [results[point, s] for s in range(seeds) if NOT_RUN < status[point, s] < Status.nonfinite]
+        if finite:
+            for name, (value, error) in _point_estimates(finite).items():
+                values[name][point], errors[name][point] = value, error
+
+    variables = {}
+    for name, (long_name, units) in OBSERVABLES.items():
+        dims = _POINT + (_TENSOR_AXES if name in TENSORS else ())
+        attrs = {"long_name": long_name, "units": units}
+        variables[name] = (dims, values[name].reshape(*shape, *_tail(name)), attrs)
+        spread = "standard deviation over blocks" if name == "max_overlap" else "standard error"
+        about = {"long_name": f"{spread} of {long_name}", "units": units}
+        variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
+        seed_dims = (*_POINT, "seed", *dims[2:])
+        variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
+    flags = {
+        "long_name": "worst status of a point",
+        "flag_values": np.array([NOT_RUN, *Status], np.int8),
+        "flag_meanings": " ".join(["not_run", *(s.name for s in Status)]),
+    }
+    variables["status"] = (_POINT, _worst(status).reshape(shape), flags)
+    variables["status_by_seed"] = ((*_POINT, "seed"), status.reshape(*shape, seeds), {**flags, "long_name": "status"})
+    variables["equilibration_strain_by_seed"] = (
+        (*_POINT, "seed"),
+        strain.reshape(*shape, seeds),
+        {"long_name": "strain sheared before the sample", "units": "1"},
+    )
+    coordinates = {
+        "packing_fraction": (
+            "packing_fraction",
+            list(settings.packing_fraction),
+            {"long_name": "packing fraction", "units": "1"},
+        ),
+        "restitution": ("restitution", list(settings.restitution), {"long_name": "restitution", "units": "1"}),
+        "seed": ("seed", np.arange(seeds), {"long_name": "seed of the random numbers"}),
+        "axis_a": ("axis_a", ["x", "y"], {"long_name": "direction of the centre-to-centre vector"}),
+        "axis_b": ("axis_b", ["x", "y"], {"long_name": "direction of the force"}),
+    }
+    return xr.Dataset(variables, coordinates, {**_attributes(settings), **run})
+
+
+def check_output(path: Path) -> None:
+    """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
+    if path.suffix != ".nc":
+        raise InputError(f"output must be a file name that ends in .nc, not {str(path)!r}.")
+    if path.is_dir():
+        raise InputError(f"output must be a file, and {str(path)!r} is a folder.")
+    if not path.parent.is_dir():
+        raise InputError(f"output must be in a folder that exists, and {str(path.parent)!r} does not.")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists():
+            with path.open("ab"):
+                pass
+    except OSError as error:
+        raise InputError(
+            f"output must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
+        ) from None
+
+
+def write_dataset(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".nc")
+    os.close(handle)
+    try:
+        data.to_netcdf(temporary, engine="h5netcdf")
+        with open(temporary, "rb") as written:
+            os.fsync(written.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """Read a dataset that ``write_dataset`` wrote; ValueError in one sentence where it is not one."""
+    if not path.is_file():
+        raise InputError(f"there is no file {str(path)!r}.")
+    try:
+        data = xr.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{str(path)!r} is not a NetCDF file that can be read: {error}.") from None
+    missing = {"force_ratio", "force_ratio_stderr", "status"} - set(data.variables)
+    if missing:
+        raise InputError(f"{str(path)!r} is not a ratio map: it has no {', '.join(sorted(missing))}.")
+    return data
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _tail(name: str) -> tuple[int, ...]:
+    return (2, 2) if name in TENSORS else ()
+
+
+def _worst(status: np.ndarray) -> np.ndarray:
+    """Worst status over the seeds of each point; not run where a seed is missing and no other is worse than ok."""
+    worst = status.max(axis=1)
+    return np.where((status.min(axis=1) == NOT_RUN) & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
+
+
+def _point_estimates(seeds: list[Replica]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Averages over all blocks of all seeds of one point, and their errors."""
+    first = seeds[0].sample
+    sums = jax.tree.map(lambda *x: np.stack(x), *(replica.sample.tally for replica in seeds))
+    estimate = partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate)
+    values, errors = jackknife(estimate, sums)
+    values["max_overlap"] = sums.largest_overlap.max()
+    errors["max_overlap"] = sums.largest_overlap.std()
+    return {name: (values[name], errors[name]) for name in OBSERVABLES}
+
+
+def _attributes(settings: MapSettings) -> dict[str, str | float | int | list[float]]:
+    """Every parameter of the run, in types that NetCDF can hold."""
+    parameters = asdict(settings)
+    equilibrate = parameters.pop("equilibrate")
+    flow = settings.flows()[0]
+    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numpy", "xarray")
+    device = jax.devices()[0]
+    return {
+        "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
+        "Conventions": "CF-1.11",
+        **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
+        "equilibrate": "until steady" if equilibrate is None else equilibrate,
+        "timestep_unit": "1 / shear rate",
+        "strain_meaning": "sampled strain of each seed",
+        "shear_rate": flow.shear_rate,
+        "polydispersity": flow.polydispersity,
+        "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
+        "max_iterations": flow.max_iterations,
+        "precision": "float64" if jax.config.jax_enable_x64 else "float32",
+        "device": f"{device.platform}: {device.device_kind}",
+        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        **{f"version_{name.replace('-', '_')}": version(name) for name in packages},
+    }

@@ -1,0 +1,94 @@
+"""Observables: the averages that follow from a tally, with their names and units."""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxgran.tally import Tally
+
+STRESS_UNIT = "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
+
+OBSERVABLES: dict[str, tuple[str, str]] = {
+    "force_ratio": ("mean contact force over mean binary contact force", "1"),
+    "contact_force": ("mean force of a contact in a solved network", "m sigma / t^2"),
+    "binary_force": ("mean force of a contact if collisions were binary", "m sigma / t^2"),
+    "pressure": ("pressure, contact and kinetic", STRESS_UNIT),
+    "contact_pressure": ("pressure of the contact forces", STRESS_UNIT),
+    "binary_pressure": ("pressure of the contact forces if collisions were binary", STRESS_UNIT),
+    "kinetic_pressure": ("pressure of the peculiar motion", STRESS_UNIT),
+    "shear_stress": ("shear stress, contact and kinetic, positive", STRESS_UNIT),
+    "contact_shear_stress": ("shear stress of the contact forces", STRESS_UNIT),
+    "binary_shear_stress": ("shear stress of the contact forces if collisions were binary", STRESS_UNIT),
+    "kinetic_shear_stress": ("shear stress of the peculiar motion", STRESS_UNIT),
+    "granular_temperature": ("granular temperature, sum of m c^2 over 2 N", "m sigma^2 / t^2"),
+    "coordination_number": ("contacts per grain (twice the contacts of solved networks over the grains)", "1"),
+    "loaded_coordination_number": ("contacts per grain that carry an impulse", "1"),
+    "macroscopic_friction": ("shear stress over pressure", "1"),
+    "inertial_number": ("shear rate times the square root of the mass of a mean grain over the pressure", "1"),
+    "collision_rate": ("approaching contacts per grain and unit strain, each grain counting its own", "1"),
+    "iterations": ("solver iterations per solved network", "1"),
+    "residual": ("mean relative residual of the solved networks", "1"),
+    "unconverged_share": ("share of the solved networks that ended above the tolerance", "1"),
+    "max_overlap": ("largest overlap of a contact", "sigma"),
+    "contact_stress": ("stress of the contact forces", STRESS_UNIT),
+    "binary_stress": ("stress of the contact forces if collisions were binary", STRESS_UNIT),
+    "kinetic_stress": ("stress of the peculiar motion", STRESS_UNIT),
+    "stress_ratio": ("contact stress over binary stress, by component", "1"),
+}
+TENSORS = ("contact_stress", "binary_stress", "kinetic_stress", "stress_ratio")
+
+
+def averages(tally: Tally, area: Array, grains: int, shear_rate: Array) -> dict[str, Array]:
+    """All observables of a tally.
+
+    Args:
+      tally: sums with any leading axes.
+      area: area of the cell, σ².
+      grains: number of grains.
+      shear_rate: γ̇.
+
+    Returns:
+      Arrays by the names of ``OBSERVABLES``: scalars with the leading axes of the tally, tensors with (2, 2) behind
+      them. Stress Σ^{ab} follows the sign of the paper: positive diagonal, and the shear stress is −Σ^{xy}.
+      A quotient of nothing by nothing (no contact was seen) is NaN.
+    """
+    volume = area * tally.duration
+    contact, binary, kinetic = (
+        moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
+    )
+    dt = _ratio(tally.duration, tally.steps)
+    pressure = {name: (s[..., 0, 0] + s[..., 1, 1]) / 2 for name, s in _named(contact, binary, kinetic)}
+    shear = {name: -s[..., 0, 1] for name, s in _named(contact, binary, kinetic)}
+    total_pressure = pressure["contact"] + pressure["kinetic"]
+    total_shear = shear["contact"] + shear["kinetic"]
+    return {
+        "force_ratio": _ratio(tally.impulse, tally.binary_impulse),
+        "contact_force": _ratio(tally.impulse, tally.contacts * dt),
+        "binary_force": _ratio(tally.binary_impulse, tally.contacts * dt),
+        "pressure": total_pressure,
+        **{f"{name}_pressure": x for name, x in pressure.items()},
+        "shear_stress": total_shear,
+        **{f"{name}_shear_stress": x for name, x in shear.items()},
+        "granular_temperature": pressure["kinetic"] * area / grains,
+        "coordination_number": 2 * tally.contacts / (grains * tally.steps),
+        "loaded_coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),
+        "macroscopic_friction": total_shear / total_pressure,
+        "inertial_number": shear_rate / jnp.sqrt(total_pressure),
+        "collision_rate": 2 * tally.collisions / (grains * tally.duration * shear_rate),
+        "iterations": _ratio(tally.iterations, tally.solves),
+        "residual": _ratio(tally.residual, tally.solves),
+        "unconverged_share": _ratio(tally.unconverged, tally.solves),
+        "max_overlap": tally.largest_overlap,
+        "contact_stress": contact,
+        "binary_stress": binary,
+        "kinetic_stress": kinetic,
+        "stress_ratio": _ratio(contact, binary),
+    }
+
+
+def _named(contact: Array, binary: Array, kinetic: Array):
+    return (("contact", contact), ("binary", binary), ("kinetic", kinetic))
+
+
+def _ratio(over: Array, under: Array) -> Array:
+    """A quotient that is NaN, without a warning, where nothing was counted."""
+    return jnp.where(under == 0, jnp.nan, over / jnp.where(under == 0, 1, under))

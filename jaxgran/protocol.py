@@ -1,0 +1,247 @@
+"""Protocol of one measurement: pack, heat, shear to the steady state, shorten the time step, sample.
+
+The stresses hardly depend on the time step, the force ratio does, and after a change of the time step the contact
+network needs a strain of up to a half to forget the old one. So the steady state is reached at a coarse step, the step
+is then shortened geometrically, and the network relaxes over a strain of 0.5 at the final one before it is sampled.
+
+Stationarity is a statistical statement. The flow is sheared in chunks, and the temperature T and pressure P of each are
+recorded. Of the later two thirds of the record, the means of ln T and ln P over the first and the second half must
+differ by less than twice the standard error of that difference, which must itself be at most 0.1; if both hold for
+both, the flow is steady.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran.dynamics import State, advance
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
+from jaxgran.measure import BLOCKS, Sample, check_precision
+from jaxgran.observables import averages
+from jaxgran.packing import pack
+from jaxgran.replica import AXIS
+from jaxgran.statistics import drift
+from jaxgran.status import Status
+from jaxgran.tally import Tally
+
+COARSE_TIMESTEP = 1e-3
+SHORTENING = 10**0.5  # factor between successive time steps
+RELAXATION_STRAIN = 0.5  # at the final time step
+_SHORTENING_STRAIN = 0.1  # at each time step between
+_CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
+_COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
+_FEWEST_CHUNKS, _MOST_CHUNKS = 9, 60
+_SIGNIFICANT, _PRECISE = 2.0, 0.1
+_SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P
+_ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
+
+Report = Callable[[float], None]  # told the replica-steps done since the last call
+
+
+class Batch(NamedTuple):
+    """Replicas on their way through the protocol: everything has a leading (replicas,) axis."""
+
+    flow: ShearFlow
+    state: State
+    status: Int[np.ndarray, " replicas"]
+    strain: Float[np.ndarray, " replicas"]  # spent on reaching the steady state
+
+
+def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> State:
+    """A flow in its steady state at its time step, ready to be sampled.
+
+    Args:
+      flow: parameters of one flow.
+      key: JAX random key; the same key gives the same state.
+      equilibrate: strain to shear at the coarse time step, or None to shear until the flow is steady.
+
+    Returns:
+      The state after packing, heating, shearing and relaxing.
+
+    Raises:
+      ValueError: a grain of thermal speed would cross more than a tenth of a diameter in one step, or float32
+        positions cannot resolve the step.
+      RuntimeError: the flow did not become steady, or ended with a bad status.
+    """
+    batch = prepare_batch(stack([flow]), key[None], equilibrate)
+    if batch.status[0] != Status.ok:
+        raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
+    return jax.tree.map(lambda x: x[0], batch.state)
+
+
+def stack(flows: list[ShearFlow]) -> ShearFlow:
+    """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
+    return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(v) for v in x])), *flows)
+
+
+def prepare_batch(
+    flow: ShearFlow, keys: Array, equilibrate: float | None = None, report: Report | None = None
+) -> Batch:
+    """``prepare`` for a batch of flows: problems are statuses of single replicas, never exceptions."""
+    theory = predicted(flow)
+    check_timestep(flow, theory)
+    state, packed = _start(flow, keys, theory.granular_temperature)
+    check_precision(flow, state)
+    status = np.where(np.asarray(packed), Status.ok, Status.not_steady)
+    coarse = replace(flow, timestep=_coarse_timestep(flow, theory))
+    batch = Batch(coarse, state, status, np.zeros(len(status)))
+    if equilibrate is None:
+        batch = _until_steady(batch, theory, report)
+    elif equilibrate > 0:
+        batch = _sheared(batch, np.full(len(status), equilibrate), report)
+    return _shortened(batch, flow, report)
+
+
+def sample_batch(batch: Batch, strain: float, report: Report | None = None) -> tuple[Batch, Sample]:
+    """Sample every replica of a batch in blocks of equal strain; a drift within the sample makes it not steady."""
+    tallies = []
+    for _ in range(BLOCKS):
+        batch, tally = _chunk(batch, np.full(len(batch.status), strain / BLOCKS), report)
+        tallies.append(tally)
+    tally = jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
+    side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
+    measured = Sample(tally, side**2, shear_rate, batch.flow.grains)
+    by_block = _averages(tally, side[:, None] ** 2, batch.flow.grains, shear_rate[:, None])
+    drifting = [_drifts(np.log(pressure)) for pressure in by_block["pressure"]]
+    status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
+    return batch._replace(status=np.maximum(status, tally.status.max(axis=1))), measured
+
+
+@jax.jit
+def predicted(flow: ShearFlow) -> SteadyShear:
+    """Kinetic theory's prediction for every flow of a batch, with α held below 0.99 (where T diverges)."""
+    alpha = jnp.minimum(flow.restitution, _ELASTIC)
+    return jax.vmap(gaussian_moments)(alpha, flow.packing_fraction, flow.shear_rate, flow.polydispersity)
+
+
+def check_timestep(flow: ShearFlow, theory: SteadyShear) -> None:
+    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step."""
+    longest = _CROSSING / _thermal_speed(theory)
+    too_long = np.asarray(flow.timestep) > longest
+    if np.any(too_long):
+        worst = np.argmax(np.asarray(flow.timestep) / longest)
+        alpha, nu = (float(np.asarray(x)[worst]) for x in (flow.restitution, flow.packing_fraction))
+        raise InputError(
+            f"timestep must be at most {longest[worst]:.1e} at restitution {alpha:g} and packing fraction {nu:g}, "
+            "or grains would cross more than a tenth of a diameter in one step."
+        )
+
+
+def _thermal_speed(theory: SteadyShear) -> np.ndarray:
+    return np.sqrt(2 * np.asarray(theory.granular_temperature))
+
+
+def _coarse_timestep(flow: ShearFlow, theory: SteadyShear) -> Array:
+    coarse = np.minimum(COARSE_TIMESTEP / np.asarray(flow.shear_rate), _COARSE_CROSSING / _thermal_speed(theory))
+    return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
+
+
+def replicated(function: Callable) -> Callable:
+    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere."""
+    if jax.default_backend() == "cpu":
+        return lambda *arguments: lax.map(lambda one: function(*one), arguments)
+    return jax.vmap(function, axis_name=AXIS)
+
+
+@jax.jit
+def _start(flow: ShearFlow, keys: Array, temperature: Array) -> tuple[State, Bool[Array, " replicas"]]:
+    """Packings with Gaussian velocities of the given temperature and no total momentum."""
+
+    def one(flow: ShearFlow, key: Array, temperature: Array):
+        pack_key, heat_key = jax.random.split(key)
+        state, found = pack(flow, pack_key)
+        masses = state.grains.masses[:, None]
+        velocities = jax.random.normal(heat_key, state.positions.shape, masses.dtype) / jnp.sqrt(masses)
+        velocities = velocities - jnp.sum(masses * velocities, axis=0) / jnp.sum(masses)
+        now = jnp.sum(masses * velocities**2) / (2 * flow.grains)
+        return replace(state, velocities=velocities * jnp.sqrt(temperature / now)), found
+
+    return replicated(one)(flow, keys, temperature)
+
+
+@jax.jit
+def _advance(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
+    return replicated(advance)(flow, state, steps)
+
+
+def _chunk(batch: Batch, strain: np.ndarray, report: Report | None) -> tuple[Batch, Tally]:
+    """Advance every replica by its own strain; replicas that are no longer finite stay where they are."""
+    alive = batch.status < Status.nonfinite
+    steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
+    state, tally = _advance(batch.flow, batch.state, jnp.asarray(np.where(alive, steps, 0), jnp.int32))
+    tally = jax.tree.map(np.asarray, tally)
+    if report is not None:
+        report(float(tally.steps.sum()))
+    status = np.where(tally.status == Status.nonfinite, Status.nonfinite, batch.status)
+    return batch._replace(state=state, status=status), tally
+
+
+def _sheared(batch: Batch, strain: np.ndarray, report: Report | None, longest: float = 1.0) -> Batch:
+    """Shear every replica by its own strain, in chunks short enough to report progress."""
+    chunks = max(1, int(np.ceil(np.max(strain) / longest)))
+    for _ in range(chunks):
+        batch, _ = _chunk(batch, strain / chunks, report)
+    return batch._replace(strain=batch.strain + strain)
+
+
+def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> Batch:
+    """Shear in chunks until every replica is steady or has used up its chunks; steady ones wait."""
+    density = batch.flow.grains / np.asarray(batch.state.side) ** 2
+    memory = density * np.asarray(theory.granular_temperature) / np.asarray(theory.shear_stress)  # strain to heat up
+    chunk = np.maximum(0.5, memory / 2)
+    count = len(batch.status)
+    steady, record = np.zeros(count, bool), []
+    area, shear_rate = np.asarray(batch.state.side) ** 2, np.asarray(batch.flow.shear_rate)
+    for chunks in range(1, _MOST_CHUNKS + 1):
+        waiting = steady | (batch.status == Status.nonfinite)
+        if waiting.all():
+            break
+        batch, tally = _chunk(batch, np.where(waiting, 0, chunk), report)
+        batch = batch._replace(strain=batch.strain + np.where(waiting, 0, chunk))
+        now = _averages(tally, area, batch.flow.grains, shear_rate)
+        record.append(np.log(np.stack([now["granular_temperature"], now["pressure"]])))
+        if chunks >= _FEWEST_CHUNKS:
+            late = np.stack(record[chunks // 3 :])
+            level = [steady[k] or all(_is_level(late[:, q, k]) for q in (0, 1)) for k in range(count)]
+            steady = steady | (np.array(level) & ~waiting)
+    bad = np.where(steady, Status.ok, Status.not_steady)
+    return batch._replace(status=np.maximum(batch.status, bad))
+
+
+def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
+    """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one."""
+    coarse, final = np.asarray(batch.flow.timestep), np.asarray(flow.timestep)
+    steps = max(0, int(np.ceil(np.log(np.max(coarse / final)) / np.log(SHORTENING) - 1e-9)))
+    for k in range(1, steps):
+        between = jnp.asarray(coarse * (final / coarse) ** (k / steps), batch.state.side.dtype)
+        batch = _sheared(
+            batch._replace(flow=replace(flow, timestep=between)), np.full(len(coarse), _SHORTENING_STRAIN), report
+        )
+    batch = batch._replace(flow=flow)
+    relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
+    return _sheared(batch, relaxation, report) if relaxation.any() else batch
+
+
+def _is_level(series: np.ndarray) -> bool:
+    """Whether the halves of a series agree within the noise, and the noise is small."""
+    difference, error = drift(series)
+    return bool(error <= _PRECISE and abs(difference) <= _SIGNIFICANT * error)
+
+
+def _drifts(series: np.ndarray) -> bool:
+    """Whether the halves of a sample differ beyond doubt and by more than matters; True where it is not finite."""
+    difference, error = drift(series)
+    return not abs(difference) <= max(_SAMPLE_SIGNIFICANT * error, _SAMPLE_LEVEL)
+
+
+def _averages(tally: Tally, area: np.ndarray, grains: int, shear_rate: np.ndarray) -> dict[str, np.ndarray]:
+    with np.errstate(invalid="ignore"):
+        return jax.tree.map(np.asarray, partial(averages, grains=grains)(tally, area=area, shear_rate=shear_rate))

@@ -1,0 +1,180 @@
+"""The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as an xarray.Dataset.
+
+Every point and seed is a replica. Replicas of like cost form a batch; batches go through a queue, the most expensive
+first, so that no core waits for another. A replica's random numbers depend on its seed and its place in the grid
+alone, so results do not depend on the batches, their order or the number of workers.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from time import perf_counter
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from jaxgran.dataset import Key, Replica, map_dataset
+from jaxgran.flow import Activation, ShearFlow, Solver
+from jaxgran.protocol import Report, prepare_batch, sample_batch, stack
+from jaxgran.settings import MapSettings
+
+_LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
+_SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
+_GRAIN_BYTES = 2000  # lists, network and state of a replica
+_SHARE_OF_MEMORY = 0.5
+
+
+def ratio_map(
+    restitution: Sequence[float],
+    packing_fraction: Sequence[float],
+    *,
+    grains: int = 256,
+    seeds: int = 2,
+    timestep: float = 1e-3,
+    equilibrate: float | None = None,
+    strain: float = 10.0,
+    tolerance: float = 1e-4,
+    solver: Solver = "nesterov",
+    activation: Activation = "midpoint",
+    batch: int | Literal["auto"] = "auto",
+    workers: int = 1,
+    report: Report | None = None,
+) -> xr.Dataset:
+    """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with standard errors.
+
+    Args:
+      restitution: values of α in [0, 1], sorted.
+      packing_fraction: values of ν in (0, 0.83], sorted.
+      grains: number of grains of a replica.
+      seeds: replicas of each point.
+      timestep: dt of the sample in units of 1/γ̇.
+      equilibrate: strain before the sample, or None to shear until the flow is steady.
+      strain: sampled strain of each seed.
+      tolerance: relative residual of a contact solve.
+      solver: "nesterov" or "jacobi".
+      activation: "midpoint" or "touching".
+      batch: replicas that run together, or "auto".
+      workers: processes; more than one only on a CPU, and then a script must guard its main part by
+        ``if __name__ == "__main__":``.
+      report: called with the replica-steps done since the last call.
+
+    Returns:
+      The dataset described in ``map_dataset``: every observable on (packing_fraction, restitution) with its standard
+      error and its values by seed, the status of each point, and every parameter as an attribute.
+
+    Raises:
+      ValueError: a parameter is out of range; the sentence says what is accepted.
+    """
+    settings = MapSettings(
+        restitution=tuple(float(x) for x in restitution),
+        packing_fraction=tuple(float(x) for x in packing_fraction),
+        grains=grains,
+        seeds=seeds,
+        timestep=timestep,
+        equilibrate=equilibrate,
+        strain=strain,
+        tolerance=tolerance,
+        solver=solver,
+        activation=activation,
+    )
+    start = perf_counter()
+    results = dict(replicas(settings, batch, workers, report))
+    return map_dataset(settings, results, {"wall_time_seconds": perf_counter() - start})
+
+
+def replicas(
+    settings: MapSettings, batch: int | Literal["auto"] = "auto", workers: int = 1, report: Report | None = None
+) -> Iterator[tuple[Key, Replica]]:
+    """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
+
+    Args:
+      settings: the map.
+      batch: replicas that run together, or "auto": a few on a CPU, what the memory holds on an accelerator.
+      workers: processes; more than one only on a CPU. They end when the iterator is closed.
+      report: told the replica-steps done since the last call.
+    """
+    tasks = _tasks(settings, batch, workers)
+    if workers == 1:
+        for task in tasks:
+            yield from _run_task(settings, task, report)
+        return
+    context = multiprocessing.get_context("spawn")
+    queue = context.SimpleQueue()
+    configuration = (jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir)
+    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (queue, *configuration))
+    listener = threading.Thread(target=_listen, args=(queue, report), daemon=True)
+    listener.start()
+    try:
+        for done in as_completed([pool.submit(_run_task, settings, task) for task in tasks]):
+            yield from done.result()
+    finally:
+        processes = list(pool._processes.values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        queue.put(None)
+        listener.join()
+
+
+def predicted_cost(flow: ShearFlow) -> float:
+    """Relative cost of a step of a flow, from measurements at dt = 1e-3: dense and dissipative flows form networks."""
+    return 20 + 600 * (1 - flow.restitution) * np.exp((flow.packing_fraction - 0.8) / 0.04)
+
+
+def _tasks(settings: MapSettings, batch: int | Literal["auto"], workers: int) -> list[list[Key]]:
+    """The replicas in batches of like cost, the most expensive first."""
+    costs = [predicted_cost(flow) for flow in settings.flows()]
+    order = sorted(range(len(costs)), key=lambda point: -costs[point])
+    keys = [(point, seed) for point in order for seed in range(settings.seeds)]
+    size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" else batch
+    return [keys[k : k + size] for k in range(0, len(keys), size)]
+
+
+def _batch_size(grains: int, count: int, workers: int) -> int:
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        return max(1, min(_LARGEST_CPU_BATCH, count // (8 * workers)))
+    memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
+    per_replica = _GRAIN_BYTES * grains + _SEARCH_BYTES * min(grains, 512) ** 2
+    return int(max(1, min(count, _SHARE_OF_MEMORY * memory / per_replica)))
+
+
+_worker_report: Report | None = None
+
+
+def _start_worker(queue, x64: bool, cache: str | None) -> None:
+    """Set up a worker process: one thread, the precision of the parent, and Ctrl-C left to the parent."""
+    global _worker_report
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    single = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {single}"
+    jax.config.update("jax_enable_x64", x64)
+    jax.config.update("jax_compilation_cache_dir", cache)
+    _worker_report = queue.put
+
+
+def _listen(queue, report: Report | None) -> None:
+    while (steps := queue.get()) is not None:
+        if report is not None:
+            report(steps)
+
+
+def _run_task(settings: MapSettings, task: Sequence[Key], report: Report | None = None) -> list[tuple[Key, Replica]]:
+    """Prepare and sample the replicas of one batch."""
+    report = report or _worker_report
+    flows = settings.flows()
+    flow = stack([flows[point] for point, _ in task])
+    keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
+    batch = prepare_batch(flow, keys, settings.equilibrate, report)
+    prepared = batch.strain
+    batch, sample = sample_batch(batch, settings.strain, report)
+    return [
+        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(prepared[k])))
+        for k, key in enumerate(task)
+    ]

@@ -1,0 +1,164 @@
+"""The cell-list search finds the pairs that a search of all images finds, or says that it may have missed some."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from scipy.spatial import cKDTree
+
+from jaxgran import pairs
+from jaxgran.cell import wrap
+from jaxgran.dynamics import State, advance
+from jaxgran.flow import ShearFlow
+from jaxgran.neighbours import cell_list_pairs, set_bit
+from jaxgran.packing import pack
+
+TILTS = (-0.5, -0.2, 0.0, 0.31, 0.499)
+PACKING_FRACTIONS = (0.1, 0.6, 0.82)
+PAIRS_PER_GRAIN = 10
+
+search = jax.jit(cell_list_pairs, static_argnames="capacity")
+
+
+@jax.jit
+def mapped_search(positions, side, tilt, cutoff):
+    capacity = PAIRS_PER_GRAIN * positions.shape[1]
+    return lax.map(lambda replica: cell_list_pairs(*replica, capacity), (positions, side, tilt, cutoff))
+
+
+@jax.jit
+def batched_search(positions, side, tilt, cutoff):
+    capacity = PAIRS_PER_GRAIN * positions.shape[1]
+    return jax.vmap(lambda *replica: cell_list_pairs(*replica, capacity), axis_name="replica")(positions, side, tilt, cutoff)
+
+
+def flow_cell(count, packing_fraction, polydispersity=0.26):
+    """Side of the cell, and the cutoff at which a homogeneous flow fills 0.8 of the engine's buffer."""
+    side = np.sqrt(np.pi / 4 * count * (1 + polydispersity**2 / 3) / packing_fraction)
+    return side, side * np.sqrt(1.6 * PAIRS_PER_GRAIN / (np.pi * count)) + polydispersity
+
+
+def random_positions(seed, count, side, tilt, clustered=False):
+    """Independent uniform positions; clustered, 40 % of them in a fifth of the cell."""
+    rng = np.random.default_rng(seed)
+    fractional = rng.random((count, 2))
+    if clustered:
+        fractional[: 2 * count // 5] *= (0.25, 0.8)
+        fractional += rng.random(2)
+    positions = side * np.stack([fractional[:, 0] + tilt * fractional[:, 1], fractional[:, 1]], axis=-1)
+    return wrap(jnp.asarray(positions), jnp.asarray(side), jnp.asarray(tilt))
+
+
+def all_images(positions, side, tilt, cutoff):
+    """Pairs i < j within the cutoff, by a tree of the nine nearest images."""
+    positions = np.asarray(positions)
+    images = [positions + side * np.array([a + b * tilt, b]) for b in (-1, 0, 1) for a in (-2, -1, 0, 1, 2)]
+    near = cKDTree(np.concatenate(images)).query_ball_point(positions, cutoff)
+    return {(i, k % len(positions)) for i, found in enumerate(near) for k in found if i < k % len(positions)}
+
+
+def found_pairs(i, j):
+    """The pairs found, after a check that each is found once and in order."""
+    i, j = np.asarray(i), np.asarray(j)
+    found = list(zip(i[i != j].tolist(), j[i != j].tolist(), strict=True))
+    assert len(set(found)) == len(found)
+    assert all(a < b for a, b in found)
+    return set(found)
+
+
+@pytest.mark.parametrize("clustered", [False, True])
+@pytest.mark.parametrize("count", [600, 2000])
+@pytest.mark.parametrize("run", [mapped_search, batched_search])
+def test_pairs_are_those_of_all_images(run, count, clustered):
+    cases = [(*flow_cell(count, fraction), tilt) for fraction in PACKING_FRACTIONS for tilt in TILTS]
+    side, cutoff, tilt = (jnp.asarray(column) for column in zip(*cases, strict=True))
+    positions = [random_positions(seed, count, s, t, clustered) for seed, (s, _, t) in enumerate(cases)]
+    i, j, missed = run(jnp.stack(positions), side, tilt, cutoff)
+    assert not missed.any()
+    for k, (s, c, t) in enumerate(cases):
+        assert found_pairs(i[k], j[k]) == all_images(positions[k], s, t, c), cases[k]
+
+
+def test_one_crowded_replica_leaves_the_others_of_a_batch_as_they_are():
+    count, tilt = 600, 0.31
+    side, cutoff = flow_cell(count, 0.6)
+    cutoffs = np.array([cutoff, cutoff / 3, cutoff])
+    positions = [random_positions(seed, count, side, tilt) for seed in range(3)]
+    positions[1] = positions[1] * 0.35  # up to 80 grains in a cell
+    same = jnp.ones(3)
+    i, j, missed = batched_search(jnp.stack(positions), side * same, tilt * same, jnp.asarray(cutoffs))
+    assert not missed.any()
+    for k in range(3):
+        assert found_pairs(i[k], j[k]) == all_images(positions[k], side, tilt, cutoffs[k])
+        alone = search(positions[k], jnp.asarray(side), jnp.asarray(tilt), jnp.asarray(cutoffs[k]), PAIRS_PER_GRAIN * count)
+        assert found_pairs(*alone[:2]) == found_pairs(i[k], j[k])
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_grains_on_the_edges_of_cells_find_their_neighbours(tilt):
+    side = 30.0
+    along = jnp.arange(30.0)
+    lattice = jnp.stack(jnp.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    positions = wrap(lattice + jnp.stack([tilt * lattice[:, 1], jnp.zeros(900)], axis=-1), jnp.asarray(side), jnp.asarray(tilt))
+    positions = positions.at[::7].set(jnp.where(positions[::7] == 0, side, positions[::7]))  # the same place
+    i, j, missed = search(positions, jnp.asarray(side), jnp.asarray(tilt), jnp.asarray(2.3), 9000)
+    assert not missed
+    assert found_pairs(i, j) == all_images(positions, side, tilt, 2.3)
+
+
+def test_single_precision_misses_nothing_but_by_rounding():
+    count, tilt = 2000, 0.499
+    side, cutoff = flow_cell(count, 0.82)
+    positions = random_positions(3, count, side, tilt).astype(jnp.float32)
+    i, j, missed = search(positions, *(jnp.float32(a) for a in (side, tilt, cutoff)), PAIRS_PER_GRAIN * count)
+    found, images = found_pairs(i, j), all_images(positions.astype(float), side, tilt, cutoff * (1 + 1e-4))
+    assert not missed
+    assert all_images(positions.astype(float), side, tilt, cutoff * (1 - 1e-6)) <= found <= images
+
+
+def test_the_largest_cutoff_of_the_engine_fits_the_grid():
+    for count in (513, 1000, 3000):
+        side, _ = flow_cell(count, 0.83, polydispersity=0.5)
+        cutoff = side * np.sqrt(1.6 * PAIRS_PER_GRAIN / (np.pi * count)) + 0.5 * 1.001
+        positions = random_positions(0, count, side, -0.5)
+        *_, missed = search(positions, jnp.asarray(side), jnp.asarray(-0.5), jnp.asarray(cutoff), PAIRS_PER_GRAIN * count)
+        assert not missed
+
+
+def test_whatever_may_be_missing_is_flagged():
+    count, tilt = 600, jnp.asarray(-0.2)
+    side, cutoff = (jnp.asarray(a) for a in flow_cell(count, 0.6))
+    positions = random_positions(1, count, side, tilt)
+    capacity = PAIRS_PER_GRAIN * count
+    assert not search(positions, side, tilt, cutoff, capacity)[-1]
+    assert search(positions, side, tilt, cutoff, 10)[-1], "a tiny buffer"
+    assert search(positions, side, tilt, 1.3 * cutoff, capacity)[-1], "cells smaller than the cutoff"
+    assert search(positions, side, tilt, cutoff * jnp.nan, capacity)[-1], "no cutoff"
+    assert search(positions * 0.1, side, tilt, cutoff / 50, capacity)[-1], "a cell too full"
+    assert search(positions * 0.3, side, tilt, cutoff, capacity)[-1], "more pairs than the list holds"
+
+
+def test_set_bit_is_the_place_of_the_bit_of_that_rank():
+    words = np.random.default_rng(0).integers(0, 2**32, 50, dtype=np.uint32)
+    words[:3] = 1, 2**31, 2**32 - 1
+    for word in words:
+        places = [k for k in range(32) if int(word) >> k & 1]
+        ranks = jnp.arange(len(places), dtype=jnp.int32)
+        assert set_bit(jnp.full(len(places), word), ranks).tolist() == places
+
+
+def test_a_flow_is_the_same_with_cell_lists_as_with_all_pairs(monkeypatch):
+    count = 1000
+    flow = ShearFlow(grains=count, restitution=0.7, packing_fraction=0.7, timestep=1e-3, tolerance=1e-8)
+    state, packed = jax.jit(pack)(flow, jax.random.key(0))
+    velocities = jax.random.normal(jax.random.key(1), (count, 2))
+    state = State(state.grains, state.positions, velocities - velocities.mean(axis=0, keepdims=True), state.side, state.tilt)
+    by_cells, tally = jax.jit(lambda start, steps: advance(flow, start, steps))(state, jnp.int32(100))
+    monkeypatch.setattr(pairs, "ALL_PAIRS_LIMIT", count)
+    by_all, reference = jax.jit(lambda start, steps: advance(flow, start, steps))(state, jnp.int32(100))
+    assert packed
+    assert tally.status == reference.status == 0
+    assert tally.collisions == reference.collisions > 0
+    np.testing.assert_allclose(by_cells.velocities, by_all.velocities, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(by_cells.positions, by_all.positions, rtol=0, atol=1e-9)
