@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from jaxgran.measure import Sample, sample
     from jaxgran.packing import pack
     from jaxgran.protocol import prepare
-    from jaxgran.sweep import ratio_map
     from jaxgran.status import Status
+    from jaxgran.sweep import ratio_map
     from jaxgran.tally import Tally
 
 __version__ = version("jaxgran")
@@ -49,7 +49,23 @@ _HOME = {
     "ratio_contours": "figures",
     "save_figures": "figures",
 }
-__all__ = sorted(_HOME)
+__all__ = [
+    "Grains",
+    "Sample",
+    "ShearFlow",
+    "State",
+    "Status",
+    "Tally",
+    "advance",
+    "pack",
+    "polydisperse",
+    "prepare",
+    "ratio_contours",
+    "ratio_curves",
+    "ratio_map",
+    "sample",
+    "save_figures",
+]
 
 
 def __getattr__(name: str):

@@ -183,7 +183,7 @@ def info_command() -> None:
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "devices": ", ".join(f"{d.platform}: {d.device_kind}" for d in jax.devices()),
         "precision": "float64",
-        "compilation cache": jax.config.jax_compilation_cache_dir,
+        "compilation cache": jax.config.read("jax_compilation_cache_dir"),
     }
     for name, value in lines.items():
         print(f"{name:18s} {value}")

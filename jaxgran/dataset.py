@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -174,7 +174,7 @@ def _point_estimates(seeds: list[Replica]) -> dict[str, tuple[np.ndarray, np.nda
     return {name: (values[name], errors[name]) for name in OBSERVABLES}
 
 
-def _attributes(settings: MapSettings) -> dict[str, str | float | int | list[float]]:
+def _attributes(settings: MapSettings) -> dict[str, Any]:
     """Every parameter of the run, in types that NetCDF can hold."""
     parameters = asdict(settings)
     equilibrate = parameters.pop("equilibrate")
@@ -192,7 +192,7 @@ def _attributes(settings: MapSettings) -> dict[str, str | float | int | list[flo
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
         "max_iterations": flow.max_iterations,
-        "precision": "float64" if jax.config.jax_enable_x64 else "float32",
+        "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
         "device": f"{device.platform}: {device.device_kind}",
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),

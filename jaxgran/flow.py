@@ -18,8 +18,7 @@ class InputError(ValueError):
     """A mistake in what a user gave; the message is one sentence that says what is accepted."""
 
 
-def _static(**kwargs):
-    return field(metadata={"static": True}, **kwargs)
+_STATIC = {"static": True}
 
 
 @jax.tree_util.register_dataclass
@@ -51,7 +50,7 @@ class ShearFlow:
       InputError: (a ValueError) a number is outside the range above (checked where it is known, that is outside ``jit``).
     """
 
-    grains: int = _static()
+    grains: int = field(metadata=_STATIC)
     restitution: float | jax.Array
     packing_fraction: float | jax.Array
     timestep: float | jax.Array
@@ -59,11 +58,12 @@ class ShearFlow:
     polydispersity: float | jax.Array = 0.26
     tolerance: float | jax.Array = 1e-4
     max_iterations: int | jax.Array = 5000
-    activation: Activation = _static(default="midpoint")
-    solver: Solver = _static(default="nesterov")
+    activation: Activation = field(default="midpoint", metadata=_STATIC)
+    solver: Solver = field(default="nesterov", metadata=_STATIC)
 
     def __post_init__(self):
-        if not isinstance(self.grains, (int, np.integer)) or isinstance(self.grains, bool) or self.grains < MIN_GRAINS:
+        whole = isinstance(self.grains, (int, np.integer)) and not isinstance(self.grains, bool)
+        if not whole or self.grains < MIN_GRAINS:
             raise InputError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
         for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
             if getattr(self, name) not in allowed:

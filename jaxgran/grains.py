@@ -35,6 +35,6 @@ def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grain
       polydispersity: half width Δ of the distribution, in σ.
       key: JAX random key.
     """
-    quantile = (jnp.arange(count) + 0.5) / count
+    quantile = (jnp.arange(count, dtype=jnp.result_type(float)) + 0.5) / count
     diameters = jax.random.permutation(key, 1 + polydispersity * (2 * quantile - 1))
     return Grains(radii=diameters / 2, masses=diameters**2)

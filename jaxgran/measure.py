@@ -39,8 +39,8 @@ class Sample:
     """
 
     tally: Tally
-    area: Float[Array, "*replicas"]
-    shear_rate: Float[Array, "*replicas"]
+    area: Float[Array | np.ndarray, "*replicas"]
+    shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
 
     @property

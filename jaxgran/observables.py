@@ -1,6 +1,7 @@
 """Observables: the averages that follow from a tally, with their names and units."""
 
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxgran.tally import Tally
@@ -37,7 +38,7 @@ OBSERVABLES: dict[str, tuple[str, str]] = {
 TENSORS = ("contact_stress", "binary_stress", "kinetic_stress", "stress_ratio")
 
 
-def averages(tally: Tally, area: Array, grains: int, shear_rate: Array) -> dict[str, Array]:
+def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) -> dict[str, Array]:
     """All observables of a tally.
 
     Args:
@@ -51,6 +52,7 @@ def averages(tally: Tally, area: Array, grains: int, shear_rate: Array) -> dict[
       them. Stress Σ^{ab} follows the sign of the paper: positive diagonal, and the shear stress is −Σ^{xy}.
       A quotient of nothing by nothing (no contact was seen) is NaN.
     """
+    area, shear_rate = jnp.asarray(area), jnp.asarray(shear_rate)
     volume = area * tally.duration
     contact, binary, kinetic = (
         moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)

@@ -45,7 +45,8 @@ class MapSettings:
         check_timestep(flows, predicted(flows))
         if round(self.strain / self.timestep) < _FEWEST_STEPS:
             raise InputError(
-                f"strain must be at least {_FEWEST_STEPS} time steps, {_FEWEST_STEPS * self.timestep:g}, not {self.strain:g}."
+                f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * self.timestep:g}, "
+                f"not {self.strain:g}."
             )
 
     def flows(self) -> list[ShearFlow]:

@@ -1,6 +1,6 @@
 """Standard errors of sums over blocks by the jackknife, and the drift of a series."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -10,7 +10,7 @@ BLOCK_MERGES = (1, 2, 4)
 Estimates = dict[str, np.ndarray]
 
 
-def jackknife(estimate: Callable[[Any], Estimates], sums: Any) -> tuple[Estimates, Estimates]:
+def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
     Every estimate is a function of sums (a ratio of sums, as a rule), so its error comes from leaving out one block at
@@ -25,8 +25,14 @@ def jackknife(estimate: Callable[[Any], Estimates], sums: Any) -> tuple[Estimate
       Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks.
     """
     value = _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)))
-    errors = [_jackknife_error(estimate, jax.tree.map(lambda x, m=m: _merged(x, m), sums)) for m in BLOCK_MERGES]
-    return value, {name: np.fmax.reduce([error[name] for error in errors]) for name in value}
+    seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
+    unknown = {name: np.full(x.shape, np.nan) for name, x in value.items()}
+    errors = [
+        _jackknife_error(estimate, jax.tree.map(lambda x, m=m: _merged(x, m), sums))
+        for m in BLOCK_MERGES
+        if seeds * (blocks // m) >= 2
+    ]
+    return value, {name: np.fmax.reduce([error[name] for error in [unknown, *errors]]) for name in value}
 
 
 def drift(series: np.ndarray) -> tuple[float, float]:
@@ -53,13 +59,11 @@ def _merged(x: np.ndarray, merge: int) -> np.ndarray:
     return x[:, : groups * merge].reshape(seeds * groups, merge, *x.shape[2:]).sum(axis=1)
 
 
-def _jackknife_error(estimate: Callable[[Any], Estimates], groups: Any) -> Estimates:
+def _jackknife_error(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) -> Estimates:
     count = len(jax.tree.leaves(groups)[0])
     without = _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=0) - x, groups)))
-    if count < 2:
-        return {name: np.full(x.shape[1:], np.nan) for name, x in without.items()}
     return {name: np.sqrt((count - 1) * np.mean((x - x.mean(axis=0)) ** 2, axis=0)) for name, x in without.items()}
 
 
-def _to_numpy(estimates: dict[str, Any]) -> Estimates:
+def _to_numpy(estimates: Mapping[str, Any]) -> Estimates:
     return {name: np.asarray(x) for name, x in estimates.items()}

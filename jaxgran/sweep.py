@@ -5,18 +5,18 @@ first, so that no core waits for another. A replica's random numbers depend on i
 alone, so results do not depend on the batches, their order or the number of workers.
 """
 
+import math
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from time import perf_counter
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import xarray as xr
 
 from jaxgran.dataset import Key, Replica, map_dataset
@@ -90,7 +90,7 @@ def ratio_map(
 
 def replicas(
     settings: MapSettings, batch: int | Literal["auto"] = "auto", workers: int = 1, report: Report | None = None
-) -> Iterator[tuple[Key, Replica]]:
+) -> Generator[tuple[Key, Replica]]:
     """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
 
     Args:
@@ -106,7 +106,7 @@ def replicas(
         return
     context = multiprocessing.get_context("spawn")
     queue = context.SimpleQueue()
-    configuration = (jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir)
+    configuration = (jax.config.read("jax_enable_x64"), jax.config.read("jax_compilation_cache_dir"))
     pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (queue, *configuration))
     listener = threading.Thread(target=_listen, args=(queue, report), daemon=True)
     listener.start()
@@ -124,7 +124,8 @@ def replicas(
 
 def predicted_cost(flow: ShearFlow) -> float:
     """Relative cost of a step of a flow, from measurements at dt = 1e-3: dense and dissipative flows form networks."""
-    return 20 + 600 * (1 - flow.restitution) * np.exp((flow.packing_fraction - 0.8) / 0.04)
+    alpha, nu = float(flow.restitution), float(flow.packing_fraction)
+    return 20 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)
 
 
 def _tasks(settings: MapSettings, batch: int | Literal["auto"], workers: int) -> list[list[Key]]:

@@ -1,0 +1,188 @@
+"""Time of a replica and step against the numba rival, from the same states, on one core.
+
+For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxgran and the rival advance the same state
+by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
+printed and written as JSON and PNG. Compilation is reported apart, as is the memory of 1000 replicas.
+
+    python benchmarks/step_cost.py            # about 10 minutes
+    python benchmarks/step_cost.py --quick    # about 1 minute
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rival_numba
+from hardware import hardware
+from matplotlib.figure import Figure
+
+import jaxgran as jg
+
+RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
+STRAINS = {1e-3: 1.0, 1e-4: 0.5, 1e-5: 0.1}  # advanced at a time
+GRAINS, TOLERANCE = 256, 1e-4
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="two points, three repetitions")
+    arguments.add_argument("--repeats", type=int, default=7, help="timed pairs of each point")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    arguments.add_argument("--memory-only", action="store_true", help=argparse.SUPPRESS)
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if chosen.memory_only:
+        print(peak_memory(1000))
+        return
+
+    compile_seconds = compilation()
+    grid = [(alpha, nu) for alpha in RESTITUTIONS for nu in PACKING_FRACTIONS]
+    if chosen.quick:
+        grid, repeats = [(0.5, 0.56), (0.5, 0.7)], 3
+    else:
+        repeats = chosen.repeats
+    print(f"compilation of sample: {compile_seconds:.1f} s")
+    print("    dt      α     ν     jaxgran     rival   ratio    force ratio (both)")
+    points = []
+    for dt in STRAINS:
+        for alpha, nu in grid:
+            points.append(compare(alpha, nu, dt, repeats))
+            print(
+                "{dt:8.0e}{alpha:6.2g}{nu:6.2g}{jaxgran_us:9.3f} µs{rival_us:7.3f} µs{ratio:8.2f}"
+                "{jaxgran_force_ratio:12.3f}{rival_force_ratio:8.3f}".format(**points[-1]),
+                flush=True,
+            )
+    means = {dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt]))) for dt in STRAINS}
+    for dt, mean in means.items():
+        print(f"dt = {dt:g}: geometric mean of jaxgran over rival {mean:.2f}")
+    memory = float(subprocess.run([sys.executable, __file__, "--memory-only"], capture_output=True, text=True).stdout)
+    print(f"peak memory of 1000 replicas of {GRAINS} grains: {memory:.2f} GB")
+
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    stem = chosen.output / ("step_cost_quick" if chosen.quick else "step_cost")
+    result = {
+        "hardware": hardware(),
+        "grains": GRAINS,
+        "tolerance": TOLERANCE,
+        "repeats": repeats,
+        "compile_seconds": compile_seconds,
+        "memory_gb_1000_replicas": memory,
+        "geometric_mean_ratio": {f"{dt:g}": mean for dt, mean in means.items()},
+        "points": points,
+    }
+    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(points, means).savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def compilation() -> float:
+    """Seconds to trace and compile ``sample`` for one shape, without the persistent cache."""
+    flow = jg.ShearFlow(grains=GRAINS, restitution=0.9, packing_fraction=0.56, timestep=1e-3)
+    state = jax.jit(jg.pack)(flow, jax.random.key(0))[0]
+    start = time.perf_counter()
+    jax.jit(lambda f, s, strain: jg.sample(f, s, strain)).lower(flow, state, 0.1).compile()
+    return time.perf_counter() - start
+
+
+def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
+    """Median microseconds per step of both programs, in turn from the same states."""
+    flow = jg.ShearFlow(grains=GRAINS, restitution=alpha, packing_fraction=nu, timestep=dt, tolerance=TOLERANCE)
+    state = jg.prepare(flow, jax.random.key(1), equilibrate=5.0)
+    steps = round(STRAINS[dt] / dt)
+    ours, theirs, sums = [], [], []
+    for repeat in range(repeats + 1):  # the first is warm-up
+        copy = rival_state(state)
+        start = time.perf_counter()
+        state, tally = jax.block_until_ready(advance(flow, state, jnp.int32(steps)))
+        middle = time.perf_counter()
+        *_, rival = rival_numba.advance(
+            **copy, shear_rate=1.0, restitution=alpha, timestep=dt, activation=0.5, tolerance=TOLERANCE, steps=steps
+        )
+        end = time.perf_counter()
+        if repeat:
+            ours.append((middle - start) / steps * 1e6)
+            theirs.append((end - middle) / steps * 1e6)
+            sums.append([float(tally.impulse), float(tally.binary_impulse), rival.impulse, rival.binary_impulse])
+    impulse, binary, rival_impulse, rival_binary = np.sum(sums, axis=0)
+    return {
+        "alpha": alpha,
+        "nu": nu,
+        "dt": dt,
+        "steps": steps,
+        "jaxgran_us": float(np.median(ours)),
+        "rival_us": float(np.median(theirs)),
+        "ratio": float(np.median(np.array(ours) / np.array(theirs))),
+        "jaxgran_us_range": [min(ours), max(ours)],
+        "rival_us_range": [min(theirs), max(theirs)],
+        "jaxgran_force_ratio": impulse / binary,
+        "rival_force_ratio": rival_impulse / rival_binary,
+    }
+
+
+advance = jax.jit(jg.advance)
+
+
+def rival_state(state: jg.State) -> dict[str, np.ndarray | float]:
+    return {
+        "positions": np.array(state.positions),
+        "velocities": np.array(state.velocities),
+        "radii": np.array(state.grains.radii),
+        "masses": np.array(state.grains.masses),
+        "side": float(state.side),
+        "tilt": float(state.tilt),
+    }
+
+
+def peak_memory(replicas: int) -> float:
+    """Peak resident gigabytes of a process that samples a batch of replicas."""
+    flow = jg.ShearFlow(grains=GRAINS, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+    state = jax.jit(jg.pack)(flow, jax.random.key(0))[0]
+    batch = jax.tree.map(lambda x: jnp.repeat(x[None], replicas, axis=0), state)
+    keys = jax.random.split(jax.random.key(1), replicas)
+    velocities = jax.vmap(lambda key: jax.random.normal(key, state.velocities.shape))(keys)
+    run = jax.jit(lambda states: jax.lax.map(lambda one: jg.sample(flow, one, 0.05), states))
+    jax.block_until_ready(run(replace(batch, velocities=velocities)))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def draw(points: list[dict], means: dict[float, float]) -> Figure:
+    """Microseconds per step of both programs at every point, one panel a time step."""
+    figure = Figure(figsize=(4.2 * len(means), 3.8), layout="constrained")
+    for axes, dt in zip(np.atleast_1d(figure.subplots(1, len(means), sharey=True)), means, strict=True):
+        here = [p for p in points if p["dt"] == dt]
+        place = np.arange(len(here))
+        for name, colour, hatch, shift in (("jaxgran", "0.25", "", -0.2), ("rival", "0.8", "//", 0.2)):
+            height = np.array([p[f"{name}_us"] for p in here])
+            low, high = np.array([p[f"{name}_us_range"] for p in here]).T
+            label = "numba Gauss–Seidel loop" if name == "rival" else name
+            axes.bar(
+                place + shift,
+                height,
+                0.4,
+                color=colour,
+                hatch=hatch,
+                edgecolor="black",
+                label=label,
+                yerr=[height - low, high - height],
+                error_kw={"elinewidth": 1, "capsize": 2},
+            )
+        axes.set(yscale="log", title=rf"$\mathrm{{d}}t={dt:g}/\dot\gamma$, mean ratio {means[dt]:.2g}")
+        axes.set_xticks(place, [f"{p['alpha']:g}\n{p['nu']:g}" for p in here])
+        axes.set_xlabel("restitution α (above), packing fraction ν (below)")
+    figure.axes[0].set_ylabel("µs per replica and step")
+    figure.axes[0].legend(loc="upper left", fontsize="small")
+    return figure
+
+
+if __name__ == "__main__":
+    main()

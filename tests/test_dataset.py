@@ -1,0 +1,193 @@
+"""The dataset holds every promised name, survives the disc, and is never left half written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic import one_sentence, random_replica
+
+from jaxgran.dataset import NOT_RUN, Key, Replica, check_output, map_dataset, read_dataset, write_dataset
+from jaxgran.observables import OBSERVABLES, TENSORS
+from jaxgran.settings import MapSettings
+from jaxgran.status import Status
+
+ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
+RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}
+
+
+@pytest.fixture(scope="module")
+def settings() -> MapSettings:
+    return MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=1e-2, strain=2.0, activation="touching")
+
+
+@pytest.fixture(scope="module")
+def results(settings) -> dict[Key, Replica]:
+    """All replicas but two of the last point, a bad one, and one that is not finite."""
+    rng = np.random.default_rng(0)
+    keys = [(point, seed) for point in range(4) for seed in range(SEEDS)][:-2]
+    statuses = {(0, 1): Status.iteration_limit, (1, 2): Status.nonfinite}
+    return {key: random_replica(rng, settings, statuses.get(key, Status.ok)) for key in keys}
+
+
+@pytest.fixture(scope="module")
+def data(settings, results) -> xr.Dataset:
+    return map_dataset(settings, results, RUN)
+
+
+def test_every_observable_has_its_dimensions_errors_and_values_by_seed(data) -> None:
+    assert data.sizes == {"packing_fraction": 2, "restitution": 2, "seed": SEEDS, "axis_a": 2, "axis_b": 2}
+    for name in OBSERVABLES:
+        tail = ("axis_a", "axis_b") if name in TENSORS else ()
+        assert data[name].dims == data[f"{name}_stderr"].dims == ("packing_fraction", "restitution", *tail)
+        assert data[f"{name}_by_seed"].dims == ("packing_fraction", "restitution", "seed", *tail)
+
+
+def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
+    assert all(data[name].attrs["long_name"] for name in data.variables)
+    without = {name for name in data.variables if "units" not in data[name].attrs}
+    assert without == {"seed", "axis_a", "axis_b", "status", "status_by_seed"}
+    for name, (_, units) in OBSERVABLES.items():
+        assert data[name].attrs["units"] == data[f"{name}_stderr"].attrs["units"] == units
+
+
+def test_values_stand_at_their_point_and_seed(data, results) -> None:
+    for (point, seed), replica in results.items():
+        there = {"packing_fraction": NUS[point // 2], "restitution": ALPHAS[point % 2], "seed": seed}
+        for name in ("force_ratio", "pressure", "kinetic_stress"):
+            np.testing.assert_allclose(data[f"{name}_by_seed"].sel(there), replica.sample.averages[name], rtol=1e-12)
+        assert data.equilibration_strain_by_seed.sel(there) == replica.strain
+
+
+def test_point_is_the_ratio_of_the_sums_of_its_finite_seeds(data, results) -> None:
+    for point in range(4):
+        tallies = [r.sample.tally for (p, _), r in results.items() if p == point and r.status != Status.nonfinite]
+        there = data.sel(packing_fraction=NUS[point // 2], restitution=ALPHAS[point % 2])
+        ratio = sum(t.impulse.sum() for t in tallies) / sum(t.binary_impulse.sum() for t in tallies)
+        assert there.force_ratio == pytest.approx(ratio)
+        moment = sum(t.contact_moment.sum(axis=0) for t in tallies)
+        duration = sum(t.duration.sum() for t in tallies)
+        np.testing.assert_allclose(there.contact_stress, moment / duration / 100.0)
+        assert there.max_overlap == max(t.largest_overlap.max() for t in tallies)
+
+
+def test_error_of_the_ratio_is_that_of_the_delta_method(data, results) -> None:
+    # Blocks are independent; the larger of three noisy errors is taken, so the stored one is a little too large.
+    tallies = [results[0, seed].sample.tally for seed in range(SEEDS)]
+    x, y = (np.concatenate([getattr(t, name) for t in tallies]) for name in ("impulse", "binary_impulse"))
+    expected = np.std(x - x.sum() / y.sum() * y, ddof=1) / np.sqrt(len(x)) / y.mean()
+    stored = float(data.force_ratio_stderr.sel(packing_fraction=NUS[0], restitution=ALPHAS[0]))
+    assert 0.95 * expected < stored < 1.5 * expected
+
+
+def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
+    np.testing.assert_array_equal(data.status, [[Status.iteration_limit, Status.nonfinite], [Status.ok, NOT_RUN]])
+    for name in ("status", "status_by_seed"):
+        values, meanings = data[name].attrs["flag_values"], data[name].attrs["flag_meanings"].split()
+        assert dict(zip(values.tolist(), meanings, strict=True)) == {-1: "not_run", **{s.value: s.name for s in Status}}
+        assert data[name].dtype == values.dtype
+
+
+def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
+    missing = data.sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
+    assert (missing.status_by_seed == NOT_RUN).all()
+    nothing = map_dataset(settings, {}, {})
+    for name in OBSERVABLES:
+        assert np.isnan(missing[f"{name}_by_seed"]).all(), name
+        assert np.isnan(nothing[name]).all() and np.isnan(nothing[f"{name}_stderr"]).all(), name
+    assert (nothing.status == NOT_RUN).all()
+
+
+def test_missing_seed_does_not_hide_a_bad_status(settings, results) -> None:
+    some = {key: replica for key, replica in results.items() if key in ((0, 1), (2, 0))}
+    status = map_dataset(settings, some, {}).status
+    np.testing.assert_array_equal(status, [[Status.iteration_limit, NOT_RUN], [NOT_RUN, NOT_RUN]])
+
+
+def test_attributes_tell_every_parameter_of_the_run(settings, data) -> None:
+    attributes = data.attrs
+    for name in ("grains", "seeds", "timestep", "strain", "tolerance", "solver", "activation"):
+        assert attributes[name] == getattr(settings, name)
+    assert (attributes["restitution"], attributes["packing_fraction"]) == (list(ALPHAS), list(NUS))
+    assert attributes["equilibrate"] == "until steady"
+    assert attributes["timestep_unit"] == "1 / shear rate"
+    assert attributes["precision"] == "float64"
+    assert {"shear_rate", "polydispersity", "max_iterations", "device", "platform", "python"} <= set(attributes)
+    assert {"version_jaxgran", "version_jax", "version_jaxlib", "version_numpy"} <= set(attributes)
+    assert attributes.items() >= RUN.items()
+
+
+def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
+    write_dataset(data, tmp_path / "map.nc")
+    again = read_dataset(tmp_path / "map.nc")
+    xr.testing.assert_equal(again, data)
+    for name in data.variables:
+        assert set(again[name].attrs) == set(data[name].attrs), name
+        for key, value in data[name].attrs.items():
+            np.testing.assert_array_equal(again[name].attrs[key], value)
+    for key, value in data.attrs.items():
+        np.testing.assert_array_equal(again.attrs[key], value)
+    assert [path.name for path in tmp_path.iterdir()] == ["map.nc"]
+
+
+def test_failed_write_keeps_the_old_file_and_leaves_no_other(
+    data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "map.nc"
+    write_dataset(data, path)
+    old = path.read_bytes()
+
+    def half_written(self, temporary, **_):
+        Path(temporary).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(xr.Dataset, "to_netcdf", half_written)
+    with pytest.raises(OSError, match="No space left"):
+        write_dataset(data, path)
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
+
+
+def test_file_is_readable_by_others_as_the_umask_says(data, tmp_path: Path) -> None:
+    write_dataset(data, tmp_path / "map.nc")
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "map.nc").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "text", "empty", "truncated", "other"])
+def test_reading_what_is_no_map_is_one_sentence(data, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "file.nc"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "text":
+        path.write_text("not a dataset\n" * 100)
+    elif kind == "empty":
+        path.touch()
+    elif kind == "truncated":
+        write_dataset(data, path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif kind == "other":
+        xr.Dataset({"temperature": ("x", np.arange(3.0))}).to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"file\.nc") as caught:
+        read_dataset(path)
+    assert one_sentence(str(caught.value))
+
+
+@pytest.mark.parametrize(
+    ("name", "accepted"),
+    [("map.txt", "ends in .nc"), ("map", "ends in .nc"), ("folder.nc", "a folder"), ("none/map.nc", "exists")],
+)
+def test_output_that_cannot_be_a_dataset_is_one_sentence(name: str, accepted: str, tmp_path: Path) -> None:
+    (tmp_path / "folder.nc").mkdir()
+    with pytest.raises(ValueError, match=accepted) as caught:
+        check_output(tmp_path / name)
+    assert one_sentence(str(caught.value))
+
+
+def test_checking_the_output_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
+    old = tmp_path / "old.nc"
+    old.write_bytes(b"old")
+    check_output(old)
+    check_output(tmp_path / "new.nc")
+    assert [p.name for p in tmp_path.iterdir()] == ["old.nc"]
+    assert old.read_bytes() == b"old"

@@ -1,0 +1,251 @@
+"""The advance over many steps: exact flight, the same trajectory by every route, statuses, batches."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.extend.core import jaxprs_in_params
+from oracles import gaps_of
+
+from jaxgran.cell import displacement, remap_tilt
+from jaxgran.dynamics import advance, contact_capacities
+from jaxgran.flow import ShearFlow
+from jaxgran.status import Status
+from jaxgran.tally import Tally
+
+EPS = np.finfo(float).eps
+COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
+
+
+def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
+    numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
+    return ShearFlow(pytest.GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
+
+
+def assert_same_state(one, two, atol: float):
+    moved = displacement(one.positions, two.positions, one.side, one.tilt)
+    np.testing.assert_allclose(moved, 0, atol=atol)
+    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=atol)
+    np.testing.assert_allclose(one.tilt, two.tilt, rtol=0, atol=atol)
+
+
+def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] = ()):
+    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their largest component."""
+    for name in COUNTS:
+        assert getattr(one, name) == getattr(two, name), name
+    for name in set(Tally.__dataclass_fields__) - {*COUNTS, "residual", "iterations", "largest_overlap", *but}:
+        first, second = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
+        np.testing.assert_allclose(first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name)
+
+
+def assert_identical(one, two):
+    jax.tree.map(np.testing.assert_array_equal, one, two)
+
+
+def test_grain_flies_straight_in_the_laboratory(run, scene):
+    """Over many steps, three remaps of the tilt and across the boundary, where the image is faster by γ̇L."""
+    state = scene([[3.0, 4.0]], [[0.5, 1.7]])
+    flow, steps = flow_of(0.02), 3200
+    after, tally = run(flow, state, steps)
+    time = steps * flow.timestep
+    tilt = float(remap_tilt(jnp.asarray(time)))
+    travelled = np.array([[3.0 + 0.5 * time, 4.0 + 1.7 * time]])
+    missed = displacement(after.positions[:1], jnp.asarray(travelled), after.side, after.tilt)
+    np.testing.assert_allclose(missed, 0, atol=1e3 * EPS * float(state.side))
+    np.testing.assert_allclose(after.velocities[0], [0.5 - travelled[0, 1], 1.7], rtol=0, atol=1e4 * EPS)
+    np.testing.assert_allclose(after.tilt, tilt, rtol=0, atol=1e4 * EPS)
+    assert (tally.steps, tally.solves, tally.impulse, tally.status) == (steps, 0, 0, Status.ok)
+    np.testing.assert_allclose(tally.duration, time, rtol=1e3 * EPS)
+
+
+@pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
+@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+def test_free_flight_repeats_the_trajectory_of_every_step(run, flowing, activation, packing_fraction):
+    flow, state = flow_of(packing_fraction, activation=activation), flowing(packing_fraction)
+    (jumped, tally), (stepped, all_steps) = (run(flow, state, 100, free_flight) for free_flight in (True, False))
+    assert tally.solves > 5
+    assert_same_state(jumped, stepped, 1e-10)
+    assert_same_tally(tally, all_steps, 1e-10)
+
+
+@pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
+def test_both_solvers_give_the_same_trajectory(run, flowing, packing_fraction):
+    flow, state = flow_of(packing_fraction), flowing(packing_fraction)
+    (one, tally), (two, other) = (run(replace(flow, solver=solver), state, 100) for solver in ("nesterov", "jacobi"))
+    assert tally.status == Status.ok and tally.solves > 5
+    assert_same_state(one, two, 1e-8)
+    assert_same_tally(tally, other, 1e-8, but=("loaded_contacts",))
+
+
+def test_two_samples_joined_are_the_sample_of_both(run, flowing):
+    flow, state = flow_of(), flowing(0.6)
+    whole_state, whole = run(flow, state, 100)
+    half_state, first = run(flow, state, 40)
+    joined_state, second = run(flow, half_state, 60)
+    assert_same_state(joined_state, whole_state, 1e-10)
+    assert_same_tally(first + second, whole, 1e-10)
+
+
+def test_no_steps_change_nothing(run, flowing):
+    state = flowing(0.6)
+    after, tally = run(flow_of(), state, 0)
+    assert_same_state(after, state, 4 * EPS)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(tally))
+
+
+def test_change_of_a_number_compiles_nothing(run, flowing):
+    state = flowing(0.6)
+    run(flow_of(), state, 3)
+    before = run.compiled.traces
+    for change in (
+        {"restitution": 0.9},
+        {"packing_fraction": 0.59},
+        {"timestep": 1e-5},
+        {"shear_rate": 2.0},
+        {"tolerance": 1e-3},
+        {"max_iterations": 7},
+        {"polydispersity": 0.1},
+    ):
+        run(flow_of(**change), state, 5)
+    assert run.compiled.traces == before
+
+
+def test_contact_buffers_hold_every_planar_network():
+    for grains in (16, 32, 1000):
+        sizes = contact_capacities(grains)
+        assert list(sizes) == sorted(sizes) and sizes[-1] == 3 * grains
+
+
+def test_deep_overlap_is_reported(run, scene):
+    for overlap, expected in ((0.02, Status.deep_overlap), (0.005, Status.ok)):
+        _, tally = run(flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1)
+        assert tally.status == expected
+        np.testing.assert_allclose(tally.largest_overlap, overlap, rtol=0, atol=8 * EPS)
+
+
+def test_cap_of_iterations_is_reported(run, flowing):
+    state, tally = run(flow_of(0.75, restitution=0.1, max_iterations=1), flowing(0.75), 100)
+    assert tally.status == Status.iteration_limit
+    assert 0 < tally.unconverged <= tally.solves
+    assert np.all(np.isfinite(state.velocities))
+
+
+def test_grain_too_fast_for_the_lists_is_reported(run, flowing):
+    state = flowing(0.6)
+    _, tally = run(flow_of(), replace(state, velocities=state.velocities.at[0, 0].add(1e5)), 20)
+    assert tally.status >= Status.capacity
+
+
+def test_pairs_that_the_lists_cannot_hold_are_reported(run, flowing):
+    state = flowing(0.6)
+    heap = replace(state, positions=2 + 0.1 * state.positions)
+    assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * pytest.GRAINS
+    _, tally = run(flow_of(), heap, 3)
+    assert tally.status == Status.capacity
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("field", ["positions", "velocities"])
+def test_state_that_is_not_finite_stops_at_once(run, flowing, field, bad):
+    state = flowing(0.6)
+    spoilt = replace(state, **{field: getattr(state, field).at[3, 1].set(bad)})
+    _, tally = run(flow_of(), spoilt, 2_000_000_000)
+    assert tally.status == Status.nonfinite
+    assert tally.steps == 0
+
+
+# Three replicas with numbers of their own
+
+
+@pytest.fixture(scope="module")
+def replicas(flowing):
+    """Flows and states of three replicas, stacked."""
+    points = [(0.6, 0.5), (0.75, 0.1), (0.5, 0.9)]
+    flows = [flow_of(nu, restitution=alpha) for nu, alpha in points]
+    states = [flowing(nu) for nu, _ in points]
+    return stacked(flows), stacked(states)
+
+
+def stacked(trees):
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def replica(tree, index: int):
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+@pytest.fixture(scope="module")
+def traced_batch(replicas):
+    batch = jax.vmap(advance, in_axes=(0, 0, None), axis_name="replica")
+    return jax.jit(batch).trace(*replicas, jnp.int32(0))
+
+
+@pytest.fixture(scope="module")
+def batches(traced_batch):
+    """The two ways to advance a batch: all replicas at once, and one after the other."""
+    together = traced_batch.lower().compile()
+    in_turn = jax.jit(lambda flows, states, steps: jax.lax.map(lambda each: advance(*each, steps), (flows, states)))
+    return {"vmap": together, "map": in_turn}
+
+
+@pytest.mark.parametrize("way", ["vmap", "map"])
+def test_batch_advances_as_single_runs_do(run, replicas, batches, way):
+    flows, states = replicas
+    after, tallies = batches[way](flows, states, jnp.int32(100))
+    for index in range(3):
+        flow = jax.tree.map(lambda leaf, index=index: leaf[index].item(), flows)
+        single, tally = run(flow, replica(states, index), 100)
+        assert tally.solves > 0
+        assert_same_state(replica(after, index), single, 1e-10)
+        assert_same_tally(replica(tallies, index), tally, 1e-10)
+
+
+@pytest.mark.parametrize("way", ["vmap", "map"])
+def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batches, way):
+    flows, states = replicas
+    _, others = stacked([flow_of()] * 3), stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
+    result, changed = (batches[way](flows, each, jnp.int32(200)) for each in (states, others))
+    assert_identical(replica(result, 0), replica(changed, 0))
+
+
+@pytest.mark.parametrize("way", ["vmap", "map"])
+@pytest.mark.parametrize("field", ["positions", "velocities"])
+def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batches, field, way):
+    flows, states = replicas
+    spoilt = replace(states, **{field: getattr(states, field).at[1, 0, 0].set(jnp.nan)})
+    healthy, _ = batches[way](flows, states, jnp.int32(200)), None
+    result = batches[way](flows, spoilt, jnp.int32(200))
+    np.testing.assert_array_equal(result[1].status, [Status.ok, Status.nonfinite, Status.ok])
+    for index in (0, 2):
+        assert_identical(replica(result, index), replica(healthy, index))
+
+
+def equations_of(jaxpr) -> list:
+    """All equations of a program, those of its branches and loops included."""
+    inner = [each for equation in jaxpr.eqns for each in jaxprs_in_params(equation.params)]
+    return [*jaxpr.eqns, *(equation for each in inner for equation in equations_of(each))]
+
+
+def test_control_flow_of_a_batch_stays_control_flow(traced_batch, flowing):
+    """A branch or loop on a predicate that differs between replicas would pay for all branches, for all replicas."""
+    single = jax.make_jaxpr(advance)(flow_of(), flowing(0.6), jnp.int32(0))
+    batch, alone = equations_of(traced_batch.jaxpr.jaxpr), equations_of(single.jaxpr)
+    for name in ("cond", "while"):
+        found = [equation for equation in batch if equation.primitive.name == name]
+        assert len(found) == sum(equation.primitive.name == name for equation in alone)
+        assert len(found) >= 2
+        for equation in found:
+            if name == "cond":
+                assert equation.invars[0].aval.shape == ()
+            else:  # a batched predicate would be reduced over the replicas outside pmax
+                inside = [each.primitive.name for each in equations_of(equation.params["cond_jaxpr"].jaxpr)]
+                assert "reduce_or" not in inside
+
+
+def test_single_precision_stays_single(flowing):
+    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(tolerance=1e-4), flowing(0.6)))
+    state, tally = jax.eval_shape(advance, replace(flow, max_iterations=jnp.int32(99)), state, jnp.int32(3))
+    numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert set(numbers) == {jnp.dtype("float32")}

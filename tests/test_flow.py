@@ -1,0 +1,117 @@
+"""ShearFlow: accepted ranges, refusals in one sentence, behaviour as a pytree."""
+
+import re
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxgran.flow import MAX_PACKING_FRACTION, MIN_GRAINS, ShearFlow
+
+FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+NUMBERS = ("restitution", "packing_fraction", "timestep", "shear_rate", "polydispersity", "tolerance", "max_iterations")
+
+RANGES = {
+    "grains": "a whole number of at least 16",
+    "restitution": "between 0 and 1",
+    "packing_fraction": "above 0 and at most 0.83",
+    "timestep": "a positive number",
+    "shear_rate": "a positive number",
+    "polydispersity": "between 0 and 0.5",
+    "tolerance": "between 1e-12 and 0.1",
+    "max_iterations": "a whole number of at least 1",
+    "activation": "midpoint or touching",
+    "solver": "nesterov or jacobi",
+}
+
+
+def refusal(**change) -> str:
+    with pytest.raises(ValueError) as caught:
+        replace(FLOW, **change)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("grains", value) for value in (15, 0, -3, 64.0, "64", True, None, [64])],
+        *[("restitution", value) for value in (-1e-9, 1.1, np.inf)],
+        *[("packing_fraction", value) for value in (0.0, -0.5, 0.831, 1.0)],
+        *[("timestep", value) for value in (0.0, -1e-3, np.inf)],
+        *[("shear_rate", value) for value in (0.0, -1.0, np.inf)],
+        *[("polydispersity", value) for value in (-0.1, 0.51)],
+        *[("tolerance", value) for value in (0.0, 1e-13, 0.2)],
+        *[("max_iterations", value) for value in (0, -1, 2**31, 2.5)],
+        *[(name, value) for name in NUMBERS for value in (np.nan, "0.05", True, 0.05j, [0.05, 0.1])],
+        *[("activation", value) for value in ("Midpoint", "", 1, None)],
+        *[("solver", value) for value in ("gauss-seidel", "", 0, None)],
+    ],
+)
+def test_bad_value_is_refused_in_one_sentence_with_the_range(name, value):
+    words = refusal(**{name: value})
+    assert words.startswith(f"{name} must be {RANGES[name]}, not ")
+    assert words.endswith(".") and "\n" not in words
+
+
+@pytest.mark.parametrize(("timestep", "shear_rate"), [(0.2, 1.0), (0.06, 2.0), (np.array([1e-3, 0.2]), 1.0)])
+def test_step_in_which_a_grain_crosses_a_tenth_of_a_diameter_is_refused(timestep, shear_rate):
+    assert refusal(timestep=timestep, shear_rate=shear_rate).startswith(
+        "timestep must be at most 0.1 / shear_rate, not "
+    )
+
+
+@pytest.mark.parametrize("array", [np.array, jnp.asarray])
+def test_one_bad_replica_refuses_the_batch(array):
+    assert re.match("restitution must be between 0 and 1", refusal(restitution=array([0.5, 1.5])))
+    assert re.match("packing_fraction must be", refusal(packing_fraction=array([0.5, np.nan])))
+
+
+@settings(derandomize=True, deadline=None)
+@given(
+    st.integers(MIN_GRAINS, 10**6),
+    st.floats(0, 1),
+    st.floats(0, MAX_PACKING_FRACTION, exclude_min=True),
+    st.floats(0, 0.1, exclude_min=True),
+)
+def test_every_value_of_the_ranges_is_accepted(grains, restitution, packing_fraction, timestep):
+    flow = ShearFlow(grains, restitution, packing_fraction, timestep)
+    assert (flow.restitution, flow.packing_fraction, flow.timestep) == (restitution, packing_fraction, timestep)
+
+
+def test_faster_shear_needs_a_shorter_step():
+    replace(FLOW, timestep=0.2, shear_rate=0.5)
+    replace(FLOW, timestep=0.1)
+
+
+def test_flow_is_a_pytree_of_its_numbers():
+    leaves, structure = jax.tree.flatten(FLOW)
+    assert leaves == [getattr(FLOW, name) for name in NUMBERS]
+    assert jax.tree.unflatten(structure, leaves) == FLOW
+    for change in ({"grains": 65}, {"activation": "touching"}, {"solver": "jacobi"}):
+        assert jax.tree.structure(replace(FLOW, **change)) != structure
+
+
+def test_batch_of_flows_is_a_flow_of_arrays():
+    batch = replace(FLOW, restitution=np.array([0.1, 0.5, 0.9]), timestep=jnp.array([1e-3, 1e-4, 1e-5]))
+    assert batch.is_batch and not FLOW.is_batch
+    axes = jax.tree.map(lambda values: 0 if np.ndim(values) else None, batch)
+    products = jax.vmap(lambda flow: flow.restitution * flow.timestep, in_axes=(axes,))(batch)
+    np.testing.assert_array_equal(products, batch.restitution * np.asarray(batch.timestep))
+    stacked = jax.tree.map(lambda *values: np.stack(values), FLOW, replace(FLOW, restitution=0.9))
+    assert stacked.is_batch and stacked.grains == 64
+    np.testing.assert_array_equal(stacked.restitution, [0.5, 0.9])
+
+
+def test_traced_numbers_are_not_judged():
+    assert jax.jit(lambda value: replace(FLOW, restitution=value).restitution)(2.0) == 2.0
+    slopes = jax.grad(lambda flow: flow.restitution * flow.timestep, allow_int=True)(FLOW)
+    assert slopes.restitution == FLOW.timestep
+
+
+def test_midpoint_looks_half_a_step_ahead():
+    assert FLOW.activation_fraction == 0.5
+    assert replace(FLOW, activation="touching").activation_fraction == 0

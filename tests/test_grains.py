@@ -1,0 +1,30 @@
+"""Stratified sample of the size distribution."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxgran.grains import polydisperse
+
+EPS = np.finfo(float).eps
+
+
+@pytest.mark.parametrize("count", [16, 17, 1000])
+@pytest.mark.parametrize("polydispersity", [0.0, 0.26, 0.5])
+def test_sample_is_a_stratified_uniform_distribution(count, polydispersity):
+    grains = polydisperse(count, polydispersity, jax.random.key(0))
+    diameters = 2 * np.asarray(grains.radii)
+    assert abs(np.mean(diameters) - 1) <= 2 * EPS  # exactly one, but for the rounding of single diameters
+    np.testing.assert_array_equal(grains.masses, diameters**2)
+    edges = 1 + polydispersity * np.linspace(-1, 1, count + 1)
+    middles = (edges[1:] + edges[:-1]) / 2
+    np.testing.assert_allclose(np.sort(diameters), middles, rtol=0, atol=4 * EPS)
+
+
+def test_key_permutes_the_sizes_and_nothing_else():
+    one, two, again = (np.asarray(polydisperse(64, 0.26, jax.random.key(seed)).radii) for seed in (0, 1, 0))
+    np.testing.assert_array_equal(one, again)
+    np.testing.assert_array_equal(np.sort(one), np.sort(two))
+    assert np.mean(one == two) < 0.2
+    neighbours = np.corrcoef(one[1:], one[:-1])[0, 1]
+    assert abs(neighbours) < 4 / np.sqrt(63)  # standard error of a correlation of independent numbers

@@ -1,0 +1,154 @@
+"""Averages are the means of the contacts and grains that were tallied."""
+
+import numpy as np
+import pytest
+
+from jaxgran.observables import OBSERVABLES, TENSORS, averages
+from jaxgran.tally import Tally, empty_tally
+from synthetic import random_tally
+
+GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
+
+DATASET_NAMES = (
+    "force_ratio contact_force binary_force pressure contact_pressure binary_pressure kinetic_pressure shear_stress "
+    "contact_shear_stress binary_shear_stress kinetic_shear_stress granular_temperature coordination_number "
+    "macroscopic_friction inertial_number collision_rate iterations max_overlap "
+    "contact_stress binary_stress kinetic_stress stress_ratio"
+).split()
+
+
+@pytest.fixture(scope="module")
+def microscopic() -> dict[str, list[np.ndarray]]:
+    """Contacts of a few time steps, a list of arrays over the contacts of each, and the velocities of each."""
+    rng = np.random.default_rng(0)
+    counts = [7, 0, 5, 9, 0, 0, 3]
+    return {
+        "impulses": [rng.gamma(2.0, 0.1, n) * rng.integers(0, 2, n) for n in counts],
+        "binary": [rng.gamma(2.0, 0.1, n) * rng.integers(0, 2, n) for n in counts],
+        "branches": [rng.normal(size=(n, 2)) for n in counts],
+        "velocities": [rng.normal(size=(GRAINS, 2)) for _ in counts],
+        "masses": [rng.uniform(0.5, 1.5, GRAINS)],
+        "iterations": [np.array(float(n)) for n in counts],
+    }
+
+
+@pytest.fixture(scope="module")
+def tally(microscopic) -> Tally:
+    def moment(impulses: str) -> np.ndarray:
+        total = np.zeros((2, 2))
+        for p, branch in zip(microscopic[impulses], microscopic["branches"], strict=True):
+            for k in range(len(p)):
+                total += p[k] * np.outer(branch[k], branch[k]) / np.linalg.norm(branch[k])
+        return total
+
+    masses = microscopic["masses"][0]
+    kinetic = sum(np.einsum("i,ia,ib->ab", masses, c, c) * TIMESTEP for c in microscopic["velocities"])
+    impulses, binary = (np.concatenate(microscopic[name]) for name in ("impulses", "binary"))
+    steps = len(microscopic["impulses"])
+    return Tally(
+        duration=np.float64(steps * TIMESTEP),
+        steps=np.float64(steps),
+        impulse=impulses.sum(),
+        binary_impulse=binary.sum(),
+        contact_moment=moment("impulses"),
+        binary_moment=moment("binary"),
+        kinetic_moment=kinetic,
+        dissipation=np.float64(0.3),
+        contacts=np.float64(len(impulses)),
+        loaded_contacts=np.float64(np.sum(impulses > 0)),
+        collisions=np.float64(np.sum(binary > 0)),
+        solves=np.float64(4.0),
+        iterations=np.float64(24.0),
+        unconverged=np.float64(1.0),
+        residual=np.float64(2e-4),
+        largest_overlap=np.float64(3e-3),
+        status=np.int32(0),
+    )
+
+
+@pytest.fixture(scope="module")
+def measured(tally) -> dict[str, np.ndarray]:
+    found = averages(tally, np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
+    return {name: np.asarray(value) for name, value in found.items()}
+
+
+def stress_over_steps(microscopic, impulses: str) -> np.ndarray:
+    """Σ^{ab} = (1/A) Σ σ^a F^b with F = p n / dt, averaged over the time steps."""
+    stresses = []
+    for p, branch in zip(microscopic[impulses], microscopic["branches"], strict=True):
+        force = (p / TIMESTEP)[:, None] * branch / np.linalg.norm(branch, axis=1, keepdims=True)
+        stresses.append(np.einsum("ca,cb->ab", branch, force) / AREA)
+    return np.mean(stresses, axis=0)
+
+
+def test_forces_are_means_over_the_contacts(microscopic, measured) -> None:
+    forces, binary = (np.concatenate(microscopic[name]) / TIMESTEP for name in ("impulses", "binary"))
+    assert measured["contact_force"] == pytest.approx(forces.mean())
+    assert measured["binary_force"] == pytest.approx(binary.mean())
+    assert measured["force_ratio"] == pytest.approx(forces.mean() / binary.mean())
+
+
+def test_stresses_are_time_averages_over_the_cell(microscopic, measured) -> None:
+    contact, binary = (stress_over_steps(microscopic, name) for name in ("impulses", "binary"))
+    masses = microscopic["masses"][0]
+    kinetic = np.mean([(masses[:, None] * c).T @ c / AREA for c in microscopic["velocities"]], axis=0)
+    for name, stress in (("contact", contact), ("binary", binary), ("kinetic", kinetic)):
+        np.testing.assert_allclose(measured[f"{name}_stress"], stress, rtol=1e-12)
+        assert measured[f"{name}_pressure"] == pytest.approx(np.trace(stress) / 2)
+        assert measured[f"{name}_shear_stress"] == pytest.approx(-stress[0, 1])
+    total = contact + kinetic
+    assert measured["pressure"] == pytest.approx(np.trace(total) / 2)
+    assert measured["shear_stress"] == pytest.approx(-total[0, 1])
+    assert measured["macroscopic_friction"] == pytest.approx(-total[0, 1] / (np.trace(total) / 2))
+    assert measured["inertial_number"] == pytest.approx(SHEAR_RATE / np.sqrt(np.trace(total) / 2))
+    np.testing.assert_allclose(measured["stress_ratio"], contact / binary, rtol=1e-12)
+
+
+def test_temperature_is_kinetic_energy_over_2n(microscopic, measured) -> None:
+    masses = microscopic["masses"][0]
+    energies = [np.sum(masses[:, None] * c**2) / (2 * GRAINS) for c in microscopic["velocities"]]
+    assert measured["granular_temperature"] == pytest.approx(np.mean(energies))
+
+
+def test_counts_are_per_grain_and_step(microscopic, measured, tally) -> None:
+    impulses, binary = microscopic["impulses"], microscopic["binary"]
+    assert measured["coordination_number"] == pytest.approx(np.mean([2 * len(p) / GRAINS for p in impulses]))
+    loaded = np.mean([2 * np.sum(p > 0) / GRAINS for p in impulses])
+    assert measured["loaded_coordination_number"] == pytest.approx(loaded)
+    strain = SHEAR_RATE * TIMESTEP * len(impulses)
+    assert measured["collision_rate"] == pytest.approx(2 * np.sum(np.concatenate(binary) > 0) / GRAINS / strain)
+    assert measured["iterations"] == 6.0
+    assert measured["unconverged_share"] == 0.25
+    assert measured["residual"] == pytest.approx(5e-5)
+    assert measured["max_overlap"] == tally.largest_overlap
+
+
+def test_leading_axes_are_kept() -> None:
+    tally = random_tally(np.random.default_rng(1), 3, 4)
+    found = averages(tally, np.full((3, 4), AREA), GRAINS, np.full((3, 4), SHEAR_RATE))
+    for name, value in found.items():
+        assert value.shape == ((3, 4, 2, 2) if name in TENSORS else (3, 4)), name
+
+
+def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
+    found = averages(empty_tally(np.dtype(float)), np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
+    for name in ("force_ratio", "contact_force", "binary_force", "iterations", "residual", "stress_ratio"):
+        assert np.isnan(found[name]).all(), name
+
+
+def test_free_flow_has_no_ratio_but_a_pressure() -> None:
+    nothing = dict.fromkeys(("impulse", "binary_impulse", "contacts", "collisions", "solves", "iterations"), 0.0)
+    moments = dict.fromkeys(("contact_moment", "binary_moment"), np.zeros((2, 2)))
+    tally = Tally(**{**vars(random_tally(np.random.default_rng(2))), **nothing, **moments})
+    found = averages(tally, np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
+    assert np.isnan(found["force_ratio"])
+    assert found["pressure"] == found["kinetic_pressure"] > 0
+    assert found["coordination_number"] == found["collision_rate"] == 0
+
+
+def test_every_promised_name_is_measured_with_a_unit(measured) -> None:
+    assert set(DATASET_NAMES) <= set(OBSERVABLES)
+    assert set(measured) == set(OBSERVABLES)
+    assert set(TENSORS) == {name for name, value in measured.items() if value.shape == (2, 2)}
+    for long_name, units in OBSERVABLES.values():
+        assert long_name and units

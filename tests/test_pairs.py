@@ -1,0 +1,147 @@
+"""Neighbour lists against brute force: complete while they are valid, also after large shear; never silently short."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import gaps_of
+
+from jaxgran import pairs
+from jaxgran.cell import displacement
+from jaxgran.grains import Grains
+from jaxgran.pairs import (
+    Frame,
+    Neighbourhood,
+    consumed_skin,
+    first_true,
+    neighbourhood,
+    present,
+    refresh,
+    separations_now,
+)
+
+EPS = np.finfo(float).eps
+
+
+compiled_first = jax.jit(first_true, static_argnums=1)
+build = jax.jit(neighbourhood)
+
+
+@pytest.mark.parametrize(("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)])
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.99, 1.0]))
+def test_first_true_entries(length, size, seed, density):
+    mask = np.random.default_rng(seed).random(length) < density
+    expected = np.nonzero(mask)[0][:size]
+    expected = np.concatenate([expected, np.full(size - len(expected), length)])
+    np.testing.assert_array_equal(compiled_first(mask, size), expected)
+
+
+@jax.jit
+def move(hood: Neighbourhood, grains: Grains, side, displacements, strain):
+    """The neighbourhood after a motion, with new lists where the old ones would no longer be valid."""
+    moved = Frame(hood.frame.displacements + displacements, hood.frame.strain + strain)
+    valid = consumed_skin(moved, hood.near_frame, 2 * jnp.max(grains.radii)) <= hood.near.skin
+    now = Neighbourhood(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
+    now = jax.lax.cond(valid, lambda: now, lambda: refresh(now, grains, side, jnp.asarray(True)))
+    return now, ~valid, *present(now, side)
+
+
+@jax.jit
+def both_separations(hood: Neighbourhood, side):
+    positions, tilt = present(hood, side)
+    listed = hood.near
+    direct = displacement(positions[listed.i], positions[listed.j], side, tilt)
+    return separations_now(listed, hood.frame), direct
+
+
+def listed_pairs(listed) -> set:
+    """The pairs of a list, each once."""
+    filled = np.asarray(listed.reach) > 0
+    found = [tuple(sorted(pair)) for pair in zip(listed.i[filled].tolist(), listed.j[filled].tolist(), strict=True)]
+    assert len(found) == len(set(found))
+    assert all(i != j for i, j in found)
+    return set(found)
+
+
+def pairs_within(gap: float, positions, radii, side, tilt) -> set:
+    return set(zip(*(axis.tolist() for axis in np.nonzero(gaps_of(positions, radii, side, tilt) <= gap)), strict=True))
+
+
+@pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0), (0.02, -0.02)])
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
+def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, packing_fraction, motion, shear):
+    """Random motion of every grain and shear over several remaps of the tilt, with the pairs of brute force."""
+    state, rng = packed(packing_fraction), np.random.default_rng(5)
+    side, radii = float(state.side), np.asarray(state.grains.radii)
+    hood = build(state.positions, state.grains, state.side, state.tilt)
+    touching = rebuilds = remaps = 0
+    for _ in range(120):
+        before = float(hood.tilt + hood.frame.strain)
+        moves = motion * rng.normal(size=state.positions.shape)
+        hood, rebuilt, positions, tilt = move(hood, state.grains, state.side, moves, jnp.asarray(shear))
+        assert not (hood.near.overflow | hood.outer.overflow)
+        touch = pairs_within(0, positions, radii, side, tilt)
+        assert touch <= listed_pairs(hood.near)
+        touching, rebuilds, remaps = (
+            touching + len(touch),
+            rebuilds + bool(rebuilt),
+            remaps + bool(abs(before - tilt) > 0.4),
+        )
+        if rebuilt:
+            assert pairs_within(float(hood.near.skin) - 1e-12, positions, radii, side, tilt) <= listed_pairs(hood.near)
+        frozen, direct = both_separations(hood, state.side)
+        short = np.linalg.norm(direct, axis=-1) < 0.49 * side
+        filled = np.asarray(hood.near.reach) > 0
+        np.testing.assert_allclose(frozen[filled & short], direct[filled & short], rtol=0, atol=64 * EPS * side)
+        assert np.all(np.linalg.norm(frozen, axis=-1)[~filled] > 2 * side)
+    assert rebuilds >= 2
+    assert touching > 30 or motion == 0
+    assert remaps >= round(abs(120 * shear)) - 1
+
+
+def test_lists_are_built_for_every_tilt(packed):
+    state = packed(0.8)
+    for tilt in (-0.5, -0.2, 0.3, 0.49999):
+        hood = build(state.positions, state.grains, state.side, jnp.asarray(tilt))
+        for listed in (hood.outer, hood.near):
+            assert not listed.overflow and listed.skin > 0
+            near = pairs_within(float(listed.skin) - 1e-12, state.positions, state.grains.radii, state.side, tilt)
+            assert near <= listed_pairs(listed)
+
+
+def test_lists_of_a_dilute_flow_reach_far(packed):
+    """The skin grows with the free path, up to half of the cell."""
+    dilute, dense = (build(s.positions, s.grains, s.side, s.tilt).near.skin for s in (packed(0.1), packed(0.8)))
+    assert dilute > 4 * dense > 0
+
+
+def clustered(count: int, side: float, seed: int) -> np.ndarray:
+    return 1 + np.random.default_rng(seed).uniform(0, side / 3, (count, 2))
+
+
+@pytest.mark.parametrize("buffer", ["NEAR_PAIRS_PER_GRAIN", "OUTER_PAIRS_PER_GRAIN"])
+def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
+    """With a buffer that is too small a list is complete, or says that it is not: by its flag or a skin used up."""
+    state, flags = packed(0.7), []
+    monkeypatch.setattr(pairs, buffer, 2)
+    tiny = jax.jit(lambda *arguments: neighbourhood(*arguments))
+    for seed in range(6):
+        places = state.positions if seed == 0 else clustered(len(state.positions), float(state.side), seed)
+        hood = tiny(places, state.grains, state.side, state.tilt)
+        touch = pairs_within(0, places, state.grains.radii, state.side, state.tilt)
+        flags.append(bool(hood.near.overflow) or float(hood.near.skin) < 0)
+        assert flags[-1] or touch <= listed_pairs(hood.near)
+    assert any(flags)
+    assert bool(hood.near.overflow)
+
+
+def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
+    monkeypatch.setattr(pairs, "OUTER_PAIRS_PER_GRAIN", 1)
+    monkeypatch.setattr(pairs, "NEAR_PAIRS_PER_GRAIN", 10)
+    state = packed(0.7)
+    places = clustered(len(state.positions), float(state.side), 0)
+    hood = jax.jit(lambda *arguments: neighbourhood(*arguments))(places, state.grains, state.side, state.tilt)
+    assert hood.outer.overflow and hood.near.overflow

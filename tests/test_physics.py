@@ -1,0 +1,185 @@
+"""Laws that cross modules: rebound, energy, momentum, power balance, Bagnold's scaling, simultaneous impacts."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import gaps_of, kinetic_energy
+
+from jaxgran.cell import displacement, relative_velocity
+from jaxgran.dynamics import State
+from jaxgran.flow import ShearFlow
+from jaxgran.status import Status
+
+EPS = np.finfo(float).eps
+
+
+def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
+    numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
+    return ShearFlow(pytest.GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
+
+
+def pair_velocity(state: State) -> np.ndarray:
+    """Velocity of grain 0 seen from grain 1 in the laboratory, shear rate one."""
+    r, c = np.asarray(state.positions), np.asarray(state.velocities)
+    return c[0] - c[1] + (r[0] - r[1])[1] * np.array([1, 0])
+
+
+def momentum(state: State) -> np.ndarray:
+    return np.sum(np.asarray(state.grains.masses)[:, None] * np.asarray(state.velocities), axis=0)
+
+
+def energy(state: State) -> float:
+    return kinetic_energy(state.grains.masses, state.velocities)
+
+
+@pytest.mark.parametrize("restitution", [k / 10 for k in range(11)])
+def test_two_discs_rebound_with_the_coefficient_of_restitution(run, scene, restitution):
+    """At 200 random phases of the step, speeds, angles, sizes and offsets; the normal is that of the change itself."""
+    rng = np.random.default_rng(int(10 * restitution))
+    for _ in range(200):
+        radii, angle, offset = rng.uniform(0.37, 0.63, 2), rng.uniform(0, 2 * np.pi), rng.uniform(-0.8, 0.8)
+        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        speed, timestep = rng.uniform(1, 10), 10 ** rng.uniform(-5, -3)
+        reach = np.sum(radii)
+        travel = rng.uniform(1, 3) * speed * timestep
+        apart = along * (np.sqrt(1 - offset**2) * reach + travel) + across * offset * reach
+        places, drift = 8 + np.array([apart, [0, 0]]), rng.normal(size=2)
+        share = rng.uniform(0, 1)
+        before = scene(places, [drift - share * speed * along, drift + (1 - share) * speed * along], radii)
+        after, tally = run(flow_of(0.02, restitution=restitution, timestep=timestep), before, 8)
+        assert tally.collisions > 0
+        kick = pair_velocity(after) - pair_velocity(before)
+        normal = kick / np.linalg.norm(kick)
+        assert normal @ (places[0] - places[1]) > 0.5 * reach
+        rebound = -(normal @ pair_velocity(after)) / (normal @ pair_velocity(before))
+        assert rebound == pytest.approx(restitution, rel=0, abs=1e-10)
+        assert tally.status == Status.ok
+
+
+@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+def test_three_touching_balls_in_a_row_share_the_momentum_at_once(run, scene, activation):
+    """The known answer of a simultaneous law, not that of Newton's cradle."""
+    before = scene([[3, 4], [4, 4], [5, 4]], [[1, 0], [0, 0], [0, 0]])
+    after, tally = run(flow_of(0.02, restitution=1.0, activation=activation), before, 1)
+    laboratory = np.asarray(after.velocities)[:3] + np.array([[4, 0]])
+    np.testing.assert_allclose(laboratory, [[-1 / 3, 0], [2 / 3, 0], [2 / 3, 0]], rtol=0, atol=1e-11)
+    assert tally.contacts == 2
+
+
+# Dense, inelastic networks at a coarse step, and single collisions
+POINTS = [(0.75, 1e-2), (0.6, 1e-3)]
+
+
+@pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.9, 1.0])
+def test_no_step_gains_energy_and_elastic_steps_keep_it(run, flowing, packing_fraction, timestep, restitution):
+    """In the frame of the contacts: the fall of the peculiar energy and the work of the shear on the impulses."""
+    state, flow = flowing(packing_fraction), flow_of(packing_fraction, restitution=restitution, timestep=timestep)
+    lost, exchanged = [], []
+    for _ in range(60):
+        after, tally = run(flow, state, 1)
+        turned = np.asarray(after.velocities) + timestep * np.asarray(after.velocities)[:, 1:] * [
+            1,
+            0,
+        ]  # before the flight
+        fall = energy(state) - kinetic_energy(state.grains.masses, turned)
+        loss = fall - float(tally.contact_moment[1, 0])
+        scale = energy(state) + float(tally.impulse)
+        assert loss == pytest.approx(float(tally.dissipation), rel=0, abs=1e-13 * scale)
+        lost.append(loss / scale)
+        exchanged.append(np.sum(np.abs(turned - np.asarray(state.velocities))))
+        state = after
+    assert np.sum(np.array(exchanged) > 1e-3) > 5
+    assert np.min(lost) >= -1e-13 if restitution < 1 else np.max(np.abs(lost)) <= 1e-8
+    assert np.max(lost) > 1e-5 or restitution == 1
+
+
+@pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
+def test_impulses_are_proportional_to_one_plus_restitution(run, flowing, packing_fraction):
+    state = flowing(packing_fraction)
+    flow, changes = flow_of(packing_fraction, timestep=1e-2), []
+    for restitution in (0.0, 0.3, 1.0):
+        after, tally = run(replace(flow, restitution=restitution), state, 1)
+        turned = np.asarray(after.velocities) + flow.timestep * np.asarray(after.velocities)[:, 1:] * [1, 0]
+        changes.append((turned - np.asarray(state.velocities)) / (1 + restitution))
+        sums = [tally.impulse, tally.binary_impulse, *np.ravel(tally.contact_moment)]
+        changes[-1] = np.append(changes[-1], np.array(sums) / (1 + restitution))
+    assert np.max(np.abs(changes[0])) > 0.1
+    np.testing.assert_allclose(changes[1:], [changes[0]] * 2, rtol=0, atol=64 * EPS * np.max(np.abs(changes[0])))
+
+
+@pytest.mark.parametrize("drift", [(0.0, 0.0), (0.3, 0.7)])
+def test_momentum_is_conserved(run, flowing, drift):
+    """m c_y stays, and m c_x falls by γ̇ m c_y t: a drift across the shear changes nothing in the laboratory."""
+    state = flowing(0.75)
+    state = replace(state, velocities=state.velocities + jnp.asarray([drift]))
+    flow, steps = flow_of(0.75, tolerance=1e-4), 400
+    after, tally = run(flow, state, steps)
+    before, time = momentum(state), steps * flow.timestep
+    assert tally.solves > 50
+    rounding = EPS * float(tally.impulse) * np.sqrt(tally.contacts)
+    np.testing.assert_allclose(momentum(after), before - [time * before[1], 0], rtol=0, atol=rounding)
+
+
+@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+@pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
+def test_shear_power_is_dissipation_and_change_of_energy(run, flowing, packing_fraction, timestep, activation):
+    state = flowing(packing_fraction)
+    flow = flow_of(packing_fraction, timestep=timestep, restitution=0.3, activation=activation, tolerance=1e-4)
+    after, tally = run(flow, state, 300)
+    power = -(tally.contact_moment + tally.kinetic_moment)[0, 1]  # ∫ τ γ̇ A dt with γ̇ = 1
+    assert tally.solves > 20 and tally.dissipation > 0
+    change = energy(after) - energy(state)
+    assert tally.dissipation + change == pytest.approx(float(power), rel=0, abs=1e-11 * float(tally.dissipation))
+
+
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
+def test_no_contact_is_missed_over_large_shear(run, flowing, packing_fraction):
+    """Overlaps by brute force stay within those that were met as contacts and one step of the fastest pair."""
+    state, flow, tilts = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.7, tolerance=1e-4), []
+    for _ in range(50):
+        state, tally = run(flow, state, 60)
+        assert tally.status == Status.ok
+        fastest = 2 * np.max(np.linalg.norm(state.velocities, axis=1)) + 1.3
+        deepest = -np.min(gaps_of(state.positions, state.grains.radii, state.side, state.tilt))
+        assert deepest <= tally.largest_overlap + fastest * flow.timestep
+        tilts.append(float(state.tilt))
+    assert np.sum(np.diff(tilts) < 0) == 3
+
+
+def test_moments_are_symmetric_and_the_stresses_compress(run, flowing):
+    _, tally = run(flow_of(0.75), flowing(0.75), 300)
+    for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment):
+        np.testing.assert_allclose(moment[0, 1], moment[1, 0], rtol=1e-12)
+        assert np.all(np.linalg.eigvalsh(moment) > 0)
+
+
+def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(run, flowing):
+    """Bagnold's scaling: rigid grains have no time scale but that of the shear."""
+    state, flow = flowing(0.75), flow_of(0.75, tolerance=1e-4)
+    faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)
+    slow, slow_tally = run(flow, state, 500)
+    fast, fast_tally = run(faster, replace(state, velocities=2 * state.velocities), 500)
+    assert slow_tally.solves > 50
+    np.testing.assert_array_equal(fast.positions, slow.positions)
+    np.testing.assert_array_equal(fast.tilt, slow.tilt)
+    np.testing.assert_array_equal(fast.velocities, 2 * slow.velocities)
+    powers = {"impulse": 2, "binary_impulse": 2, "contact_moment": 2, "binary_moment": 2, "kinetic_moment": 2}
+    powers |= {"dissipation": 4, "duration": 0.5}
+    for name, leaf in vars(slow_tally).items():
+        np.testing.assert_array_equal(getattr(fast_tally, name), powers.get(name, 1) * leaf, err_msg=name)
+
+
+def test_compiled_velocities_equal_the_interpreted_ones(flowing):
+    """Some releases of JAX return wrong numbers from compiled code, silently."""
+    state = flowing(0.75)
+    i, j = (np.arange(pytest.GRAINS), np.roll(np.arange(pytest.GRAINS), 5))
+
+    def relative(state: State):
+        separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)
+        return relative_velocity(state.velocities, i, j, separations, jnp.asarray(1.0))
+
+    np.testing.assert_allclose(jax.jit(relative)(state), relative(state), rtol=0, atol=64 * EPS * float(state.side))

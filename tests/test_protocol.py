@@ -1,0 +1,202 @@
+"""A flow starts as theory says, is sheared until it is steady by a stated criterion, and its time step is shortened."""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import one_sentence
+
+from jaxgran import protocol
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.protocol import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch, stack
+from jaxgran.status import Status
+
+GRAINS, TIMESTEP = 64, 1e-2
+FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
+
+
+def with_timesteps(*timesteps: float) -> ShearFlow:
+    return stack([replace(flow, timestep=dt) for flow, dt in zip(FLOWS, timesteps, strict=True)])
+
+
+def assert_same_bits(one: Any, other: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def replica(tree: Any, k: int) -> Any:
+    return jax.tree.map(lambda x: x[k], tree)
+
+
+@pytest.fixture(scope="module")
+def keys() -> jax.Array:
+    return jax.random.split(jax.random.key(0), 2)
+
+
+@pytest.fixture(scope="module")
+def batch(keys) -> Batch:
+    """Two replicas, sheared by 0.5."""
+    return prepare_batch(stack(FLOWS), keys, equilibrate=0.5)
+
+
+def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> None:
+    assert_same_bits(prepare_batch(stack(FLOWS), keys, equilibrate=0.5).state, batch.state)
+    other = prepare_batch(stack(FLOWS), keys[::-1], equilibrate=0.5)
+    assert not np.any(np.asarray(other.state.velocities) == np.asarray(batch.state.velocities))
+    np.testing.assert_array_equal(batch.strain, 0.5)
+
+
+def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
+    temperature = jnp.asarray([0.3, 2.0])
+    state, found = protocol._start(stack(FLOWS), keys, temperature)
+    masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
+    assert np.all(found)
+    np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)
+    measured = np.sum(masses[..., None] * velocities**2, axis=(1, 2)) / (2 * GRAINS)
+    np.testing.assert_allclose(measured, temperature, rtol=1e-12)
+    assert np.all(state.tilt == 0)
+
+
+def test_momentum_stays_zero_through_the_preparation(batch) -> None:
+    masses, velocities = np.asarray(batch.state.grains.masses), np.asarray(batch.state.velocities)
+    np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-10)
+
+
+def test_steady_noise_is_accepted_at_the_rate_of_its_criterion() -> None:
+    # Two errors hold 95.4 % of a Gaussian, and fewer where the error itself comes from few values.
+    rng = np.random.default_rng(0)
+    for length, least in ((6, 0.85), (40, 0.93)):
+        levels = [protocol._is_level(0.05 * rng.normal(size=length)) for _ in range(2000)]
+        assert np.mean(levels) > least - 4 * np.sqrt(least * (1 - least) / 2000)
+
+
+def test_a_drifting_record_is_refused() -> None:
+    rng = np.random.default_rng(1)
+    for length in (6, 20, 40):
+        drifting = np.linspace(0.0, 1.0, length) + 0.05 * rng.normal(size=(200, length))
+        relaxing = np.exp(-np.linspace(0.0, 2.0, length)) + 0.01 * rng.normal(size=(200, length))
+        assert not any(protocol._is_level(one) for one in drifting)
+        assert not any(protocol._is_level(one) for one in relaxing)
+
+
+def test_noise_that_hides_any_drift_is_refused() -> None:
+    assert not any(protocol._is_level(one) for one in np.random.default_rng(2).normal(size=(100, 12)))
+
+
+def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, sheared = np.random.default_rng(3), []
+
+    def chunk(batch: Batch, strain: np.ndarray, report):
+        sheared.append(strain)
+        return batch, None
+
+    def averages(*_):
+        n = len(sheared)
+        temperature = np.exp([0.02 * rng.normal(), n / 10, rng.normal(), 0.02 * rng.normal(), np.nan])
+        pressure = np.exp([0.02 * rng.normal(), 0.0, rng.normal(), -n / 10, np.nan])
+        return {"granular_temperature": temperature, "pressure": pressure}
+
+    monkeypatch.setattr(protocol, "_chunk", chunk)
+    monkeypatch.setattr(protocol, "_averages", averages)
+    start: Any = SimpleNamespace(side=np.full(5, 10.0))
+    theory: Any = SimpleNamespace(granular_temperature=np.full(5, 1.0), shear_stress=np.full(5, 0.2))
+    status = np.array([0, 0, 0, 0, Status.nonfinite])
+    flow = stack([FLOWS[0]] * 5)
+    end = protocol._until_steady(Batch(flow, start, status, np.zeros(5)), theory, None)
+    bad = Status.not_steady
+    np.testing.assert_array_equal(end.status, [Status.ok, bad, bad, bad, Status.nonfinite])
+    strain = np.array(sheared)
+    assert np.all(strain[:, 4] == 0)  # no work is done for a replica that is not finite
+    np.testing.assert_allclose(end.strain, strain.sum(axis=0))
+    assert 9 <= np.count_nonzero(strain[:, 0]) < 30
+    assert np.all(strain[:, 1] > 0)
+    # A chunk is at least half the strain in which the shear would heat the grains to their temperature, n T / τ.
+    assert strain[0, 0] == pytest.approx(GRAINS / 100 * 1.0 / 0.2 / 2)
+
+
+def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    record = []
+
+    def sheared(batch: Batch, strain: np.ndarray, report):
+        record.append((np.asarray(batch.flow.timestep), strain))
+        return batch
+
+    monkeypatch.setattr(protocol, "_sheared", sheared)
+    flow, coarse = with_timesteps(1e-5, 2e-4), with_timesteps(1e-3, 1e-3)
+    state: Any = SimpleNamespace(side=jnp.full(2, 10.0))
+    end = protocol._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2)), flow, None)
+    timesteps, strains = np.array([dt for dt, _ in record]), np.array([strain for _, strain in record])
+    ladder = np.vstack([coarse.timestep, timesteps])
+    np.testing.assert_allclose(ladder[1:] / ladder[:-1], [[10**-0.5, 0.2**0.25]] * 4, rtol=1e-6)
+    np.testing.assert_array_equal(timesteps[-1], flow.timestep)
+    np.testing.assert_array_equal(strains[-1], 0.5)
+    assert np.all(strains[:-1] > 0)
+    assert end.flow is flow
+
+    record.clear()
+    protocol._shortened(Batch(flow, state, np.zeros(2), np.zeros(2)), flow, None)
+    assert record == []
+
+
+def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
+    flow = with_timesteps(1e-4, 2e-2)
+    coarse = np.asarray(protocol._coarse_timestep(flow, predicted(flow)))
+    assert coarse[0] == protocol.COARSE_TIMESTEP
+    assert coarse[1] == 2e-2
+
+
+def test_a_time_step_too_long_is_a_sentence_that_names_the_longest() -> None:
+    flow = with_timesteps(0.08, 0.08)
+    theory = predicted(flow)
+    with pytest.raises(ValueError, match="timestep must be at most") as caught:
+        check_timestep(flow, theory)
+    message = str(caught.value)
+    assert isinstance(caught.value, InputError)
+    assert one_sentence(message)
+    assert "restitution 0.9 and packing fraction 0.6" in message  # the hotter of the two
+    longest = float(re.search(r"at most ([\d.e+-]+) at", message)[1])
+    crossed = longest * np.sqrt(2 * np.asarray(theory.granular_temperature)[1])  # at thermal speed
+    assert 0.09 < crossed <= 0.1
+    check_timestep(with_timesteps(longest, longest), theory)
+
+
+def test_prepare_refuses_a_time_step_too_long_for_its_flow() -> None:
+    with pytest.raises(ValueError, match="timestep must be at most"):
+        prepare(replace(FLOWS[1], timestep=0.08), jax.random.key(0))
+
+
+def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = batch._replace(status=np.array([Status.not_steady]))
+    monkeypatch.setattr(protocol, "prepare_batch", lambda *_: bad)
+    with pytest.raises(RuntimeError, match="not_steady"):
+        prepare(FLOWS[0], jax.random.key(0))
+
+
+def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identical(batch) -> None:
+    velocities = batch.state.velocities.at[1, 5, 0].set(jnp.nan)
+    broken = batch._replace(state=replace(batch.state, velocities=velocities))
+    end, measured = sample_batch(batch, strain=1.6)
+    broken_end, broken_measured = sample_batch(broken, strain=1.6)
+    assert broken_end.status[1] == Status.nonfinite
+    assert broken_end.status[0] == end.status[0] < Status.nonfinite
+    assert_same_bits(replica(broken_end.state, 0), replica(end.state, 0))
+    assert_same_bits(replica(broken_measured, 0), replica(measured, 0))
+
+
+def test_sample_that_drifts_is_not_steady() -> None:
+    rng = np.random.default_rng(4)
+    noise = 0.05 * rng.normal(size=(200, 16))
+    assert not any(protocol._drifts(one) for one in noise)
+    assert all(protocol._drifts(one) for one in noise + np.linspace(0.0, 1.0, 16))
+    assert not protocol._drifts(noise[0] + np.linspace(0.0, 0.1, 16))  # too little to matter
+    assert protocol._drifts(np.full(16, np.nan))
+
+
+def test_report_is_told_every_replica_step(batch) -> None:
+    told = []
+    sample_batch(batch, 1.6, told.append)
+    assert sum(told) == 2 * round(1.6 / TIMESTEP)

@@ -1,0 +1,75 @@
+"""Every mistake in the parameters of a map is one sentence that names the accepted range, before anything runs."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic import one_sentence
+
+from jaxgran.flow import InputError
+from jaxgran.settings import MapSettings
+
+GOOD: dict[str, Any] = {
+    "restitution": (0.5, 0.9),
+    "packing_fraction": (0.6,),
+    "grains": 64,
+    "seeds": 2,
+    "timestep": 1e-2,
+    "strain": 2.0,
+}
+
+MISTAKES: list[tuple[dict[str, Any], str]] = [
+    ({"restitution": (-0.1, 0.5)}, "between 0 and 1"),
+    ({"restitution": (0.5, 1.1)}, "between 0 and 1"),
+    ({"restitution": (float("nan"),)}, "between 0 and 1"),
+    ({"restitution": ()}, "at least one number"),
+    ({"restitution": (0.5, 0.1, 0.9)}, "sorted"),
+    ({"restitution": (0.5, 0.5)}, "without repetition"),
+    ({"restitution": ((0.1, 0.5), (0.7, 0.9))}, "a list of numbers"),
+    ({"packing_fraction": (0.0, 0.5)}, "above 0 and at most 0.83"),
+    ({"packing_fraction": (0.84,)}, "above 0 and at most 0.83"),
+    ({"packing_fraction": ()}, "at least one number"),
+    ({"packing_fraction": (0.7, 0.6, 0.65)}, "sorted"),
+    ({"grains": 15}, "at least 16"),
+    ({"grains": 64.0}, "a whole number"),
+    ({"seeds": 0}, "at least 1"),
+    ({"seeds": True}, "a whole number"),
+    ({"timestep": 0.0}, "a positive number"),
+    ({"timestep": -1e-3}, "a positive number"),
+    ({"timestep": float("nan")}, "a positive number"),
+    ({"timestep": 0.2}, "at most 0.1"),
+    ({"timestep": 0.09}, "at most"),  # a grain would cross more than a tenth of a diameter
+    ({"strain": 0.0}, "a positive number"),
+    ({"strain": float("inf")}, "a positive number"),
+    ({"strain": 0.1}, "at least 160 time steps"),
+    ({"equilibrate": -1.0}, "at least 0"),
+    ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
+    ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
+    ({"solver": "gauss"}, "nesterov or jacobi"),
+    ({"activation": "always"}, "midpoint or touching"),
+]
+
+
+@pytest.mark.parametrize(("mistake", "accepted"), MISTAKES, ids=lambda x: str(x) if isinstance(x, dict) else "")
+def test_a_mistake_is_one_sentence_with_the_accepted_range(mistake: dict[str, Any], accepted: str) -> None:
+    with pytest.raises(ValueError, match=accepted) as caught:
+        MapSettings(**{**GOOD, **mistake})
+    assert isinstance(caught.value, InputError)
+    assert one_sentence(str(caught.value))
+    assert next(iter(mistake)) in str(caught.value)
+
+
+def test_lists_may_fall_as_well_as_rise() -> None:
+    assert MapSettings(**{**GOOD, "restitution": (0.9, 0.5)}).restitution == (0.9, 0.5)
+
+
+def test_flows_are_the_points_packing_fraction_first() -> None:
+    settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6), "activation": "touching"})
+    points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
+    assert points == [(0.5, 0.7), (0.6, 0.7)]
+    for flow in settings.flows():
+        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-2, "touching")
+
+
+def test_numbers_of_numpy_are_accepted() -> None:
+    MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-2)})
