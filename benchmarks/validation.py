@@ -9,7 +9,6 @@ time step at all; the second, with the touching rule at dt = 1e-4, with another 
 
 import argparse
 import json
-import os
 from pathlib import Path
 
 import jax
@@ -19,6 +18,7 @@ from hardware import hardware
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from jaxgran.sweep import usable_cores
 
 # (packing fraction, restitution): temperature, pressure, shear stress; m = σ = γ̇ = 1
 EVENT_DRIVEN = {
@@ -48,7 +48,7 @@ def main() -> None:
     arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
     chosen = arguments.parse_args()
     jax.config.update("jax_enable_x64", True)
-    workers = len(os.sched_getaffinity(0))
+    workers = usable_cores()
 
     stresses = jg.ratio_map(
         [0.9, 0.7],

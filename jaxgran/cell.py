@@ -19,7 +19,9 @@ def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
     return tilt - jnp.floor(tilt + 0.5)
 
 
-def displacement(to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array) -> Float[Array, "*n 2"]:
+def displacement(
+    to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array
+) -> Float[Array, "*n 2"]:
     """Minimum-image separation ``to − origin``; exact for separations shorter than half the side."""
     d = to - origin
     rows = jnp.round(d[..., 1] / side)
@@ -30,19 +32,20 @@ def displacement(to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: A
 def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
     """The images of the positions with x and y in [0, L)."""
     rows = jnp.floor(positions[:, 1] / side)
+    rows = jnp.where(positions[:, 1] - rows * side >= side, rows + 1, rows)  # a tiny negative y plus L rounds to L
     x = positions[:, 0] - rows * tilt * side
-    wrapped = jnp.stack([x - side * jnp.floor(x / side), positions[:, 1] - rows * side], axis=-1)
-    return jnp.where(wrapped >= side, 0, wrapped)  # a tiny negative number plus L rounds to L
+    x = x - side * jnp.floor(x / side)
+    return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(positions[:, 1] - rows * side, 0)], axis=-1)
 
 
 def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:
     """The vectors with strain·y added to x."""
-    return vectors + strain * vectors[..., ::-1] * jnp.asarray([1, 0], vectors.dtype)
+    return vectors + strain * vectors[..., ::-1] * jnp.broadcast_to(jnp.asarray([1, 0], vectors.dtype), vectors.shape)
 
 
 def relative_velocity(
     velocities: Float[Array, "grains 2"], i: Array, j: Array, separations: Float[Array, "pairs 2"], shear_rate: Array
 ) -> Float[Array, "pairs 2"]:
     """Relative velocity of grain i seen from (the image of) grain j in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
-    shear = separations[:, ::-1] * jnp.asarray([1, 0], separations.dtype)
+    shear = separations[:, ::-1] * jnp.asarray([[1, 0]], separations.dtype)
     return velocities[i] - velocities[j] + shear_rate * shear

@@ -220,7 +220,7 @@ def _measure(
     jax = _configured_jax()
     from jaxgran.dataset import check_output, map_dataset, write_dataset
     from jaxgran.settings import MapSettings
-    from jaxgran.sweep import predicted_cost, replicas
+    from jaxgran.sweep import predicted_cost, replicas, usable_cores
 
     if output is not None:
         check_output(output)
@@ -231,7 +231,7 @@ def _measure(
     if workers is not None and workers > 1 and not on_cpu:
         raise InputError("workers must be 1 on an accelerator.")
     count = len(settings.flows()) * settings.seeds
-    workers = min(count, workers or (len(os.sched_getaffinity(0)) if on_cpu else 1))
+    workers = min(count, workers or (usable_cores() if on_cpu else 1))
     costs = [predicted_cost(flow) for flow in settings.flows()]
 
     results, start, interrupted = {}, time.perf_counter(), False

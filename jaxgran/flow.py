@@ -21,7 +21,6 @@ class InputError(ValueError):
 _STATIC = {"static": True}
 
 
-@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
@@ -47,7 +46,7 @@ class ShearFlow:
     ================  =================  ===============================================================
 
     Raises:
-      InputError: (a ValueError) a number is outside the range above (checked where it is known, that is outside ``jit``).
+      InputError: (a ValueError) a number is outside its range; traced numbers are not judged.
     """
 
     grains: int = field(metadata=_STATIC)
@@ -85,6 +84,28 @@ class ShearFlow:
         return any(np.ndim(getattr(self, f.name)) > 0 for f in fields(self) if not f.metadata.get("static"))
 
 
+_TRACED, _FIXED = (
+    tuple(f.name for f in fields(ShearFlow) if bool(f.metadata.get("static")) is static) for static in (False, True)
+)
+
+
+def _unflatten(fixed: tuple, traced: tuple) -> ShearFlow:
+    """A flow of any leaves, not judged: they may be derivatives, axes or placeholders."""
+    flow = object.__new__(ShearFlow)
+    for name, value in zip(_FIXED + _TRACED, (*fixed, *traced), strict=True):
+        object.__setattr__(flow, name, value)
+    return flow
+
+
+jax.tree_util.register_pytree_with_keys(
+    ShearFlow,
+    lambda flow: (
+        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED],
+        tuple(getattr(flow, name) for name in _FIXED),
+    ),
+    _unflatten,
+)
+
 _RANGES = {
     "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
     "packing_fraction": (
@@ -95,13 +116,13 @@ _RANGES = {
     "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
     "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
-    "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1), "a whole number of at least 1"),
+    "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), "a whole number of at least 1"),
 }
 
 
 def _known(value) -> np.ndarray | None:
     """The value as an array of numbers, or None while it is only traced or a placeholder of a pytree."""
-    numbers = (bool, int, float, str, np.generic, np.ndarray, jax.Array)
+    numbers = (bool, int, float, complex, str, list, tuple, np.generic, np.ndarray, jax.Array)
     if isinstance(value, Tracer) or not isinstance(value, numbers):
         return None
     return np.asarray(value)
@@ -112,5 +133,5 @@ def require(name: str, value, accepts, words: str) -> None:
     known = _known(value)
     if known is None:
         return
-    if known.dtype.kind not in "iuf" or not np.all(accepts(known)):
+    if isinstance(value, (list, tuple)) or known.dtype.kind not in "iuf" or not np.all(accepts(known)):
         raise InputError(f"{name} must be {words}, not {value!r}.")

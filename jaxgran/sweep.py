@@ -122,6 +122,11 @@ def replicas(
         listener.join()
 
 
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def predicted_cost(flow: ShearFlow) -> float:
     """Relative cost of a step of a flow, from measurements at dt = 1e-3: dense and dissipative flows form networks."""
     alpha, nu = float(flow.restitution), float(flow.packing_fraction)

@@ -1,0 +1,173 @@
+"""A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where positions resolve it."""
+
+import re
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import one_sentence, random_tally
+
+from jaxgran import protocol
+from jaxgran.dynamics import State
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.measure import BLOCKS, Sample, _sample, check_precision, sample
+from jaxgran.observables import OBSERVABLES
+from jaxgran.protocol import Batch, prepare_batch, sample_batch, stack
+from jaxgran.status import Status
+
+GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.32
+FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
+
+
+def replica(tree: Any, k: int) -> Any:
+    return jax.tree.map(lambda x: x[k], tree)
+
+
+def assert_agree(measured: Sample, expected: Sample) -> None:
+    """Counts are the same, and sums agree up to what rounding grows to within the strain."""
+    for name in ("steps", "contacts", "collisions", "solves"):
+        np.testing.assert_array_equal(getattr(measured.tally, name), getattr(expected.tally, name))
+    for name in ("impulse", "binary_impulse", "contact_moment", "kinetic_moment", "largest_overlap"):
+        np.testing.assert_allclose(getattr(measured.tally, name), getattr(expected.tally, name), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(measured.area, expected.area)
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    return prepare_batch(stack(FLOWS), jax.random.split(jax.random.key(0), 2), equilibrate=0.5)
+
+
+@pytest.fixture(scope="module")
+def state(batch) -> State:
+    return replica(batch.state, 0)
+
+
+@pytest.fixture(scope="module")
+def measured(state) -> tuple[State, Sample]:
+    return sample(FLOWS[0], state, STRAIN)
+
+
+def test_strain_is_rounded_to_whole_steps_and_shared_among_the_blocks(state, measured) -> None:
+    steps = np.asarray(measured[1].tally.steps)
+    assert steps.shape == (BLOCKS,)
+    np.testing.assert_array_equal(steps, 2)
+    uneven = np.asarray(sample(FLOWS[0], state, 0.374)[1].tally.steps)  # 37 steps
+    assert uneven.sum() == 37
+    assert uneven.max() - uneven.min() == 1
+
+
+def test_blocks_add_up_to_the_whole(batch, measured) -> None:
+    steps = jnp.asarray([round(STRAIN / TIMESTEP)] * 2, jnp.int32)
+    end, whole = protocol._advance(batch.flow, batch.state, steps)
+    tally, whole = measured[1].tally, replica(whole, 0)
+    for name in vars(tally):
+        if name not in ("largest_overlap", "status"):
+            np.testing.assert_allclose(np.sum(getattr(tally, name), axis=0), getattr(whole, name), rtol=1e-5, atol=1e-9)
+    assert np.max(tally.largest_overlap) == pytest.approx(float(whole.largest_overlap), rel=1e-5)
+    np.testing.assert_allclose(measured[0].velocities, end.velocities[0], atol=1e-6)
+    assert np.sum(tally.duration) == pytest.approx(STRAIN)
+
+
+def test_sample_of_a_batch_is_the_sample_of_each(batch, measured) -> None:
+    _, both = sample_batch(batch, STRAIN)
+    assert_agree(replica(both, 0), measured[1])
+
+
+def test_vmap_applies(batch, state, measured) -> None:
+    shear = jax.jit(jax.vmap(partial(sample, strain=STRAIN), axis_name="replica"))
+    _, both = shear(batch.flow, batch.state)
+    assert_agree(replica(both, 0), measured[1])
+    assert both.force_ratio.shape == both.status.shape == (2,)
+    assert both.contact_stress.shape == (2, 2, 2)
+    assert_agree(replica(both, 1), sample(FLOWS[1], replica(batch.state, 1), STRAIN)[1])
+
+
+def test_lax_map_and_jit_apply_with_a_traced_strain(batch, measured) -> None:
+    strain = jnp.asarray(STRAIN)
+    shear = jax.jit(lambda flow, state, strain: jax.lax.map(lambda x: sample(*x, strain), (flow, state)))
+    _, both = shear(batch.flow, batch.state, strain)
+    assert_agree(replica(both, 0), measured[1])
+
+
+def test_a_change_of_numbers_compiles_nothing_anew(state, measured) -> None:
+    compiled = _sample._cache_size()
+    sample(replace(FLOWS[0], restitution=0.6, packing_fraction=0.61, timestep=9e-3, tolerance=1e-5), state, 0.2)
+    assert _sample._cache_size() == compiled
+
+
+def test_averages_are_those_of_all_blocks_together() -> None:
+    tally = random_tally(np.random.default_rng(0), BLOCKS)
+    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+    assert one.force_ratio == pytest.approx(tally.impulse.sum() / tally.binary_impulse.sum())
+    stress = (tally.contact_moment + tally.kinetic_moment).sum(axis=0) / tally.duration.sum() / 100.0
+    assert one.pressure == pytest.approx(np.trace(stress) / 2)
+    assert one.shear_stress == pytest.approx(-stress[0, 1])
+    assert one.averages["max_overlap"] == tally.largest_overlap.max()
+    for name in ("granular_temperature", "contact_stress", "binary_stress", "kinetic_stress", "stress_ratio"):
+        np.testing.assert_array_equal(getattr(one, name), one.averages[name])
+
+
+def test_worst_status_of_the_blocks_wins() -> None:
+    tally = random_tally(np.random.default_rng(1), BLOCKS)
+    tally.status[3], tally.status[7] = Status.deep_overlap, Status.iteration_limit
+    assert Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS).status == Status.deep_overlap
+
+
+def test_every_average_has_an_error() -> None:
+    one = Sample(random_tally(np.random.default_rng(2), BLOCKS), np.float64(100.0), np.float64(1.0), GRAINS)
+    errors = one.errors()
+    assert set(errors) == set(OBSERVABLES)
+    for name, error in errors.items():
+        assert error.shape == one.averages[name].shape
+        assert np.all(error > 0), name
+
+
+def test_errors_of_a_batch_are_refused() -> None:
+    both = Sample(random_tally(np.random.default_rng(3), 2, BLOCKS), np.full(2, 100.0), np.ones(2), GRAINS)
+    with pytest.raises(ValueError, match="index it first"):
+        both.errors()
+    assert set(replica(both, 0).errors()) == set(OBSERVABLES)
+
+
+@pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), float("inf")])
+def test_strain_that_is_not_positive_is_one_sentence(state, strain: float) -> None:
+    with pytest.raises(ValueError, match="strain must be a positive number") as caught:
+        sample(FLOWS[0], state, strain)
+    assert isinstance(caught.value, InputError)
+    assert one_sentence(str(caught.value))
+
+
+def in_float32(state: State) -> State:
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float32), state)
+
+
+def test_float32_is_refused_where_it_cannot_resolve_the_time_step(state) -> None:
+    with jax.enable_x64(False):
+        single = in_float32(state)
+        with pytest.raises(ValueError, match="float64") as caught:
+            sample(replace(FLOWS[0], timestep=1e-5), single, 1.0)
+        message = str(caught.value)
+        assert one_sentence(message)
+        assert "float32" in message
+        least = float(re.search(r"at least ([\d.e+-]+) ", message)[1])
+        assert 1e-5 < least < 1e-4
+        check_precision(replace(FLOWS[0], timestep=least), single)
+    check_precision(replace(FLOWS[0], timestep=1e-5), state)  # float64 resolves it
+
+
+def test_float32_measures_what_float64_does_at_a_time_step_it_resolves(state) -> None:
+    # A tenth of a per cent: a hundred steps in which rounding has little time to grow.
+    flow = replace(FLOWS[0], timestep=1e-4)
+    _, double = sample(flow, state, 1e-2)
+    with jax.enable_x64(False):
+        _, single = sample(flow, in_float32(state), 1e-2)
+    assert single.pressure.dtype == jnp.float32
+    assert single.status == Status.ok
+    assert float(single.averages["kinetic_pressure"]) == pytest.approx(
+        float(double.averages["kinetic_pressure"]), rel=1e-3
+    )
+    assert float(np.sum(single.tally.steps)) == 100

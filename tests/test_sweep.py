@@ -1,0 +1,122 @@
+"""Every replica runs once, and its numbers depend on nothing but its seed and its place in the grid."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxgran import sweep
+from jaxgran.dataset import Key, Replica, map_dataset
+from jaxgran.flow import ShearFlow
+from jaxgran.settings import MapSettings
+from jaxgran.status import Status
+from jaxgran.sweep import predicted_cost, ratio_map, replicas
+
+SETTINGS = {
+    "restitution": (0.5, 0.9),
+    "packing_fraction": (0.6,),
+    "grains": 64,
+    "seeds": 2,
+    "timestep": 1e-2,
+    "equilibrate": 0.5,
+    "strain": 1.6,
+}
+
+
+@pytest.fixture(scope="module")
+def settings() -> MapSettings:
+    return MapSettings(**SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def results(settings) -> dict[Key, Replica]:
+    """The replicas of a map, run in pairs."""
+    return dict(replicas(settings, batch=2))
+
+
+def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
+    assert set(one) == set(other)
+    for key, replica in one.items():
+        jax.tree.map(np.testing.assert_array_equal, replica, other[key])
+
+
+numbers = st.floats(0.0, 1.0)
+
+
+@given(
+    points=st.lists(st.tuples(numbers, st.floats(0.01, 0.83)), min_size=1, max_size=12),
+    seeds=st.integers(1, 5),
+    batch=st.one_of(st.just("auto"), st.integers(1, 20)),
+    workers=st.integers(1, 4),
+)
+def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int, batch, workers: int) -> None:
+    flows = [ShearFlow(64, alpha, nu, 1e-3) for alpha, nu in points]
+    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, grains=64)
+    tasks = sweep._tasks(settings, batch, workers)
+    keys = [key for task in tasks for key in task]
+    assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
+    costs = [predicted_cost(flows[point]) for point, _ in keys]
+    assert costs == sorted(costs, reverse=True)
+    if batch != "auto":
+        assert max(map(len, tasks)) <= batch
+    assert len(tasks) >= min(workers, len(keys))  # no worker is idle
+
+
+def test_cost_grows_with_density_and_dissipation() -> None:
+    def cost(alpha: float, nu: float) -> float:
+        return predicted_cost(ShearFlow(64, alpha, nu, 1e-3))
+
+    assert cost(0.1, 0.8) > cost(0.5, 0.8) > cost(0.5, 0.6) > cost(0.9, 0.6)
+
+
+def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> None:
+    assert_same_bits(dict(replicas(settings, batch=1)), results)
+
+
+def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
+    mixed = [*sweep._run_task(settings, [(1, 1), (0, 0)]), *sweep._run_task(settings, [(1, 0), (0, 1)])]
+    assert_same_bits(dict(mixed), results)
+
+
+def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
+    told = []
+    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
+    steps = round(SETTINGS["strain"] / 1e-2) + round(SETTINGS["equilibrate"] / 1e-2)
+    assert sum(told) == pytest.approx(4 * steps)
+
+
+def test_replicas_of_a_point_differ(results) -> None:
+    ratios = {float(replica.sample.pressure) for replica in results.values()}
+    assert len(ratios) == 4
+
+
+def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
+    data = ratio_map(**SETTINGS, batch=2)
+    expected = map_dataset(settings, results, {})
+    np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
+    np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
+    assert set(data.attrs) - set(expected.attrs) == {"wall_time_seconds", "replica_steps_per_second"}
+    assert data.attrs["wall_time_seconds"] > 0
+    steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-2)
+    assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
+
+
+@pytest.mark.parametrize("mistake", [{"batch": 0}, {"batch": 1.5}, {"batch": "all"}, {"workers": 0}, {"workers": 2.0}])
+def test_batches_and_workers_that_cannot_be_are_one_sentence(mistake: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(mistake))} must be"):
+        ratio_map(**SETTINGS, **mistake)
+
+
+def test_small_flows_have_the_stresses_of_event_driven_discs() -> None:
+    # N = 1000 discs, ν = 0.6, α = 0.7 and 0.9. So few grains in so coarse steps are within 6 % of that.
+    data = ratio_map([0.7, 0.9], [0.6], grains=64, seeds=2, timestep=3e-3, strain=20.0, batch=2)
+    assert np.all(data.status == Status.ok)
+    expected = {"pressure": [2.530, 9.814], "shear_stress": [1.083, 2.715], "granular_temperature": [0.548, 2.057]}
+    for name, values in expected.items():
+        measured, error = data[name].values[0], data[f"{name}_stderr"].values[0]
+        assert np.all(error < 0.1 * measured)
+        assert np.all(np.abs(measured - values) < 4 * error + 0.06 * np.asarray(values)), name
