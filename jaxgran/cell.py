@@ -40,12 +40,16 @@ def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float
 
 def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:
     """The vectors with strain·y added to x."""
-    return vectors + strain * vectors[..., ::-1] * jnp.broadcast_to(jnp.asarray([1, 0], vectors.dtype), vectors.shape)
+    return jnp.stack([vectors[..., 0] + strain * vectors[..., 1], vectors[..., 1]], axis=-1)
 
 
 def relative_velocity(
-    velocities: Float[Array, "grains 2"], i: Array, j: Array, separations: Float[Array, "pairs 2"], shear_rate: Array
+    velocities: Float[Array, "grains 2"],
+    i: Array,
+    j: Array,
+    separations: Float[Array, "pairs 2"],
+    shear_rate: float | Array,
 ) -> Float[Array, "pairs 2"]:
     """Relative velocity of grain i seen from (the image of) grain j in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
-    shear = separations[:, ::-1] * jnp.asarray([[1, 0]], separations.dtype)
-    return velocities[i] - velocities[j] + shear_rate * shear
+    peculiar = velocities[i] - velocities[j]
+    return jnp.stack([peculiar[:, 0] + shear_rate * separations[:, 1], peculiar[:, 1]], axis=-1)

@@ -25,10 +25,11 @@ from jaxgran.flow import Activation, InputError, Solver
 INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
 _PLAIN_PROGRESS_SECONDS = 10
 
+_UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
+
 app = typer.Typer(
     help="Flows of rigid, frictionless discs in simple shear by contact dynamics.",
     epilog="Example: jaxgran map --restitution 0.1,0.5,0.9 --packing-fraction 0.5:0.8:4 --output ratio.nc",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -56,9 +57,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 def main() -> None:
     """Entry point: mistakes in the input end with one sentence and exit status 2."""
     try:
-        app()
+        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except InputError as mistake:
         _stop(str(mistake))
+    except _UsageError as mistake:
+        _stop(f"{mistake.format_message().rstrip('.')}.")
+    raise SystemExit(status)
 
 
 def number_list(text: str, name: str) -> tuple[float, ...]:
@@ -138,10 +142,11 @@ def plot_command(
     from jaxgran.dataset import read_dataset
     from jaxgran.figures import save_figures
 
+    data = read_dataset(file)
     folder = file.parent if output is None else output
     if not folder.is_dir() or not os.access(folder, os.W_OK):
         raise InputError(f"output must be a folder that exists and can be written to, not {str(folder)!r}.")
-    _say_written(save_figures(read_dataset(file), folder / file.stem))
+    _say_written(save_figures(data, folder / file.stem))
 
 
 @app.command("run")
@@ -183,7 +188,7 @@ def info_command() -> None:
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "devices": ", ".join(f"{d.platform}: {d.device_kind}" for d in jax.devices()),
         "precision": "float64",
-        "compilation cache": jax.config.read("jax_compilation_cache_dir"),
+        "compilation cache": jax.config.values["jax_compilation_cache_dir"],
     }
     for name, value in lines.items():
         print(f"{name:18s} {value}")
@@ -220,16 +225,13 @@ def _measure(
     jax = _configured_jax()
     from jaxgran.dataset import check_output, map_dataset, write_dataset
     from jaxgran.settings import MapSettings
-    from jaxgran.sweep import predicted_cost, replicas, usable_cores
+    from jaxgran.sweep import check_batches, predicted_cost, replicas, usable_cores
 
     if output is not None:
         check_output(output)
     settings = MapSettings(**chosen)
     on_cpu = jax.default_backend() == "cpu"
-    if workers is not None and workers < 1:
-        raise InputError(f"workers must be at least 1, not {workers}.")
-    if workers is not None and workers > 1 and not on_cpu:
-        raise InputError("workers must be 1 on an accelerator.")
+    check_batches(batch, 1 if workers is None else workers)
     count = len(settings.flows()) * settings.seeds
     workers = min(count, workers or (usable_cores() if on_cpu else 1))
     costs = [predicted_cost(flow) for flow in settings.flows()]
@@ -375,14 +377,14 @@ def _say_written(paths: Iterable[Path]) -> None:
 
 def _finish(data, written: list[Path], interrupted: bool) -> None:
     """Say what was written and what went wrong, and exit with the status that tells it."""
-    _say_written(path for path in written if path.exists())
+    started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
+    written = [path for path in written if started and path.exists()]
+    _say_written(written)
     bad = _bad_points(data)
     if interrupted:
         missing = len(bad.get("not_run", []))
-        _stop(
-            f"interrupted with {missing} points missing; what is done is saved. Repeat: {data.attrs['command']}",
-            INTERRUPTED,
-        )
+        saved = "; what is done is saved" if written else ""
+        _stop(f"interrupted with {missing} points missing{saved}. Repeat: {data.attrs['command']}", INTERRUPTED)
     if bad:
         words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
         _stop(f"finished, but points marked * have a bad status. {words}.", BAD_STATUS)

@@ -42,7 +42,7 @@ def is_contact(
     separations: Float[Array, "pairs 2"],
     velocities: Float[Array, "pairs 2"],
     reach: Float[Array, " pairs"],
-    look_ahead: Array,
+    look_ahead: float | Array,
 ) -> tuple[Bool[Array, " pairs"], Bool[Array, " pairs"]]:
     """Which pairs are contacts, and which of them approach.
 
@@ -92,18 +92,24 @@ def contact_network(
     used = index < pairs.reach.size
     index = jnp.where(used, index, 0)
     i, j = pairs.i[index], pairs.j[index]
-    distances = jnp.sqrt(_dot(separations[index], separations[index]))
-    normals = jnp.where(used[:, None], separations[index] / distances[:, None], 0)
+    separation, velocity = (_picked(vectors, index) for vectors in (separations, velocities))
+    distances = jnp.sqrt(_dot(separation, separation))
+    normals = jnp.where(used[:, None], separation / distances[:, None], 0)
     return Contacts(
         i=i,
         j=j,
         normals=normals,
         distances=distances,
-        approach=_dot(normals, velocities[index]),
+        approach=_dot(normals, velocity),
         inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
         inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
         used=used,
     )
+
+
+def _picked(vectors: Float[Array, "pairs 2"], index: Int[Array, " contacts"]) -> Float[Array, "contacts 2"]:
+    """The vectors at ``index``, by component: vectors that a caller has put together need not exist in full."""
+    return jnp.stack([vectors[:, 0][index], vectors[:, 1][index]], axis=-1)
 
 
 def _dot(a: Float[Array, "n 2"], b: Float[Array, "n 2"]) -> Float[Array, " n"]:

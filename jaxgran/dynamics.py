@@ -18,11 +18,21 @@ from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.flow import ShearFlow
 from jaxgran.grains import Grains
-from jaxgran.pairs import Frame, Neighbourhood, PairList, first_true, neighbourhood, present, refresh, separations_now
-from jaxgran.replica import any_replica, largest_replica, where_active
+from jaxgran.pairs import (
+    Frame,
+    Neighbourhood,
+    PairList,
+    bit_words,
+    neighbourhood,
+    present,
+    refresh,
+    separations_now,
+    set_bits,
+)
+from jaxgran.replica import any_replica, in_batch, largest_replica, where_active
 from jaxgran.solver import grain_impulses, solve
 from jaxgran.status import Status
-from jaxgran.tally import Tally, empty_tally
+from jaxgran.tally import Sums, Tally, empty_sums
 
 DEEP_OVERLAP = 1e-2
 _LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
@@ -51,18 +61,35 @@ class State:
     tilt: Float[Array, ""]
 
 
+class _Pairs(NamedTuple):
+    """Near pairs in flight: separations and relative laboratory velocities, (pairs,) each, x and y apart for speed."""
+
+    x: Array
+    y: Array
+    ux: Array
+    uy: Array
+
+    def separations(self) -> Float[Array, "pairs 2"]:
+        return jnp.stack([self.x, self.y], axis=-1)
+
+    def velocities(self) -> Float[Array, "pairs 2"]:
+        return jnp.stack([self.ux, self.uy], axis=-1)
+
+
 class _Carry(NamedTuple):
     hood: Neighbourhood
+    pairs: _Pairs
+    slack: Array  # what is left of the skin of the near list
     velocities: Array
     step: Array  # steps flown
     solved: Array  # whether the contacts of the present step have been dealt with
-    tally: Tally
+    sums: Sums
 
 
 def contact_capacities(grains: int) -> tuple[int, ...]:
     """Sizes of the contact buffers, smallest first. Contacts of discs form a planar graph: at most 3 N of them."""
     top = 3 * grains
-    return tuple(sorted({max(8, top // 4**k) for k in range(5)}))
+    return tuple(sorted({1, *(max(4, top // 4**k) for k in (0, 1, 2, 3))}))
 
 
 def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> tuple[State, Tally]:
@@ -82,75 +109,88 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
 
     def unfinished(now: _Carry):
-        return (now.step < steps) & (now.tally.status < Status.nonfinite)
+        return (now.step < steps) & (now.sums.status < Status.nonfinite)
 
     def body(now: _Carry) -> _Carry:
         go = unfinished(now)
-        hood, room = _fresh_lists(now, flow, grains, side, go)
-        pairs = hood.near
-        separations = separations_now(pairs, hood.frame)
-        u = relative_velocity(now.velocities, pairs.i, pairs.j, separations, shear_rate)
+        hood, pairs, slack, loss = _fresh_lists(now, flow, grains, side, go)
 
         least = now.solved.astype(jnp.int32)
-        jump = jnp.minimum(_steps_to_contact(separations, u, pairs.reach, flow, least), jnp.floor(room / dt))
+        jump = _steps_to_contact(pairs, hood.near.reach, flow, least)
+        jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, _LONGEST_FLIGHT / shear_rate) / dt))
         jump = jump if free_flight else jnp.zeros_like(jump)
         remaining = steps - now.step
-        jump = jnp.clip(jnp.minimum(jump, remaining).astype(jnp.int32), least, remaining)
-        flight = jump * dt
+        jump = jnp.clip(jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining)
+        flight = jump.astype(slack.dtype) * dt
 
-        tally = _tally_flight(now.tally, now.velocities, grains, jump, flight, shear_rate)
+        sums = _add_flight(now.sums, now.velocities, grains, jump, flight, shear_rate)
         frame, velocities = _fly(hood.frame, now.velocities, flight, shear_rate)
-        hood = replace(hood, frame=frame)
+        hood, slack = replace(hood, frame=frame), slack - loss * flight
+        pairs = pairs._replace(x=pairs.x + flight * pairs.ux, y=pairs.y + flight * pairs.uy)
         step = now.step + jump
         meets = go & (step < steps)
-        velocities, tally = _collide(flow, pairs, separations + flight * u, u, grains, velocities, tally, meets)
-        overrun = pairs.overflow | (room < flight)
-        status = jnp.where(jnp.all(jnp.isfinite(velocities)), jnp.where(overrun, Status.capacity, Status.ok), Status.nonfinite)
-        tally = replace(tally, status=jnp.maximum(tally.status, status.astype(jnp.int32)))
-        return where_active(go, _Carry(hood, velocities, step, meets, tally), now)
+        velocities, pairs, sums = _collide(flow, hood.near, grains, velocities, pairs, sums, meets)
+        status = jnp.where(hood.near.overflow | (slack < 0), Status.capacity, Status.ok)
+        status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
+        sums = sums._replace(status=jnp.maximum(sums.status, status))
+        return where_active(go, _Carry(hood, pairs, slack, velocities, step, meets, sums), now)
 
-    finite = jnp.all(jnp.isfinite(state.positions)) & jnp.all(jnp.isfinite(state.velocities))
-    tally = empty_tally(state.positions.dtype)
-    tally = replace(tally, status=jnp.where(finite, tally.status, Status.nonfinite).astype(jnp.int32))
     hood = neighbourhood(state.positions, grains, side, state.tilt)
-    start = _Carry(hood, state.velocities, jnp.int32(0), jnp.bool_(False), tally)
+    pairs = _pairs_now(hood, state.velocities, shear_rate)
+    sums = empty_sums(state.positions.dtype)
+    sums = sums._replace(status=_status_if_finite(state.positions, state.velocities))
+    start = _Carry(hood, pairs, hood.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
     positions, tilt = present(end.hood, side)
-    return State(grains, positions, end.velocities, side, tilt), end.tally
+    status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
+    return State(grains, positions, end.velocities, side, tilt), replace(end.sums.tally(), status=status)
 
 
-def _flight_room(hood: Neighbourhood, velocities: Array, grains: Grains, shear_rate: Array) -> Float[Array, ""]:
-    """Time for which free flight surely keeps the near list valid."""
-    tilted = 1 + jnp.abs(hood.near_frame.strain)
-    largest = jnp.max(grains.radii) / tilted
-    slope = hood.frame.strain
-    vx, vy = velocities[:, 0] - slope * velocities[:, 1], velocities[:, 1]
-    speed = jnp.sqrt(vx**2 + vy**2) + 2 * _LONGEST_FLIGHT * jnp.abs(vy)
-    moved = jnp.sqrt(jnp.sum((hood.frame.displacements - hood.near_frame.displacements) ** 2, axis=-1))
-    left = hood.near.skin / (2 * tilted) - largest * jnp.abs(hood.frame.strain - hood.near_frame.strain) - moved
-    return jnp.minimum(jnp.min(left / (speed + largest * shear_rate)), _LONGEST_FLIGHT / shear_rate)
+def _status_if_finite(*values: Array) -> Int[Array, ""]:
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+    return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)
 
 
-def _fresh_lists(now: _Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array) -> tuple[Neighbourhood, Array]:
-    """Lists that stay valid for at least one more step, and the time for which they do."""
-    room = _flight_room(now.hood, now.velocities, grains, flow.shear_rate)
-    stale = go & ~(room >= flow.timestep)
+def _pairs_now(hood: Neighbourhood, velocities: Array, shear_rate: float | Array) -> _Pairs:
+    separations = separations_now(hood.near, hood.frame)
+    u = relative_velocity(velocities, hood.near.i, hood.near.j, separations, shear_rate)
+    return _Pairs(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
 
-    def fresh(_):
+
+def _fresh_lists(
+    now: _Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array
+) -> tuple[Neighbourhood, _Pairs, Array, Array]:
+    """Lists that stay valid for at least one more step, their pairs, the slack, and a bound on its loss per time.
+
+    A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
+    r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
+    """
+    cx, cy = now.velocities[:, 0], now.velocities[:, 1]
+    speed = jnp.sqrt(-_smallest(-(cx * cx + cy * cy))) * (1 + _LONGEST_FLIGHT)
+    diameter = 2 * jnp.max(grains.radii)
+
+    def loss(skin: Array) -> Array:
+        return 2 * speed + flow.shear_rate * (diameter + skin) / 2
+
+    stale = go & ~(now.slack >= loss(now.hood.near.skin) * flow.timestep)
+
+    def fresh():
         hood = refresh(now.hood, grains, side, stale)
-        return hood, _flight_room(hood, now.velocities, grains, flow.shear_rate)
+        new = hood, _pairs_now(hood, now.velocities, flow.shear_rate), hood.near.skin
+        return where_active(stale, new, (now.hood, now.pairs, now.slack))
 
-    return lax.cond(any_replica(stale), fresh, lambda _: (now.hood, room), None)
+    hood, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.hood, now.pairs, now.slack))
+    return hood, pairs, slack, loss(hood.near.skin)
 
 
-def _steps_to_contact(separations: Array, u: Array, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
+def _steps_to_contact(pairs: _Pairs, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
     """Number of steps, at least ``least``, after which some pair first is an approaching contact; may be infinite."""
-    time, closest = first_contact_time(separations, u, reach)
-    steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least)
-    return jnp.min(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
+    time, closest = first_contact_time(pairs.separations(), pairs.velocities(), reach)
+    steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least.astype(time.dtype))
+    return _smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
 
 
-def _fly(frame: Frame, velocities: Array, flight: Array, shear_rate: Array) -> tuple[Frame, Array]:
+def _fly(frame: Frame, velocities: Array, flight: Array, shear_rate: float | Array) -> tuple[Frame, Array]:
     """Exact free flight (SLLOD) for a time: the laboratory velocities stay as they are."""
     cx, cy = velocities[:, 0], velocities[:, 1]
     dx = (cx - frame.strain * cy) * flight - shear_rate * cy * flight**2
@@ -158,72 +198,105 @@ def _fly(frame: Frame, velocities: Array, flight: Array, shear_rate: Array) -> t
     return Frame(moved, frame.strain + shear_rate * flight), jnp.stack([cx - shear_rate * flight * cy, cy], axis=-1)
 
 
-def _tally_flight(tally: Tally, velocities: Array, grains: Grains, jump: Array, flight: Array, shear_rate: Array) -> Tally:
-    """The tally with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
-    xx, xy, yy = (jnp.sum(grains.masses * velocities[:, a] * velocities[:, b]) for a, b in ((0, 0), (0, 1), (1, 1)))
+def _add_flight(
+    sums: Sums, velocities: Array, grains: Grains, jump: Array, flight: Array, shear_rate: float | Array
+) -> Sums:
+    """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
+    cx, cy = velocities[:, 0], velocities[:, 1]
+    px, py = grains.masses * cx, grains.masses * cy
+    xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in ((px, cx), (px, cy), (py, cy)))
     turned = shear_rate * flight
     xx, xy = xx - turned * xy + turned**2 / 3 * yy, xy - turned / 2 * yy
-    moment = flight * jnp.stack([xx, xy, xy, yy]).reshape(2, 2)
-    return replace(
-        tally,
-        duration=tally.duration + flight,
-        steps=tally.steps + jump,
-        kinetic_moment=tally.kinetic_moment + moment,
-    )
+    flown = jnp.stack([flight, jump.astype(flight.dtype), flight * xx, flight * xy, flight * yy])
+    return sums._replace(flights=sums.flights + flown)
 
 
 def _collide(
-    flow: ShearFlow, pairs: PairList, separations: Array, u: Array, grains: Grains, velocities: Array, tally: Tally, meets: Array
-) -> tuple[Array, Tally]:
-    """Velocities and tally after the contacts of one step; unchanged where no contact approaches."""
-    contact, approaching = is_contact(separations, u, pairs.reach, flow.activation_fraction * flow.timestep)
-    count = jnp.sum(contact, dtype=jnp.int32)
-    meets = meets & jnp.any(approaching)
-    capacities = contact_capacities(grains.radii.size)
+    flow: ShearFlow, near: PairList, grains: Grains, velocities: Array, pairs: _Pairs, sums: Sums, meets: Array
+) -> tuple[Array, _Pairs, Sums]:
+    """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches."""
+    look_ahead = flow.activation_fraction * flow.timestep
+    contact, approaching = is_contact(pairs.separations(), pairs.velocities(), near.reach, look_ahead)
+    words = bit_words(contact)
+    count = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
+    meets = meets & jnp.any(bit_words(approaching) > 0)
+    # A lone contact has a closed form, which differs in the last bits: never chosen by what else is in a batch.
+    capacities = contact_capacities(grains.radii.size)[1 if in_batch() else 0 :]
     rung = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
     rung = largest_replica(jnp.where(meets, rung, 0))
 
     def with_capacity(capacity: int):
-        def collided(_):
-            network = contact_network(first_true(contact, capacity), pairs, separations, u, grains)
-            new = _apply_impulses(flow, network, count > capacity, velocities, tally, grains, meets)
-            return where_active(meets, new, (velocities, tally))
+        def collided():
+            index = set_bits(words, capacity, contact.size)
+            network = contact_network(index, near, pairs.separations(), pairs.velocities(), grains)
+            impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
+            change = _velocity_changes(network, impulses, grains)
+            (xi, yi), (xj, yj) = change(near.i), change(near.j)
+            kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)
+            moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
+            return where_active(meets, (moved, kicked, new), (velocities, pairs, sums))
 
         return collided
 
-    return lax.switch(rung, [lambda _: (velocities, tally), *map(with_capacity, capacities)], None)
+    return lax.switch(rung, [lambda: (velocities, pairs, sums), *map(with_capacity, capacities)])
 
 
-def _apply_impulses(
-    flow: ShearFlow, network: Contacts, overflow: Array, velocities: Array, tally: Tally, grains: Grains, meets: Array
-) -> tuple[Array, Tally]:
+def _velocity_changes(network: Contacts, impulses: Array, grains: Grains):
+    """A function that gives the changes of velocity, x and y, of the grains with the given numbers."""
+    if impulses.size == 1:
+        along = network.normals * impulses[:, None]
+        of_i, of_j = along * network.inverse_mass_i[:, None], -along * network.inverse_mass_j[:, None]
+
+        def change(grain: Array) -> tuple[Array, ...]:
+            is_i, is_j = grain == network.i, grain == network.j
+            return tuple(jnp.where(is_i, of_i[:, a], jnp.where(is_j, of_j[:, a], 0)) for a in (0, 1))
+    else:
+        table = grain_impulses(network, impulses, grains.radii.size) / grains.masses[:, None]
+
+        def change(grain: Array) -> tuple[Array, ...]:
+            return table[:, 0][grain], table[:, 1][grain]
+
+    return change
+
+
+def _impulses(
+    flow: ShearFlow, network: Contacts, overflow: Array, sums: Sums, grains: Grains, meets: Array
+) -> tuple[Array, Sums]:
+    """Impulses of a network, and the sums with its contribution."""
     count = grains.radii.size
     solution = solve(network, count, flow.shear_rate, flow.tolerance, flow.max_iterations, flow.solver, meets)
     bounce = 1 + flow.restitution
     impulses = bounce * solution.impulses
-    approach = network.approach
+    approach, (nx, ny), length = network.approach, network.normals.T, network.distances
     reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
     binary = bounce * reduced_mass * jnp.maximum(0, -approach)
-    directions = network.normals[:, :, None] * network.normals[:, None, :] * network.distances[:, None, None]
-    overlaps = jnp.where(network.used, grains.radii[network.i] + grains.radii[network.j] - network.distances, 0)
+    loss = -(approach + bounce / 2 * solution.response)
+    features = jnp.stack([jnp.ones_like(nx), nx * nx * length, nx * ny * length, ny * ny * length, loss])
+    flags = jnp.stack([network.used, impulses > 0, network.used & (approach < 0)]).astype(nx.dtype)
+    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags])
+    overlaps = jnp.where(network.used, grains.radii[network.i] + grains.radii[network.j] - length, 0)
     deepest = jnp.max(overlaps)
     status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
-    status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status)
-    change = grain_impulses(network, impulses, count) / grains.masses[:, None]
-    return velocities + change, replace(
-        tally,
-        impulse=tally.impulse + jnp.sum(impulses),
-        binary_impulse=tally.binary_impulse + jnp.sum(binary),
-        contact_moment=tally.contact_moment + jnp.sum(directions * impulses[:, None, None], axis=0),
-        binary_moment=tally.binary_moment + jnp.sum(directions * binary[:, None, None], axis=0),
-        dissipation=tally.dissipation - jnp.sum(impulses * (approach + bounce / 2 * solution.response)),
-        contacts=tally.contacts + jnp.sum(network.used),
-        loaded_contacts=tally.loaded_contacts + jnp.sum(impulses > 0),
-        collisions=tally.collisions + jnp.sum(network.used & (approach < 0)),
-        solves=tally.solves + 1,
-        iterations=tally.iterations + solution.iterations,
-        unconverged=tally.unconverged + (solution.status != Status.ok),
-        residual=tally.residual + solution.residual,
-        largest_overlap=jnp.maximum(tally.largest_overlap, deepest),
-        status=jnp.maximum(tally.status, status.astype(jnp.int32)),
+    status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
+    unconverged = solution.status != Status.ok
+    counts = [jnp.ones_like(bounce), solution.iterations, unconverged, solution.residual]
+    return impulses, Sums(
+        flights=sums.flights,
+        contacts=sums.contacts + jnp.matmul(features, weights.T, precision=lax.Precision.HIGHEST),
+        solves=sums.solves + jnp.stack([jnp.asarray(value, nx.dtype) for value in counts]),
+        largest_overlap=jnp.maximum(sums.largest_overlap, deepest),
+        status=jnp.maximum(sums.status, status),
     )
+
+
+def _smallest(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Smallest entry of a vector.
+
+    XLA's CPU backend runs a minimum over one long axis as a serial chain of comparisons; folded into rows of 32 it
+    is a vector operation. The halves are folded apart so that the entries are computed once, in a loop of their own.
+    """
+    lanes = 32
+    rows = 2 * -(-values.size // (2 * lanes))
+    folded = jnp.pad(values, (0, rows * lanes - values.size), constant_values=jnp.inf).reshape(rows, lanes)
+    columns = jnp.minimum(jnp.min(folded[: rows // 2], axis=0), jnp.min(folded[rows // 2 :], axis=0))
+    return jnp.min(jnp.minimum(columns[: lanes // 2], columns[lanes // 2 :]))

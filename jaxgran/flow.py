@@ -128,10 +128,16 @@ def _known(value) -> np.ndarray | None:
     return np.asarray(value)
 
 
+def two_digits(value: float, up: bool) -> str:
+    """A positive number as 1.2e-03, rounded to the side of a limit on which it is still accepted."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
+
+
 def require(name: str, value, accepts, words: str) -> None:
     """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
     known = _known(value)
     if known is None:
         return
     if isinstance(value, (list, tuple)) or known.dtype.kind not in "iuf" or not np.all(accepts(known)):
-        raise InputError(f"{name} must be {words}, not {value!r}.")
+        raise InputError(f"{name} must be {words}, not {' '.join(repr(value).split())}.")

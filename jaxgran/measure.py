@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics import State, advance
-from jaxgran.flow import InputError, ShearFlow, require
+from jaxgran.flow import InputError, ShearFlow, require, two_digits
 from jaxgran.observables import averages
 from jaxgran.statistics import jackknife
 from jaxgran.tally import Tally
@@ -129,7 +129,7 @@ def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = B
 @partial(jax.jit, static_argnames="blocks")
 def _sample(flow: ShearFlow, state: State, strain: Array, blocks: int) -> tuple[State, Sample]:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
-    edges = jnp.round(steps * jnp.arange(blocks + 1) / blocks).astype(jnp.int32)
+    edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks).astype(jnp.int32)
     state, tally = lax.scan(lambda now, n: advance(flow, now, n), state, jnp.diff(edges))
     return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains)
 
@@ -146,6 +146,7 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     least = _ROUNDING_STEPS * rounding
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(
-            f"timestep must be at least {least:.1e} / shear_rate for positions in {state.positions.dtype}: "
+            f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "
+            f"{state.positions.dtype}: "
             'use a longer one, or float64 (jax.config.update("jax_enable_x64", True)).'
         )

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxgran.cell import displacement, remap_tilt, sheared, wrap
 from jaxgran.grains import Grains
@@ -150,22 +150,35 @@ def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
     Rank and select on words of 32 bits: the word that holds the k-th True entry follows from the running number of
     set bits, its place in the word by halving. An order of magnitude cheaper than ``jnp.nonzero`` inside a step.
     """
-    length = mask.size
-    words = -(-length // _WORD)
-    bits = jnp.pad(mask, (0, words * _WORD - length)).reshape(words, _WORD)
+    return set_bits(bit_words(mask), size, mask.size)
+
+
+def bit_words(mask: Bool[Array, " m"]) -> UInt32[Array, " words"]:
+    """The mask in words of 32 bits, the first entry in the lowest bit."""
+    words = -(-mask.size // _WORD)
+    bits = jnp.pad(mask, (0, words * _WORD - mask.size)).reshape(words, _WORD)
     weights = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)
-    bits = jnp.sum(jnp.where(bits, weights, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
-    counts = jax.lax.population_count(bits).astype(jnp.int32)
+    return jnp.sum(jnp.where(bits, weights[None, :], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+
+
+def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Array, " size"]:
+    """Positions of the first ``size`` set bits, padded with ``length``."""
+    count = words.size
+    if size == 1:
+        lowest = jax.lax.population_count((words & -words) - jnp.uint32(1)).astype(jnp.int32)
+        return jnp.min(jnp.where(words > 0, jnp.arange(count, dtype=jnp.int32) * _WORD + lowest, length))[None]
+    set_in_word = jax.lax.population_count(words).astype(jnp.int32)
     wanted = jnp.arange(size, dtype=jnp.int32)
-    if words <= _FEW_WORDS:
-        running = jnp.sum(jnp.where(jnp.tril(jnp.ones((words, words), bool)), counts, 0), axis=1, dtype=jnp.int32)
-        word = jnp.sum(running <= wanted[:, None], axis=1, dtype=jnp.int32)
+    if count <= _FEW_WORDS:
+        triangle = jnp.tril(jnp.ones((count, count), bool))
+        running = jnp.sum(jnp.where(triangle, set_in_word[None, :], 0), axis=1, dtype=jnp.int32)
+        word = jnp.sum(running[None, :] <= wanted[:, None], axis=1, dtype=jnp.int32)
     else:
-        running = jnp.cumsum(counts, dtype=jnp.int32)
+        running = jnp.cumsum(set_in_word, dtype=jnp.int32)
         word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
-    found = jnp.minimum(word, words - 1)
-    rank = wanted - (running - counts)[found]
-    bits, place = bits[found], jnp.zeros_like(wanted)
+    found = jnp.minimum(word, count - 1)
+    rank = wanted - (running - set_in_word)[found]
+    bits, place = words[found], jnp.zeros_like(wanted)
     for half in (16, 8, 4, 2, 1):
         low = bits & jnp.uint32((1 << half) - 1)
         below = jax.lax.population_count(low).astype(jnp.int32)
@@ -173,7 +186,7 @@ def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
         rank = jnp.where(upper, rank - below, rank)
         bits = jnp.where(upper, bits >> half, low)
         place = jnp.where(upper, place + half, place)
-    return jnp.where(word < words, found * _WORD + place, length)
+    return jnp.where(word < count, found * _WORD + place, length)
 
 
 def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Array, ""]:
@@ -205,7 +218,7 @@ def _pair_list(i, j, separations, index, grains: Grains, skin, overflow) -> Pair
     return PairList(
         i=i,
         j=j,
-        separations=jnp.where(filled[:, None], separations[index], jnp.asarray([1e6, 0], separations.dtype)),
+        separations=jnp.where(filled[:, None], separations[index], jnp.asarray([[1e6, 0]], separations.dtype)),
         reach=jnp.where(filled, grains.radii[i] + grains.radii[j], 0),
         skin=skin,
         overflow=overflow,

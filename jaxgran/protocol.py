@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.dynamics import State, advance
-from jaxgran.flow import InputError, ShearFlow
+from jaxgran.flow import InputError, ShearFlow, two_digits
 from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
 from jaxgran.measure import BLOCKS, Sample, check_precision
 from jaxgran.observables import averages
@@ -79,7 +79,12 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
 
 def stack(flows: list[ShearFlow]) -> ShearFlow:
     """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack([np.asarray(v) for v in x])), *flows)
+
+    def joined(*values) -> Array:
+        numbers = np.stack([np.asarray(value) for value in values])
+        return jnp.asarray(numbers, jnp.int32 if numbers.dtype.kind == "i" else None)  # a cap fits an int32
+
+    return jax.tree.map(joined, *flows)
 
 
 def prepare_batch(
@@ -130,8 +135,8 @@ def check_timestep(flow: ShearFlow, theory: SteadyShear) -> None:
         worst = np.argmax(np.asarray(flow.timestep) / longest)
         alpha, nu = (float(np.asarray(x)[worst]) for x in (flow.restitution, flow.packing_fraction))
         raise InputError(
-            f"timestep must be at most {longest[worst]:.1e} at restitution {alpha:g} and packing fraction {nu:g}, "
-            "or grains would cross more than a tenth of a diameter in one step."
+            f"timestep must be at most {two_digits(longest[worst], up=False)} at restitution {alpha:g} and packing "
+            f"fraction {nu:g}, or grains would cross more than a tenth of a diameter in one step."
         )
 
 
@@ -160,7 +165,7 @@ def _start(flow: ShearFlow, keys: Array, temperature: Array) -> tuple[State, Boo
         state, found = pack(flow, pack_key)
         masses = state.grains.masses[:, None]
         velocities = jax.random.normal(heat_key, state.positions.shape, masses.dtype) / jnp.sqrt(masses)
-        velocities = velocities - jnp.sum(masses * velocities, axis=0) / jnp.sum(masses)
+        velocities = velocities - jnp.sum(masses * velocities, axis=0, keepdims=True) / jnp.sum(masses)
         now = jnp.sum(masses * velocities**2) / (2 * flow.grains)
         return replace(state, velocities=velocities * jnp.sqrt(temperature / now)), found
 

@@ -15,7 +15,7 @@ AXIS = "replica"
 T = TypeVar("T")
 
 
-def _in_batch() -> bool:
+def in_batch() -> bool:
     """Whether the code being traced runs under ``vmap(axis_name="replica")``."""
     try:
         lax.axis_index(AXIS)
@@ -26,12 +26,12 @@ def _in_batch() -> bool:
 
 def any_replica(predicate: jax.Array) -> jax.Array:
     """Whether the predicate holds in at least one replica of the batch; the predicate itself outside a batch."""
-    return lax.pmax(predicate.astype(jnp.int32), AXIS) > 0 if _in_batch() else predicate
+    return lax.pmax(predicate.astype(jnp.int32), AXIS) > 0 if in_batch() else predicate
 
 
 def largest_replica(value: jax.Array) -> jax.Array:
     """The largest value over the replicas of the batch; the value itself outside a batch."""
-    return lax.pmax(value, AXIS) if _in_batch() else value
+    return lax.pmax(value, AXIS) if in_batch() else value
 
 
 def where_active(active: jax.Array, new: T, old: T) -> T:
@@ -39,6 +39,6 @@ def where_active(active: jax.Array, new: T, old: T) -> T:
 
     Outside a batch control flow never reaches an inactive replica, so ``new`` is returned as it is.
     """
-    if not _in_batch():
+    if not in_batch():
         return new
     return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, old)

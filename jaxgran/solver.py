@@ -56,7 +56,12 @@ def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grai
     """Total impulse Hᵀp on every grain."""
     along = contacts.normals * impulses[:, None]
     total = jnp.zeros((grains, 2), along.dtype)
-    return total.at[contacts.i].add(along).at[contacts.j].add(-along)
+    return total.at[_ends(contacts)].add(jnp.concatenate([along, -along]))
+
+
+def _ends(contacts: Contacts) -> Int[Array, " two_contacts"]:
+    """The grains at both ends of the contacts: one scatter over all ends costs less than one for each."""
+    return jnp.concatenate([contacts.i, contacts.j])
 
 
 def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, " contacts"]:
@@ -70,7 +75,7 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     """Diagonal D with W ⪯ D; one in unused slots, so that it can be divided by."""
     nx, ny = contacts.normals[:, 0], contacts.normals[:, 1]
     outer = jnp.stack([nx * nx, nx * ny, ny * ny], axis=-1)
-    total = jnp.zeros((grains, 3), outer.dtype).at[contacts.i].add(outer).at[contacts.j].add(outer)
+    total = jnp.zeros((grains, 3), outer.dtype).at[_ends(contacts)].add(jnp.concatenate([outer, outer]))
     xx, xy, yy = total[:, 0], total[:, 1], total[:, 2]
     largest = (xx + yy + jnp.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
     bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
@@ -78,7 +83,13 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
 
 
 def solve(
-    contacts: Contacts, grains: int, shear_rate: Array, tolerance: Array, max_iterations: Array, method: Solver, active: Array
+    contacts: Contacts,
+    grains: int,
+    shear_rate: float | Array,
+    tolerance: float | Array,
+    max_iterations: int | Array,
+    method: Solver,
+    active: Array,
 ) -> Solution:
     """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
 
@@ -95,9 +106,11 @@ def solve(
     """
     b = contacts.approach
     diagonal = contacts.inverse_mass_i + contacts.inverse_mass_j
+    if b.size == 1:
+        return _single_contact(b, jnp.where(contacts.used, diagonal, 1), active)
     relaxation = JACOBI_RELAXATION if method == "jacobi" else 1.0
     bound = spectral_bound(contacts, grains)
-    scale = jnp.linalg.norm(jnp.minimum(b, 0))
+    scale = jnp.sqrt(_dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
     target = tolerance * scale + 10 * jnp.finfo(b.dtype).eps * shear_rate
 
     def unfinished(now: _Iterate):
@@ -106,54 +119,65 @@ def solve(
     def iterate(now: _Iterate) -> _Iterate:
         next_momentum = (1 + jnp.sqrt(1 + 4 * now.momentum**2)) / 2
         extrapolation = (now.momentum - 1) / next_momentum
-        start = now.impulses + extrapolation * (now.impulses - now.previous)
-        gradient = now.response + extrapolation * (now.response - now.previous_response) + b
-        impulses = jnp.maximum(0, start - relaxation * gradient / bound)
+        start, response = now.point + extrapolation * (now.point - now.previous)
+        impulses = jnp.maximum(0, start - relaxation * (response + b) / bound)
         response = delassus_product(contacts, impulses, grains)
-        residual = jnp.linalg.norm(jnp.minimum(diagonal * impulses, response + b))
-        uphill = jnp.sum(bound * (start - impulses) * (impulses - now.impulses)) > 0
+        error = jnp.minimum(diagonal * impulses, response + b)
+        residual = jnp.sqrt(_dot(error, error))
+        uphill = _dot(bound * (start - impulses), impulses - now.point[0]) > 0
         keep_momentum = (method == "nesterov") & ~uphill
+        point = jnp.stack([impulses, response])
         better = ~(residual >= now.best_residual)
         new = _Iterate(
-            impulses=impulses,
-            response=response,
-            previous=now.impulses,
-            previous_response=now.response,
+            point=point,
+            previous=now.point,
             momentum=jnp.where(keep_momentum, next_momentum, 1.0).astype(b.dtype),
             residual=residual,
-            best=jnp.where(better, impulses, now.best),
-            best_response=jnp.where(better, response, now.best_response),
+            best=jnp.where(better, point, now.best),
             best_residual=jnp.where(better, residual, now.best_residual),
             iterations=now.iterations + 1,
         )
         return where_active(unfinished(now), new, now)
 
-    zero = jnp.zeros_like(b)
+    zero = jnp.zeros((2, b.size), b.dtype)
     infinite = jnp.asarray(jnp.inf, b.dtype)
-    start = _Iterate(zero, zero, zero, zero, jnp.ones((), b.dtype), infinite, zero, zero, infinite, jnp.int32(0))
+    start = _Iterate(zero, zero, jnp.ones((), b.dtype), infinite, zero, infinite, jnp.int32(0))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start)
-    jammed = (jnp.sum(b * end.best) < 0) & (
-        jnp.linalg.norm(end.best_response) < _JAMMED_RESPONSE * jnp.linalg.norm(diagonal * end.best)
-    )
+    impulses, response = end.best
+
+    def is_jammed():
+        return (_dot(b, impulses) < 0) & (
+            jnp.linalg.norm(response) < _JAMMED_RESPONSE * jnp.linalg.norm(diagonal * impulses)
+        )
+
     capped = active & ~(end.residual <= target)
+    jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
     status = jnp.where(capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok)
     return Solution(
-        impulses=end.best,
-        response=end.best_response,
+        impulses=impulses,
+        response=response,
         residual=jnp.where(active, end.best_residual / jnp.maximum(scale, target), 0),
         iterations=end.iterations,
         status=jnp.where(active & jnp.isnan(end.residual), Status.nonfinite, status).astype(jnp.int32),
     )
 
 
+def _single_contact(b: Float[Array, "1"], diagonal: Float[Array, "1"], active: Array) -> Solution:
+    """The exact solution of a network of one contact, for which the iteration would need one product."""
+    impulses = jnp.where(active, jnp.maximum(0, -b / diagonal), 0)
+    status = jnp.where(jnp.isnan(impulses[0]), Status.nonfinite, Status.ok).astype(jnp.int32)
+    return Solution(impulses, diagonal * impulses, jnp.zeros((), b.dtype), active.astype(jnp.int32), status)
+
+
+def _dot(a: Float[Array, " contacts"], b: Float[Array, " contacts"]) -> Float[Array, ""]:
+    return jnp.dot(a, b, precision=lax.Precision.HIGHEST)
+
+
 class _Iterate(NamedTuple):
-    impulses: Array
-    response: Array
+    point: Array  # (2, contacts): impulses and their response
     previous: Array
-    previous_response: Array
     momentum: Array
     residual: Array
     best: Array
-    best_response: Array
     best_residual: Array
     iterations: Array

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import xarray as xr
 
 from jaxgran.dataset import Key, Replica, map_dataset
-from jaxgran.flow import Activation, ShearFlow, Solver
+from jaxgran.flow import Activation, InputError, ShearFlow, Solver
 from jaxgran.protocol import Report, prepare_batch, sample_batch, stack
 from jaxgran.settings import MapSettings
 
@@ -83,9 +83,30 @@ def ratio_map(
         solver=solver,
         activation=activation,
     )
-    start = perf_counter()
-    results = dict(replicas(settings, batch, workers, report))
-    return map_dataset(settings, results, {"wall_time_seconds": perf_counter() - start})
+    check_batches(batch, workers)
+    start, done = perf_counter(), 0.0
+
+    def count(steps: float) -> None:
+        nonlocal done
+        done += steps
+        if report is not None:
+            report(steps)
+
+    results = dict(replicas(settings, batch, workers, count))
+    seconds = perf_counter() - start
+    run = {"wall_time_seconds": seconds, "replica_steps_per_second": done / seconds, "workers": workers}
+    return map_dataset(settings, results, run)
+
+
+def check_batches(batch: int | Literal["auto"], workers: int) -> None:
+    """Raise a ValueError in one sentence where replicas cannot be run in such batches by so many processes."""
+    for name, value in (("batch", batch), ("workers", workers)):
+        whole = isinstance(value, int) and not isinstance(value, bool) and value >= 1
+        if not whole and (name, value) != ("batch", "auto"):
+            words = "auto or a whole number" if name == "batch" else "a whole number"
+            raise InputError(f"{name} must be {words} of at least 1, not {value!r}.")
+    if workers > 1 and jax.default_backend() != "cpu":
+        raise InputError("workers must be 1 on an accelerator.")
 
 
 def replicas(
@@ -106,7 +127,7 @@ def replicas(
         return
     context = multiprocessing.get_context("spawn")
     queue = context.SimpleQueue()
-    configuration = (jax.config.read("jax_enable_x64"), jax.config.read("jax_compilation_cache_dir"))
+    configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
     pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (queue, *configuration))
     listener = threading.Thread(target=_listen, args=(queue, report), daemon=True)
     listener.start()

@@ -149,7 +149,7 @@ def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     assert coarse[1] == 2e-2
 
 
-@pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.1, 0.3), (0.6, 0.4), (0.7, 0.8)])
+@pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.3, 0.95), (0.85, 0.4), (0.7, 0.8)])
 def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple[float, float]) -> None:
     flow = replace(with_timesteps(0.1, 0.1), restitution=jnp.asarray(alphas), packing_fraction=jnp.full(2, 0.4))
     theory = predicted(flow)

@@ -61,9 +61,10 @@ def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
     costs = [predicted_cost(flows[point]) for point, _ in keys]
     assert costs == sorted(costs, reverse=True)
-    if batch != "auto":
+    if batch == "auto":
+        assert len(tasks) >= min(workers, len(keys))  # no worker is idle
+    else:
         assert max(map(len, tasks)) <= batch
-    assert len(tasks) >= min(workers, len(keys))  # no worker is idle
 
 
 def test_cost_grows_with_density_and_dissipation() -> None:
@@ -99,7 +100,7 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     expected = map_dataset(settings, results, {})
     np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
     np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
-    assert set(data.attrs) - set(expected.attrs) == {"wall_time_seconds", "replica_steps_per_second"}
+    assert set(data.attrs) - set(expected.attrs) == {"wall_time_seconds", "replica_steps_per_second", "workers"}
     assert data.attrs["wall_time_seconds"] > 0
     steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-2)
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
@@ -111,12 +112,11 @@ def test_batches_and_workers_that_cannot_be_are_one_sentence(mistake: dict[str, 
         ratio_map(**SETTINGS, **mistake)
 
 
-def test_small_flows_have_the_stresses_of_event_driven_discs() -> None:
-    # N = 1000 discs, ν = 0.6, α = 0.7 and 0.9. So few grains in so coarse steps are within 6 % of that.
-    data = ratio_map([0.7, 0.9], [0.6], grains=64, seeds=2, timestep=3e-3, strain=20.0, batch=2)
-    assert np.all(data.status == Status.ok)
-    expected = {"pressure": [2.530, 9.814], "shear_stress": [1.083, 2.715], "granular_temperature": [0.548, 2.057]}
-    for name, values in expected.items():
+def test_small_flows_have_nearly_the_stresses_of_event_driven_discs() -> None:
+    # N = 1000 discs at ν = 0.6, α = 0.7 and 0.9. So few grains have stresses that are 3 to 6 % smaller.
+    data = ratio_map([0.7, 0.9], [0.6], grains=64, seeds=2, timestep=1e-3, strain=40.0, batch=2)
+    assert np.all(data.status.values == Status.ok)
+    for name, expected in (("pressure", [2.530, 9.814]), ("shear_stress", [1.083, 2.715])):
         measured, error = data[name].values[0], data[f"{name}_stderr"].values[0]
-        assert np.all(error < 0.1 * measured)
-        assert np.all(np.abs(measured - values) < 4 * error + 0.06 * np.asarray(values)), name
+        assert np.all(error < 0.05 * measured)
+        assert np.all(np.abs(measured - expected) < 4 * error + 0.06 * np.asarray(expected)), name

@@ -1,0 +1,340 @@
+"""The command line does what it says, and says in one sentence what it cannot do."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic import random_replica
+
+from jaxgran import cli, sweep
+from jaxgran.dataset import NOT_RUN, read_dataset
+from jaxgran.flow import InputError
+from jaxgran.status import Status
+
+SMALL_MAP = (
+    "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-2 "
+    "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
+)
+POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
+
+
+class Outcome(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+def jaxgran(folder: Path, *arguments: str) -> Outcome:
+    """Run a command in a folder, in this process, with JAX as it is set up here."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(StringIO()) as out,
+        redirect_stderr(StringIO()) as err,
+        pytest.raises(SystemExit) as end,
+    ):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["jaxgran", *arguments])
+        patch.setattr(cli, "_configured_jax", lambda: jax)
+        cli.main()
+    return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
+
+
+def in_a_process(folder: Path, *arguments: str) -> Outcome:
+    """Run a command as its user would, in a process of its own."""
+    command = [sys.executable, "-c", "from jaxgran.cli import main; main()", *arguments]
+    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
+    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
+
+    def replicas(settings, batch, workers, report) -> Iterator:
+        rng = np.random.default_rng(0)
+        for key, status in statuses.items():
+            report(100.0)
+            yield key, random_replica(rng, settings, status)
+        if end is not None:
+            raise end
+
+    return replicas
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+# Lists
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=8))
+def test_list_of_numbers_is_those_numbers(numbers: list[float]) -> None:
+    assert cli.number_list(",".join(map(repr, numbers)), "restitution") == tuple(numbers)
+
+
+@given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
+def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, count: int) -> None:
+    numbers = cli.number_list(f"{start / 100}:{stop / 100}:{count}", "restitution")
+    assert len(numbers) == count
+    assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
+    np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
+
+
+def test_range_has_no_noise_in_its_last_digits() -> None:
+    assert cli.number_list("0.1:0.9:9", "restitution") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+
+
+@pytest.mark.parametrize("text", ["", ",", "0.1,", "a", "0.1;0.5", "0.1:0.9", "0.1:0.9:1", "0.1:0.9:x", "0:1:2:3"])
+def test_what_is_no_list_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"restitution must be a list like 0\.1,0\.5,0\.9 or start:stop:count"):
+        cli.number_list(text, "restitution")
+
+
+@given(st.text("0123456789.,:e-+ nainf", max_size=8))
+def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
+    try:
+        numbers = cli.number_list(text, "restitution")
+    except InputError:
+        return
+    assert numbers
+    assert all(isinstance(number, float) for number in numbers)
+
+
+# Mistakes
+
+MISTAKES = {
+    "map --restitution -0.1,0.5": "restitution must be between 0 and 1",
+    "map --restitution 0.5,1.1": "restitution must be between 0 and 1",
+    "map --restitution nan": "restitution must be between 0 and 1",
+    "map --restitution ''": "restitution must be a list",
+    "map --restitution 0.5,0.1,0.9": "restitution must be sorted",
+    "map --restitution 0.5,0.5": "without repetition",
+    "map --packing-fraction 0,0.5": "packing_fraction must be above 0 and at most 0.83",
+    "map --packing-fraction 0.5,0.84": "packing_fraction must be above 0 and at most 0.83",
+    "map --packing-fraction 0.7,0.5,0.6": "packing_fraction must be sorted",
+    "map --grains 15": "grains must be a whole number of at least 16",
+    "map --grains 20.5": "--grains",
+    "map --seeds 0": "seeds must be a whole number of at least 1",
+    "map --timestep 0": "timestep must be a positive number",
+    "map --timestep -1e-3": "timestep must be a positive number",
+    "map --timestep 0.2": "timestep must be at most 0.1 / shear_rate",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.09": "timestep must be at most",
+    "map --strain 0": "strain must be a positive number",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "strain must be at least 160 time steps",
+    "map --equilibrate -1": "equilibrate must be a number of at least 0",
+    "map --tolerance 1": "tolerance must be between",
+    "map --solver gauss": "'nesterov', 'jacobi'",
+    "map --activation always": "'midpoint', 'touching'",
+    "map --preset slow": "'quick', 'paper'",
+    "map --batch 0": "batch must be auto or a whole number of at least 1",
+    "map --batch many": "batch must be auto or a whole number of at least 1",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --workers 0": "workers must be a whole number of at least 1",
+    "map --output map.txt": "ends in .nc",
+    "map --output none/map.nc": "a folder that exists",
+    "map --output folder.nc": "is a folder",
+    "map --resume": "--resume is not available yet",
+    "map --scheduler tcp://localhost": "--scheduler is not available yet",
+    "map --wrong": "--wrong",
+    "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
+    "run --restitution 0.5 --packing-fraction 0.9": "packing_fraction must be above 0 and at most 0.83",
+    "run --restitution 0.5 --packing-fraction 0.5 --grains 3": "grains must be a whole number of at least 16",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd": "--trajectory is not available yet",
+    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.gif": "--movie is not available yet",
+    "run --restitution 0.5 --packing-fraction 0.5 --output flow.csv": "ends in .nc",
+    "run --restitution 0.5": "--packing-fraction",
+    "plot none.nc": "there is no file",
+    "plot folder.nc": "there is no file",
+    "plot text.nc": "not a NetCDF file",
+    "draw": "draw",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a folder and a text file whose names end in .nc."""
+    (tmp_path / "folder.nc").mkdir()
+    (tmp_path / "text.nc").write_text("not a map")
+    return tmp_path
+
+
+def assert_one_sentence(outcome: Outcome) -> None:
+    assert outcome.status == 2
+    assert outcome.out == ""
+    assert outcome.err.startswith("jaxgran: ")
+    assert outcome.err.endswith(".\n")
+    assert outcome.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("command", "accepted"), MISTAKES.items(), ids=MISTAKES)
+def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(command: str, accepted: str, folder: Path) -> None:
+    before = files(folder)
+    outcome = jaxgran(folder, *("" if word == "''" else word for word in command.split()))
+    assert_one_sentence(outcome)
+    assert accepted in outcome.err
+    assert files(folder) == before
+
+
+def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(**_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", denied)
+    outcome = jaxgran(folder, "map")
+    assert_one_sentence(outcome)
+    assert "Permission denied" in outcome.err
+
+
+def test_a_mistake_has_no_traceback_in_a_process_of_its_own(tmp_path: Path) -> None:
+    outcome = in_a_process(tmp_path, "map", "--restitution", "0.5,2")
+    assert_one_sentence(outcome)
+    assert not any(name.endswith((".nc", ".png")) for name in files(tmp_path))
+
+
+# What the commands do
+
+
+@pytest.fixture(scope="module")
+def small_map(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    folder = tmp_path_factory.mktemp("map")
+    return folder, jaxgran(folder, *SMALL_MAP.split())
+
+
+def test_map_writes_a_dataset_and_two_figures(small_map) -> None:
+    folder, _ = small_map
+    assert files(folder) == {"small.nc", "small_curves.png", "small_contours.png"}
+    for name in ("small_curves.png", "small_contours.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    data = read_dataset(folder / "small.nc")
+    np.testing.assert_array_equal(data.restitution, [0.5, 0.9])
+    np.testing.assert_array_equal(data.packing_fraction, [0.5, 0.6])
+    assert np.all(data.force_ratio >= 0.99)
+    assert np.all(data.equilibration_strain_by_seed == 0.5)
+    assert data.attrs["command"] == f"jaxgran {SMALL_MAP}"
+    assert data.attrs["replica_steps_per_second"] > 0
+
+
+def test_map_prints_the_table_and_the_progress_apart(small_map) -> None:
+    folder, (_, out, err) = small_map
+    data = read_dataset(folder / "small.nc")
+    assert "dt = 0.01 / shear rate, midpoint activation" in " ".join(out.split())
+    for nu in (0.5, 0.6):
+        (row,) = (line for line in out.splitlines() if line.split()[:1] == [str(nu)])
+        for alpha in (0.5, 0.9):
+            value = data.force_ratio.sel(packing_fraction=nu, restitution=alpha)
+            assert f"{float(value):.4g} ±" in row
+    assert "points" not in out
+    assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
+    for name in ("small.nc", "small_curves.png", "small_contours.png"):
+        assert f"wrote {name}" in err
+
+
+def test_status_of_the_exit_tells_whether_every_point_is_good(small_map) -> None:
+    folder, (status, _, err) = small_map
+    data = read_dataset(folder / "small.nc")
+    bad = [
+        f"(restitution {alpha:g}, packing fraction {nu:g})"
+        for nu in (0.5, 0.6)
+        for alpha in (0.5, 0.9)
+        if data.status.sel(packing_fraction=nu, restitution=alpha) != Status.ok
+    ]
+    assert status == (3 if bad else 0)
+    assert all(point in err for point in bad)
+
+
+def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path) -> None:
+    folder, _ = small_map
+    outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
+    assert (outcome.status, outcome.out) == (0, "")
+    assert files(tmp_path) == {"small_curves.png", "small_contours.png"}
+    for name in files(tmp_path):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_plot_into_a_folder_that_is_not_there_is_one_sentence(small_map) -> None:
+    folder, _ = small_map
+    assert_one_sentence(jaxgran(folder, "plot", "small.nc", "--output", "none"))
+
+
+def test_run_prints_every_average_with_its_error_and_unit(tmp_path: Path) -> None:
+    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep 1e-3 --strain 4 --output flow.nc"
+    outcome = jaxgran(tmp_path, *words.split())
+    assert outcome.status in (0, 3)
+    assert files(tmp_path) == {"flow.nc"}
+    data = read_dataset(tmp_path / "flow.nc").isel(restitution=0, packing_fraction=0)
+    for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
+        (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
+        assert f"{float(data[name]):.4g} ± {float(data[f'{name}_stderr']):.2g}" in row
+    (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("pressure"))
+    assert row.strip().endswith("m / t^2")
+
+
+def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
+    outcome = in_a_process(tmp_path, "info")
+    assert (outcome.status, outcome.err) == (0, "")
+    lines = dict(line.split(maxsplit=1) for line in outcome.out.splitlines() if "compilation" not in line)
+    assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
+    assert lines["precision"] == "float64"
+    assert "jaxgran" in outcome.out.splitlines()[-1]  # the folder of the compilation cache
+
+
+def test_no_command_at_all_is_the_help(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path)
+    assert outcome.status == 0
+    assert all(command in outcome.out for command in ("map", "plot", "run", "info"))
+
+
+def test_quiet_has_no_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--quiet")
+    assert outcome.status == 0
+    assert "points" not in outcome.err
+    assert {"jaxgran_map.nc", "jaxgran_map_curves.png"} <= files(tmp_path)
+
+
+@pytest.mark.parametrize("status", [status for status in Status if status != Status.ok])
+def test_bad_status_is_named_with_its_point(status: Status, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): status}))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1")
+    assert outcome.status == 3
+    assert f"{status.name.replace('_', ' ')}: (restitution 0.9, packing fraction 0.6)." in outcome.err
+    assert "restitution 0.5" not in outcome.err
+    assert "Traceback" not in outcome.err
+    (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("0.6"))
+    assert row.count("*") == 1
+    assert "jaxgran_map.nc" in files(tmp_path)
+
+
+def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
+    assert outcome.status == 130
+    assert files(tmp_path) == {"half.nc"}
+    data = read_dataset(tmp_path / "half.nc")
+    np.testing.assert_array_equal(data.status, [[NOT_RUN, Status.ok]])
+    assert np.isnan(data.force_ratio[0, 0]) and np.isfinite(data.force_ratio[0, 1])
+    command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
+    assert "1 points missing; what is done is saved" in outcome.err
+    assert outcome.err.rstrip().endswith(command)
+
+
+def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "old.nc").write_bytes(b"old")
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({}, KeyboardInterrupt))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc")
+    assert outcome.status == 130
+    assert (tmp_path / "old.nc").read_bytes() == b"old"
+    assert "saved" not in outcome.err and "wrote" not in outcome.err
