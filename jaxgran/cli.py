@@ -3,6 +3,7 @@
 Exit status: 0 done; 2 a mistake in the input; 3 finished, but a point carries a bad status; 130 interrupted.
 """
 
+import hashlib
 import os
 import platform
 import shlex
@@ -14,13 +15,17 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
 
+import platformdirs
 import typer
 from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from jaxgran.flow import Activation, InputError, Solver
+# XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+from jaxgran.flow import Activation, InputError, Solver  # noqa: E402
 
 INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
 _PLAIN_PROGRESS_SECONDS = 10
@@ -41,7 +46,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "grains": 256,
         "seeds": 2,
         "timestep": 1e-3,
-        "strain": 6.0,
+        "strain": 8.0,
     },
     "paper": {
         "restitution": "0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9,0.98",
@@ -56,6 +61,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 def main() -> None:
     """Entry point: mistakes in the input end with one sentence and exit status 2."""
+    os.environ.setdefault(
+        "TF_CPP_MIN_LOG_LEVEL", "3"
+    )  # XLA warns of harmless differences when it loads a cached program
     try:
         status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except InputError as mistake:
@@ -202,12 +210,20 @@ def _stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
 def _configured_jax():
     """JAX in double precision, with compiled programs kept in the cache folder of the user."""
     import jax
-    import platformdirs
 
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("jaxgran"))
+    jax.config.update("jax_compilation_cache_dir", _compilation_cache())
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     return jax
+
+
+def _compilation_cache() -> str:
+    """Folder of compiled programs, one for each kind of processor: a home folder may be shared by several."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    processor = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
+    kind = hashlib.sha256(processor.encode()).hexdigest()[:12]
+    return str(Path(platformdirs.user_cache_dir("jaxgran")) / kind)
 
 
 def _batch(text: str) -> int | Literal["auto"]:

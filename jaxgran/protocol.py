@@ -7,7 +7,7 @@ is then shortened geometrically, and the network relaxes over a strain of 0.5 at
 Stationarity is a statistical statement. The flow is sheared in chunks, and the temperature T and pressure P of each are
 recorded. Of the later two thirds of the record, the means of ln T and ln P over the first and the second half must
 differ by less than twice the standard error of that difference, which must itself be at most 0.1; if both hold for
-both, the flow is steady.
+both, the flow is steady. The error counts chunks as correlated at least as much as the memory of the flow says.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,8 @@ RELAXATION_STRAIN = 0.5  # at the final time step
 _SHORTENING_STRAIN = 0.1  # at each time step between
 _CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
 _COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
-_FEWEST_CHUNKS, _MOST_CHUNKS = 9, 60
+_SHORTEST_CHUNK = 0.75  # strain
+_FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
 _SIGNIFICANT, _PRECISE = 2.0, 0.1
 _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
@@ -80,11 +81,13 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
 def stack(flows: list[ShearFlow]) -> ShearFlow:
     """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
 
-    def joined(*values) -> Array:
+    def joined(path, *values) -> Array:
         numbers = np.stack([np.asarray(value) for value in values])
-        return jnp.asarray(numbers, jnp.int32 if numbers.dtype.kind == "i" else None)  # a cap fits an int32
+        if path[-1].name == "max_iterations":
+            return jnp.asarray(numbers, jnp.int32)
+        return jnp.asarray(numbers, None if numbers.dtype.kind == "f" else float)
 
-    return jax.tree.map(joined, *flows)
+    return jax.tree_util.tree_map_with_path(joined, *flows)
 
 
 def prepare_batch(
@@ -115,7 +118,8 @@ def sample_batch(batch: Batch, strain: float, report: Report | None = None) -> t
     side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
     measured = Sample(tally, side**2, shear_rate, batch.flow.grains)
     by_block = _averages(tally, side[:, None] ** 2, batch.flow.grains, shear_rate[:, None])
-    drifting = [_drifts(np.log(pressure)) for pressure in by_block["pressure"]]
+    correlation = np.exp(-strain / BLOCKS / _memory(batch, predicted(batch.flow)))
+    drifting = [_drifts(np.log(p), rho) for p, rho in zip(by_block["pressure"], correlation, strict=True)]
     status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
     return batch._replace(status=np.maximum(status, tally.status.max(axis=1))), measured
 
@@ -197,11 +201,18 @@ def _sheared(batch: Batch, strain: np.ndarray, report: Report | None, longest: f
     return batch._replace(strain=batch.strain + strain)
 
 
+def _memory(batch: Batch, theory: SteadyShear) -> np.ndarray:
+    """Strain that a flow remembers: that of its contact network, or that in which the shear heats it if longer."""
+    density = batch.flow.grains / np.asarray(batch.state.side) ** 2
+    heating = density * np.asarray(theory.granular_temperature) / np.asarray(theory.shear_stress)
+    return np.maximum(RELAXATION_STRAIN, heating)
+
+
 def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> Batch:
     """Shear in chunks until every replica is steady or has used up its chunks; steady ones wait."""
-    density = batch.flow.grains / np.asarray(batch.state.side) ** 2
-    memory = density * np.asarray(theory.granular_temperature) / np.asarray(theory.shear_stress)  # strain to heat up
-    chunk = np.maximum(0.5, memory / 2)
+    memory = _memory(batch, theory)
+    chunk = np.maximum(_SHORTEST_CHUNK, memory / 2)
+    correlation = np.exp(-chunk / memory)
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
     area, shear_rate = np.asarray(batch.state.side) ** 2, np.asarray(batch.flow.shear_rate)
@@ -215,7 +226,7 @@ def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> B
         record.append(np.log(np.stack([now["granular_temperature"], now["pressure"]])))
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
-            level = [steady[k] or all(_is_level(late[:, q, k]) for q in (0, 1)) for k in range(count)]
+            level = [steady[k] or all(_is_level(late[:, q, k], correlation[k]) for q in (0, 1)) for k in range(count)]
             steady = steady | (np.array(level) & ~waiting)
     bad = np.where(steady, Status.ok, Status.not_steady)
     return batch._replace(status=np.maximum(batch.status, bad))
@@ -235,15 +246,15 @@ def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
     return _sheared(batch, relaxation, report) if relaxation.any() else batch
 
 
-def _is_level(series: np.ndarray) -> bool:
+def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
     """Whether the halves of a series agree within the noise, and the noise is small."""
-    difference, error = drift(series)
+    difference, error = drift(series, least_correlation)
     return bool(error <= _PRECISE and abs(difference) <= _SIGNIFICANT * error)
 
 
-def _drifts(series: np.ndarray) -> bool:
+def _drifts(series: np.ndarray, least_correlation: float = 0.0) -> bool:
     """Whether the halves of a sample differ beyond doubt and by more than matters; True where it is not finite."""
-    difference, error = drift(series)
+    difference, error = drift(series, least_correlation)
     return not abs(difference) <= max(_SAMPLE_SIGNIFICANT * error, _SAMPLE_LEVEL)
 
 

@@ -35,11 +35,12 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     return value, {name: np.fmax.reduce([error[name] for error in [unknown, *errors]]) for name in value}
 
 
-def drift(series: np.ndarray) -> tuple[float, float]:
+def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
     """Difference of the means of the second and first half of a series, and its standard error.
 
     The error allows for the correlation of neighbouring values: the variance of a mean is multiplied by
-    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means, taken within [0, 0.9].
+    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series shows it too
+    small, so ρ is taken between ``least_correlation`` and 0.9.
     The series has at least four values.
     """
     half = len(series) // 2
@@ -47,7 +48,8 @@ def drift(series: np.ndarray) -> tuple[float, float]:
     means = halves.mean(axis=1)
     residuals = halves - means[:, None]
     squares = np.sum(residuals**2)
-    correlation = np.clip(np.sum(residuals[:, 1:] * residuals[:, :-1]) / max(squares, np.finfo(float).tiny), 0, 0.9)
+    lagged = np.sum(residuals[:, 1:] * residuals[:, :-1]) / max(squares, np.finfo(float).tiny)
+    correlation = np.clip(lagged, least_correlation, 0.9)
     variance = squares / (2 * half - 2) * 2 / half
     return float(means[1] - means[0]), float(np.sqrt(variance * (1 + correlation) / (1 - correlation)))
 

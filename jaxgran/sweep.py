@@ -176,11 +176,12 @@ _worker_report: Report | None = None
 
 
 def _start_worker(queue, x64: bool, cache: str | None) -> None:
-    """Set up a worker process: one thread, the precision of the parent, and Ctrl-C left to the parent."""
+    """Set up a worker process: the precision of the parent, and Ctrl-C left to the parent.
+
+    XLA keeps its flags: with others, small matrix products would be summed in another order than in the parent.
+    """
     global _worker_report
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    single = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {single}"
     jax.config.update("jax_enable_x64", x64)
     jax.config.update("jax_compilation_cache_dir", cache)
     _worker_report = queue.put

@@ -196,10 +196,13 @@ def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch
     assert "Permission denied" in outcome.err
 
 
-def test_a_mistake_has_no_traceback_in_a_process_of_its_own(tmp_path: Path) -> None:
-    outcome = in_a_process(tmp_path, "map", "--restitution", "0.5,2")
-    assert_one_sentence(outcome)
-    assert not any(name.endswith((".nc", ".png")) for name in files(tmp_path))
+def test_a_mistake_is_one_sentence_in_a_process_of_its_own_with_and_without_cached_programs(tmp_path: Path) -> None:
+    for _ in range(2):
+        outcome = in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09")
+        assert_one_sentence(outcome)
+        assert "timestep must be at most" in outcome.err
+        assert any((tmp_path / "cache" / "jaxgran").iterdir())
+    assert files(tmp_path) == {"cache"}
 
 
 # What the commands do

@@ -61,6 +61,13 @@ def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     assert np.all(state.tilt == 0)
 
 
+def test_whole_numbers_become_real_ones_in_a_batch_of_flows() -> None:
+    flow = stack([ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0, 1)])
+    assert flow.restitution.dtype == flow.shear_rate.dtype == jnp.float64
+    assert flow.max_iterations.dtype == jnp.int32
+    np.testing.assert_array_equal(flow.restitution, [0.0, 1.0])
+
+
 def test_momentum_stays_zero_through_the_preparation(batch) -> None:
     masses, velocities = np.asarray(batch.state.grains.masses), np.asarray(batch.state.velocities)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-10)
