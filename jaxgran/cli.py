@@ -25,7 +25,7 @@ from rich.table import Table
 # XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from jaxgran.flow import Activation, InputError, Solver  # noqa: E402
+from jaxgran.flow import Activation, InputError, Solver
 
 INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
 _PLAIN_PROGRESS_SECONDS = 10
@@ -42,7 +42,7 @@ app = typer.Typer(
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {
         "restitution": "0.1,0.25,0.4,0.6,0.8",
-        "packing_fraction": "0.3,0.5,0.6,0.7,0.75,0.79",
+        "packing_fraction": "0.4,0.5,0.6,0.7,0.75,0.79",
         "grains": 256,
         "seeds": 2,
         "timestep": 1e-3,

@@ -6,8 +6,9 @@ is then shortened geometrically, and the network relaxes over a strain of 0.5 at
 
 Stationarity is a statistical statement. The flow is sheared in chunks, and the temperature T and pressure P of each are
 recorded. Of the later two thirds of the record, the means of ln T and ln P over the first and the second half must
-differ by less than twice the standard error of that difference, which must itself be at most 0.1; if both hold for
-both, the flow is steady. The error counts chunks as correlated at least as much as the memory of the flow says.
+differ by less than twice the standard error of that difference or by less than 0.1, and that error must be at most 0.1;
+if both hold for both, the flow is steady. The error counts chunks as correlated at least as much as the memory of the
+flow says.
 """
 
 from collections.abc import Callable
@@ -40,7 +41,7 @@ _CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
 _COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
 _SHORTEST_CHUNK = 0.75  # strain
 _FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
-_SIGNIFICANT, _PRECISE = 2.0, 0.1
+_SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
 _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
 
@@ -247,9 +248,9 @@ def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
 
 
 def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the halves of a series agree within the noise, and the noise is small."""
+    """Whether the halves of a series agree within the noise or a tenth, and the noise is small."""
     difference, error = drift(series, least_correlation)
-    return bool(error <= _PRECISE and abs(difference) <= _SIGNIFICANT * error)
+    return bool(error <= _PRECISE and abs(difference) <= max(_SIGNIFICANT * error, _LEVEL))
 
 
 def _drifts(series: np.ndarray, least_correlation: float = 0.0) -> bool:

@@ -54,6 +54,7 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
     """Run a command as its user would, in a process of its own."""
     command = [sys.executable, "-c", "from jaxgran.cli import main; main()", *arguments]
     environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     return Outcome(done.returncode, done.stdout, done.stderr)
 
