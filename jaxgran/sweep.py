@@ -166,7 +166,8 @@ def _tasks(settings: MapSettings, batch: int | Literal["auto"], workers: int) ->
 def _batch_size(grains: int, count: int, workers: int) -> int:
     device = jax.devices()[0]
     if device.platform == "cpu":
-        return max(1, min(_LARGEST_CPU_BATCH, count // (8 * workers)))
+        largest = max(1, min(_LARGEST_CPU_BATCH, count // (8 * workers)))
+        return next(size for size in range(largest, 0, -1) if count % size == 0)  # a smaller last one compiles again
     memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
     per_replica = _GRAIN_BYTES * grains + _SEARCH_BYTES * min(grains, 512) ** 2
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory / per_replica)))
