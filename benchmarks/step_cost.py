@@ -176,7 +176,9 @@ def draw(points: list[dict], means: dict[float, float]) -> Figure:
                 yerr=[height - low, high - height],
                 error_kw={"elinewidth": 1, "capsize": 2},
             )
-        axes.set(yscale="log", title=rf"$\mathrm{{d}}t={dt:g}/\dot\gamma$, mean ratio {means[dt]:.2g}")
+        axes.set(
+            yscale="log", title=rf"$\mathrm{{d}}t=10^{{{np.log10(dt):.0f}}}/\dot\gamma$, mean ratio {means[dt]:.2g}"
+        )
         axes.set_xticks(place, [f"{p['alpha']:g}\n{p['nu']:g}" for p in here])
         axes.set_xlabel("restitution α (above), packing fraction ν (below)")
     figure.axes[0].set_ylabel("µs per replica and step")

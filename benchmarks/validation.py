@@ -28,6 +28,7 @@ EVENT_DRIVEN = {
     (0.7, 0.7): (0.537, 5.46, 2.26),
 }
 OBSERVABLES = ("granular_temperature", "pressure", "shear_stress")
+REFERENCE_ERROR = {"granular_temperature": 0.03, "pressure": 0.01, "shear_stress": 0.01, "force_ratio": 0.05}  # at most
 # (packing fraction, restitution): force ratio of single runs of strain 3 to 4, about 5 % uncertain
 FORCE_RATIO = {
     (0.3, 0.9): 1.000,
@@ -119,6 +120,9 @@ def draw(rows: list[dict]) -> Figure:
     place = np.arange(len(rows))[::-1]
     ratio = [row["value"] / row["reference"] for row in rows]
     axes.axvline(1, color="0.6")
+    uncertain = [REFERENCE_ERROR[row["observable"]] for row in rows]
+    axes.barh(place, 2 * np.array(uncertain), 0.8, 1 - np.array(uncertain), color="0.88", label="reference ± its error")
+    figure.legend(loc="outside upper center", fontsize="small")
     axes.errorbar(ratio, place, xerr=[row["error"] / row["reference"] for row in rows], fmt="ko", ms=4, capsize=3)
     axes.set_yticks(place, [f"{r['observable'].replace('_', ' ')}, ν {r['nu']:g}, α {r['alpha']:g}" for r in rows])
     axes.tick_params(labelsize="small")

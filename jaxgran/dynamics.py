@@ -89,7 +89,7 @@ class _Carry(NamedTuple):
 def contact_capacities(grains: int) -> tuple[int, ...]:
     """Sizes of the contact buffers, smallest first. Contacts of discs form a planar graph: at most 3 N of them."""
     top = 3 * grains
-    return tuple(sorted({1, *(max(4, top // 4**k) for k in (0, 1, 2, 3))}))
+    return tuple(sorted({1, *(max(4, top // share) for share in (96, 24, 6, 3, 1))}))
 
 
 def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> tuple[State, Tally]:

@@ -1,5 +1,6 @@
 """ShearFlow: the parameters of one simple shear flow, with their units and accepted ranges."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from typing import Literal, get_args
 
@@ -89,7 +90,7 @@ _TRACED, _FIXED = (
 )
 
 
-def _unflatten(fixed: tuple, traced: tuple) -> ShearFlow:
+def _unflatten(fixed: tuple, traced: Iterable) -> ShearFlow:
     """A flow of any leaves, not judged: they may be derivatives, axes or placeholders."""
     flow = object.__new__(ShearFlow)
     for name, value in zip(_FIXED + _TRACED, (*fixed, *traced), strict=True):
