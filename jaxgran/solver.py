@@ -117,8 +117,7 @@ def solve(
         return active & ~(now.residual <= target) & (now.iterations < max_iterations) & ~jnp.isnan(now.residual)
 
     def iterate(now: _Iterate) -> _Iterate:
-        next_momentum = (1 + jnp.sqrt(1 + 4 * now.momentum**2)) / 2
-        extrapolation = (now.momentum - 1) / next_momentum
+        extrapolation = now.momentum / (now.momentum + 3)
         start, response = now.point + extrapolation * (now.point - now.previous)
         impulses = jnp.maximum(0, start - relaxation * (response + b) / bound)
         response = delassus_product(contacts, impulses, grains)
@@ -131,7 +130,7 @@ def solve(
         new = _Iterate(
             point=point,
             previous=now.point,
-            momentum=jnp.where(keep_momentum, next_momentum, 1.0).astype(b.dtype),
+            momentum=jnp.where(keep_momentum, now.momentum + 1, 0).astype(b.dtype),
             residual=residual,
             best=jnp.where(better, point, now.best),
             best_residual=jnp.where(better, residual, now.best_residual),
@@ -141,7 +140,7 @@ def solve(
 
     zero = jnp.zeros((2, b.size), b.dtype)
     infinite = jnp.asarray(jnp.inf, b.dtype)
-    start = _Iterate(zero, zero, jnp.ones((), b.dtype), infinite, zero, infinite, jnp.int32(0))
+    start = _Iterate(zero, zero, jnp.zeros((), b.dtype), infinite, zero, infinite, jnp.int32(0))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start)
     impulses, response = end.best
 
