@@ -3,8 +3,8 @@
 Two maps are run. The first is compared with event-driven simulations of the same hard discs (N = 1000), which have no
 time step at all; the second, with the touching rule at dt = 1e-4, with another contact-dynamics program (N = 400).
 
-    python benchmarks/validation.py           # about 20 minutes on two cores
-    python benchmarks/validation.py --quick   # fewer grains and less strain, about 2 minutes
+    python benchmarks/validation.py           # about 2 minutes on two cores
+    python benchmarks/validation.py --quick   # fewer grains and less strain, about a minute
 """
 
 import argparse
