@@ -79,11 +79,6 @@ class ShearFlow:
         """θ: the share of a step of free flight over which a pair must overlap to be a contact."""
         return 0.5 if self.activation == "midpoint" else 0.0
 
-    @property
-    def is_batch(self) -> bool:
-        """Whether the numbers of this flow carry a leading (replicas,) axis."""
-        return any(np.ndim(getattr(self, f.name)) > 0 for f in fields(self) if not f.metadata.get("static"))
-
 
 _TRACED, _FIXED = (
     tuple(f.name for f in fields(ShearFlow) if bool(f.metadata.get("static")) is static) for static in (False, True)

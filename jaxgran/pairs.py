@@ -11,7 +11,8 @@ grains of largest diameter d that touch have |Δy| ≤ d, so no contact is misse
 
     2 max|δ| (1 + |γ_ref|) + d |γ − γ_ref| ≤ s
 
-with δ counted from the build of the list and γ_ref the strain of the frame at that time.
+with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer list is judged by
+this; the near one, in ``dynamics``, by a bound on the speed at which a gap closes, which is cheaper and as safe.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxgran.cell import displacement, remap_tilt, sheared, wrap
 from jaxgran.grains import Grains
-from jaxgran.neighbours import cell_list_pairs
+from jaxgran.neighbours import cell_list_pairs, set_bit
 from jaxgran.replica import any_replica, where_active
 
 ALL_PAIRS_LIMIT = 512  # above this number of grains the search uses a cell list
@@ -177,15 +178,7 @@ def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Arra
         running = jnp.cumsum(set_in_word, dtype=jnp.int32)
         word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
     found = jnp.minimum(word, count - 1)
-    rank = wanted - (running - set_in_word)[found]
-    bits, place = words[found], jnp.zeros_like(wanted)
-    for half in (16, 8, 4, 2, 1):
-        low = bits & jnp.uint32((1 << half) - 1)
-        below = jax.lax.population_count(low).astype(jnp.int32)
-        upper = rank >= below
-        rank = jnp.where(upper, rank - below, rank)
-        bits = jnp.where(upper, bits >> half, low)
-        place = jnp.where(upper, place + half, place)
+    place = set_bit(words[found], wanted - (running - set_in_word)[found])
     return jnp.where(word < count, found * _WORD + place, length)
 
 

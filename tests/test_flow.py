@@ -97,12 +97,11 @@ def test_flow_is_a_pytree_of_its_numbers():
 
 def test_batch_of_flows_is_a_flow_of_arrays():
     batch = replace(FLOW, restitution=np.array([0.1, 0.5, 0.9]), timestep=jnp.array([1e-3, 1e-4, 1e-5]))
-    assert batch.is_batch and not FLOW.is_batch
     axes = jax.tree.map(lambda values: 0 if np.ndim(values) else None, batch)
     products = jax.vmap(lambda flow: flow.restitution * flow.timestep, in_axes=(axes,))(batch)
     np.testing.assert_array_equal(products, batch.restitution * np.asarray(batch.timestep))
     stacked = jax.tree.map(lambda *values: np.stack(values), FLOW, replace(FLOW, restitution=0.9))
-    assert stacked.is_batch and stacked.grains == 64
+    assert stacked.grains == 64
     np.testing.assert_array_equal(stacked.restitution, [0.5, 0.9])
 
 
