@@ -66,7 +66,9 @@ def main() -> None:
     means = {dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt]))) for dt in STRAINS}
     for dt, mean in means.items():
         print(f"dt = {dt:g}: geometric mean of jaxgran over rival {mean:.2f}")
-    memory = float(subprocess.run([sys.executable, __file__, "--memory-only"], capture_output=True, text=True).stdout)
+    memory = float(
+        subprocess.run([sys.executable, __file__, "--memory-only"], capture_output=True, text=True, check=True).stdout
+    )
     print(f"peak memory of 1000 replicas of {GRAINS} grains: {memory:.2f} GB")
 
     chosen.output.mkdir(parents=True, exist_ok=True)

@@ -54,16 +54,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "grains": 400,
         "seeds": 4,
         "timestep": 1e-5,
-        "strain": 2.0,
+        "strain": 4.0,
     },
 }
 
 
 def main() -> None:
     """Entry point: mistakes in the input end with one sentence and exit status 2."""
-    os.environ.setdefault(
-        "TF_CPP_MIN_LOG_LEVEL", "3"
-    )  # XLA warns of harmless differences when it loads a cached program
     try:
         status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except InputError as mistake:
@@ -116,7 +113,7 @@ def map_command(
     """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
     for name, wanted in (("--scheduler", scheduler is not None), ("--resume", resume)):
         if wanted:
-            raise InputError(f"{name} is not available yet: run the map on this machine, from the start.")
+            raise InputError(f"{name} is not available yet: run the map here, from the start.")
     given = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,

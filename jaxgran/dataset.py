@@ -5,7 +5,6 @@ import platform
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +14,9 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.flow import InputError
-from jaxgran.measure import Sample
-from jaxgran.observables import OBSERVABLES, TENSORS, averages
+from jaxgran.measure import Sample, estimates
+from jaxgran.observables import OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
-from jaxgran.statistics import jackknife
 from jaxgran.status import Status
 
 NOT_RUN = -1
@@ -102,8 +100,9 @@ def check_output(path: Path) -> None:
     """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
     if path.suffix != ".nc":
         raise InputError(f"output must be a file name that ends in .nc, not {str(path)!r}.")
-    if path.is_dir():
-        raise InputError(f"output must be a file, and {str(path)!r} is a folder.")
+    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in ("curves", "contours"))):
+        if file.is_dir():
+            raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
     if not path.parent.is_dir():
         raise InputError(f"output must be in a folder that exists, and {str(path.parent)!r} does not.")
     try:
@@ -165,12 +164,7 @@ def _worst(status: np.ndarray) -> np.ndarray:
 
 def _point_estimates(seeds: list[Replica]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Averages over all blocks of all seeds of one point, and their errors."""
-    first = seeds[0].sample
-    sums = jax.tree.map(lambda *x: np.stack(x), *(replica.sample.tally for replica in seeds))
-    estimate = partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate)
-    values, errors = jackknife(estimate, sums)
-    values["max_overlap"] = sums.largest_overlap.max()
-    errors["max_overlap"] = sums.largest_overlap.std()
+    values, errors = estimates([replica.sample for replica in seeds])
     return {name: (values[name], errors[name]) for name in OBSERVABLES}
 
 

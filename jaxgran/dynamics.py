@@ -130,7 +130,9 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
         step = now.step + jump
         meets = go & (step < steps)
         velocities, pairs, sums = _collide(flow, hood.near, grains, velocities, pairs, sums, meets)
-        status = jnp.where(hood.near.overflow | (slack < 0), Status.capacity, Status.ok)
+        status = jnp.where(
+            hood.near.overflow | (slack < -16 * jnp.finfo(slack.dtype).eps * hood.near.skin), Status.capacity, Status.ok
+        )
         status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
         sums = sums._replace(status=jnp.maximum(sums.status, status))
         return where_active(go, _Carry(hood, pairs, slack, velocities, step, meets, sums), now)
@@ -166,7 +168,8 @@ def _fresh_lists(
     r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
     """
     cx, cy = now.velocities[:, 0], now.velocities[:, 1]
-    speed = jnp.sqrt(-_smallest(-(cx * cx + cy * cy))) * (1 + _LONGEST_FLIGHT)
+    longest = jnp.maximum(_LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
+    speed = jnp.sqrt(-_smallest(-(cx * cx + cy * cy))) * (1 + longest)
     diameter = 2 * jnp.max(grains.radii)
 
     def loss(skin: Array) -> Array:

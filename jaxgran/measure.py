@@ -1,5 +1,6 @@
 """Sample: what is measured of a flow over a strain, in blocks, so that every average has an error."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.dynamics import State, advance
 from jaxgran.flow import InputError, ShearFlow, require, two_digits
 from jaxgran.observables import averages
-from jaxgran.statistics import jackknife
+from jaxgran.statistics import Estimates, jackknife
 from jaxgran.tally import Tally
 
 BLOCKS = 16
@@ -102,8 +103,22 @@ class Sample:
         """Standard errors of the averages of one replica, by the names of the observables (see ``jackknife``)."""
         if jnp.ndim(self.area):
             raise InputError("errors are those of one replica, and this sample holds a batch: index it first.")
-        sums = jax.tree.map(lambda x: np.asarray(x)[None], self.tally)
-        return jackknife(partial(averages, area=self.area, grains=self.grains, shear_rate=self.shear_rate), sums)[1]
+        return estimates([self])[1]
+
+
+def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
+    """Averages over all blocks of some replicas of one flow, and their standard errors by the jackknife.
+
+    The largest overlap is no average: its entry is the largest of all blocks, and its error the standard deviation of
+    the largest overlaps of the blocks.
+    """
+    first = seeds[0]
+    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
+    values, errors = jackknife(
+        partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
+    )
+    overlap = {"max_overlap": sums.largest_overlap.max()}, {"max_overlap": sums.largest_overlap.std()}
+    return values | overlap[0], errors | overlap[1]
 
 
 def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = BLOCKS) -> tuple[State, Sample]:
@@ -119,9 +134,13 @@ def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = B
       The state at the end and the sample.
 
     Raises:
-      ValueError: the strain is not a positive number, or positions in float32 cannot resolve the time step.
+      ValueError: the strain is not a positive number or shorter than a time step for each block, or positions in
+        float32 cannot resolve the time step.
     """
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
+        least = blocks * np.max(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
+        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {blocks} time steps, {least:g}")
     check_precision(flow, state)
     return _sample(flow, state, strain, blocks)
 
@@ -129,8 +148,8 @@ def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = B
 @partial(jax.jit, static_argnames="blocks")
 def _sample(flow: ShearFlow, state: State, strain: Array, blocks: int) -> tuple[State, Sample]:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
-    edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks).astype(jnp.int32)
-    state, tally = lax.scan(lambda now, n: advance(flow, now, n), state, jnp.diff(edges))
+    edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks)
+    state, tally = lax.scan(lambda now, n: advance(flow, now, n), state, jnp.diff(edges).astype(jnp.int32))
     return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains)
 
 

@@ -67,7 +67,7 @@ def pack(flow: ShearFlow, key: Array) -> tuple[State, Bool[Array, ""]]:
         go = unfinished(now)
         stuck = go & (now.iterations >= _ITERATIONS)
         now = lax.cond(any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now)
-        return where_active(go, _fire_step(now, inflated, side), now)
+        return where_active(go, _fire_step(now, inflated, side, allowed), now)
 
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start(jnp.int32(0)))
     positions, tilt = present(end.hood, side)
@@ -85,8 +85,11 @@ def _overlap_forces(hood: Neighbourhood, grains: Grains) -> tuple[Float[Array, "
     return jnp.zeros_like(hood.positions).at[pairs.i].add(push).at[pairs.j].add(-push), largest
 
 
-def _fire_step(now: _Fire, grains: Grains, side: Array) -> _Fire:
-    """One step of FIRE: follow the forces with inertia, stop dead when they point backwards."""
+def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire:
+    """One step of FIRE: follow the forces with inertia, stop dead when they point backwards.
+
+    Where the overlap is allowed already nothing moves, so that the packing returned is the one that was measured.
+    """
     frame = now.hood.frame
     stale = ~(consumed_skin(frame, now.hood.near_frame, 2 * jnp.max(grains.radii)) <= now.hood.near.skin)
     hood = lax.cond(any_replica(stale), lambda: refresh(now.hood, grains, side, stale), lambda: now.hood)
@@ -100,6 +103,7 @@ def _fire_step(now: _Fire, grains: Grains, side: Array) -> _Fire:
     step = jnp.maximum(step, 1e-3)
     mixing = jnp.where(forward, jnp.where(faster, now.mixing * 0.99, now.mixing), 0.1).astype(now.mixing.dtype)
     velocities = mixed + step * forces
-    moved = Frame(hood.frame.displacements + step * velocities, hood.frame.strain)
+    stride = jnp.where(overlap < allowed, 0, step)
+    moved = Frame(hood.frame.displacements + stride * velocities, hood.frame.strain)
     hood = Neighbourhood(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
     return _Fire(hood, velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts)

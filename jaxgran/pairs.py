@@ -7,12 +7,13 @@ from the displacements δ of the grains since then and from the strain γ since 
 
 There are two lists. The outer one has a large skin and is searched seldom; the near one, which every event reads,
 is filtered from it often. A list with skin s holds every pair whose gap was at most s when it was built. Two
-grains of largest diameter d that touch have |Δy| ≤ d, so no contact is missed while
+grains within a distance r now have |Δy| ≤ r, so no such pair is missed as long as its gap is at most
 
-    2 max|δ| (1 + |γ_ref|) + d |γ − γ_ref| ≤ s
+    s − 2 max|δ| (1 + |γ_ref|) − r |γ − γ_ref|
 
-with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer list is judged by
-this; the near one, in ``dynamics``, by a bound on the speed at which a gap closes, which is cheaper and as safe.
+with δ counted from the build of the list and γ_ref the strain of the frame at that time. So the outer list is judged
+before a near list is filtered from it, with r the largest diameter and the skin of the near list; the near list itself
+is judged in ``dynamics`` by a bound on the speed at which a gap closes, which is cheaper and as safe.
 """
 
 from dataclasses import dataclass
@@ -98,10 +99,13 @@ def separations_now(pairs: PairList, frame: Frame) -> Float[Array, "pairs 2"]:
     return sheared(d, frame.strain)
 
 
-def consumed_skin(frame: Frame, since: Frame, largest_diameter: Array) -> Float[Array, ""]:
-    """How much of the skin of a list built at ``since`` the motion up to ``frame`` may have used."""
+def consumed_skin(frame: Frame, since: Frame, distance: Array) -> Float[Array, ""]:
+    """How much of the skin of a list built at ``since`` the motion up to ``frame`` may have used.
+
+    It holds for pairs that are now within the given distance (of their centres).
+    """
     moved = jnp.sqrt(jnp.max(jnp.sum((frame.displacements - since.displacements) ** 2, axis=-1)))
-    return 2 * moved * (1 + jnp.abs(since.strain)) + largest_diameter * jnp.abs(frame.strain - since.strain)
+    return 2 * moved * (1 + jnp.abs(since.strain)) + distance * jnp.abs(frame.strain - since.strain)
 
 
 def present(hood: Neighbourhood, side: Array) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
@@ -130,8 +134,9 @@ def refresh(hood: Neighbourhood, grains: Grains, side: Array, stale: Bool[Array,
       stale: whether this replica needs it; others of the batch keep what they have.
     """
     still = Frame(jnp.zeros_like(hood.positions), jnp.zeros_like(hood.tilt))
-    left = hood.outer.skin - consumed_skin(hood.frame, still, 2 * jnp.max(grains.radii))
-    search = stale & ~(left >= _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side))
+    nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
+    left = hood.outer.skin - consumed_skin(hood.frame, still, 2 * jnp.max(grains.radii) + nominal)
+    search = stale & ~(left >= nominal)
 
     def searched(_):
         positions, tilt = present(hood, side)

@@ -54,7 +54,7 @@ class Batch(NamedTuple):
     flow: ShearFlow
     state: State
     status: Int[np.ndarray, " replicas"]
-    strain: Float[np.ndarray, " replicas"]  # spent on reaching the steady state
+    strain: Float[np.ndarray, " replicas"]  # sheared before the sample
 
 
 def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> State:
@@ -63,7 +63,8 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
     Args:
       flow: parameters of one flow.
       key: JAX random key; the same key gives the same state.
-      equilibrate: strain to shear at the coarse time step, or None to shear until the flow is steady.
+      equilibrate: strain to shear at the coarse time step, or None to shear until the flow is steady. A given
+        strain is taken as it is, though a map calls a point whose strain is shorter than its memory not steady.
 
     Returns:
       The state after packing, heating, shearing and relaxing.
@@ -74,7 +75,8 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
       RuntimeError: the flow did not become steady, or ended with a bad status.
     """
     batch = prepare_batch(stack([flow]), key[None], equilibrate)
-    if batch.status[0] != Status.ok:
+    tolerated = Status.ok if equilibrate is None else Status.not_steady
+    if batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
     return jax.tree.map(lambda x: x[0], batch.state)
 
@@ -99,13 +101,15 @@ def prepare_batch(
     check_timestep(flow, theory)
     state, packed = _start(flow, keys, theory.granular_temperature)
     check_precision(flow, state)
-    status = np.where(np.asarray(packed), Status.ok, Status.not_steady)
+    status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=_coarse_timestep(flow, theory))
     batch = Batch(coarse, state, status, np.zeros(len(status)))
     if equilibrate is None:
         batch = _until_steady(batch, theory, report)
-    elif equilibrate > 0:
-        batch = _sheared(batch, np.full(len(status), equilibrate), report)
+    else:
+        too_short = equilibrate < _memory(batch, theory)
+        batch = _sheared(batch, np.full(len(status), equilibrate), report) if equilibrate > 0 else batch
+        batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
     return _shortened(batch, flow, report)
 
 
@@ -120,7 +124,8 @@ def sample_batch(batch: Batch, strain: float, report: Report | None = None) -> t
     measured = Sample(tally, side**2, shear_rate, batch.flow.grains)
     by_block = _averages(tally, side[:, None] ** 2, batch.flow.grains, shear_rate[:, None])
     correlation = np.exp(-strain / BLOCKS / _memory(batch, predicted(batch.flow)))
-    drifting = [_drifts(np.log(p), rho) for p, rho in zip(by_block["pressure"], correlation, strict=True)]
+    series = np.log(np.stack([by_block["pressure"], by_block["granular_temperature"]], axis=1))
+    drifting = [any(_drifts(one, rho) for one in pair) for pair, rho in zip(series, correlation, strict=True)]
     status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
     return batch._replace(status=np.maximum(status, tally.status.max(axis=1))), measured
 
@@ -190,8 +195,8 @@ def _chunk(batch: Batch, strain: np.ndarray, report: Report | None) -> tuple[Bat
     tally = jax.tree.map(np.asarray, tally)
     if report is not None:
         report(float(tally.steps.sum()))
-    status = np.where(tally.status == Status.nonfinite, Status.nonfinite, batch.status)
-    return batch._replace(state=state, status=status), tally
+    lost = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the rest is for the sample to judge
+    return batch._replace(state=state, status=np.maximum(batch.status, lost)), tally
 
 
 def _sheared(batch: Batch, strain: np.ndarray, report: Report | None, longest: float = 1.0) -> Batch:

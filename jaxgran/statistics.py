@@ -6,7 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-BLOCK_MERGES = (1, 2, 4)
+BLOCK_MERGES = (1, 2, 4, 8, 16)  # with 16 blocks a seed, the last compares whole seeds
+_FEWEST_GROUPS = 4  # a spread over fewer says little, unless there is nothing better
 Estimates = dict[str, np.ndarray]
 
 
@@ -14,8 +15,9 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
     Every estimate is a function of sums (a ratio of sums, as a rule), so its error comes from leaving out one block at
-    a time. Blocks that follow each other are correlated; merged in twos and fours they are less so, and the largest of
-    the three errors is taken (the blocking method: Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
+    a time. Blocks that follow each other are correlated; merged in groups of up to 16 they are less so, and the
+    largest of the errors is taken, as far as there are four groups (the blocking method: Flyvbjerg and Petersen,
+    J. Chem. Phys. 91, 461, 1989).
 
     Args:
       estimate: maps a pytree of sums with any leading axes to named estimates with the same leading axes.
@@ -30,7 +32,7 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     errors = [
         _jackknife_error(estimate, jax.tree.map(lambda x, m=m: _merged(x, m), sums))
         for m in BLOCK_MERGES
-        if seeds * (blocks // m) >= 2
+        if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)
     ]
     return value, {name: np.fmax.reduce([error[name] for error in [unknown, *errors]]) for name in value}
 

@@ -28,6 +28,7 @@ _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
 _GRAIN_BYTES = 2000  # lists, network and state of a replica
 _SHARE_OF_MEMORY = 0.5
+_LIKE = 2  # replicas that advance in lockstep differ in cost by at most this factor
 
 
 def ratio_map(
@@ -129,7 +130,8 @@ def replicas(
     queue = context.SimpleQueue()
     configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
     pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (queue, *configuration))
-    listener = threading.Thread(target=_listen, args=(queue, report), daemon=True)
+    ended = threading.Event()
+    listener = threading.Thread(target=_listen, args=(queue, report, ended), daemon=True)
     listener.start()
     try:
         for done in as_completed([pool.submit(_run_task, settings, task) for task in tasks]):
@@ -139,8 +141,8 @@ def replicas(
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()
-        queue.put(None)
-        listener.join()
+        ended.set()
+        listener.join(timeout=1)  # a worker that was ended while it reported may have left half a message
 
 
 def usable_cores() -> int:
@@ -160,7 +162,14 @@ def _tasks(settings: MapSettings, batch: int | Literal["auto"], workers: int) ->
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
     keys = [(point, seed) for point in order for seed in range(settings.seeds)]
     size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" else batch
-    return [keys[k : k + size] for k in range(0, len(keys), size)]
+    lockstep = jax.default_backend() != "cpu"
+    tasks: list[list[Key]] = []
+    for key in keys:
+        full = not tasks or len(tasks[-1]) == size
+        if full or (lockstep and costs[key[0]] < costs[tasks[-1][0][0]] / _LIKE):
+            tasks.append([])
+        tasks[-1].append(key)
+    return tasks
 
 
 def _batch_size(grains: int, count: int, workers: int) -> int:
@@ -188,10 +197,13 @@ def _start_worker(queue, x64: bool, cache: str | None) -> None:
     _worker_report = queue.put
 
 
-def _listen(queue, report: Report | None) -> None:
-    while (steps := queue.get()) is not None:
-        if report is not None:
-            report(steps)
+def _listen(queue, report: Report | None, ended: threading.Event) -> None:
+    """Pass on what the workers report, until they have ended."""
+    while not ended.wait(0.05):
+        while not queue.empty():
+            steps = queue.get()
+            if report is not None:
+                report(steps)
 
 
 def _run_task(settings: MapSettings, task: Sequence[Key], report: Report | None = None) -> list[tuple[Key, Replica]]:

@@ -1,5 +1,7 @@
 """Neighbour lists against brute force: complete while they are valid, also after large shear; never silently short."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -145,3 +147,23 @@ def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
     places = clustered(len(state.positions), float(state.side), 0)
     hood = jax.jit(lambda *arguments: neighbourhood(*arguments))(places, state.grains, state.side, state.tilt)
     assert hood.outer.overflow and hood.near.overflow
+
+
+def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
+    """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than touching ones."""
+    rng, count = np.random.default_rng(0), 256
+    grains = Grains(jnp.full(count, 0.5), jnp.ones(count))
+    side = jnp.sqrt(count * jnp.pi / 4 / 0.1)
+    sheared = jax.jit(lambda hood, stale: refresh(hood, grains, side, stale))
+    for _ in range(5):
+        positions = jnp.asarray(rng.uniform(size=(count, 2))) * side
+        hood = build(positions, grains, side, jnp.asarray(0.0))
+        for strain in (0.2, 0.5, 1.0):
+            hood = replace(hood, frame=Frame(jnp.zeros_like(positions), jnp.asarray(strain) + 0 * hood.frame.strain))
+            hood = sheared(hood, jnp.asarray(True))
+            now, tilt = present(hood, side)
+            assert not (hood.near.overflow | hood.outer.overflow)
+            skin = float(hood.near.skin) - 1e-12
+            assert pairs_within(skin, now, np.asarray(grains.radii), float(side), float(tilt)) <= listed_pairs(
+                hood.near
+            )
