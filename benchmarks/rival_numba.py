@@ -2,7 +2,7 @@
 
 It solves the same time step as jaxgran and shares no code with it, so it serves twice: as the time to beat on one core
 and as an independent check of the physics. The loop visits every time step, it never jumps over free flight; everything
-else is as fast as we know how to write it:
+else is made to be fast:
 
 - *Two Verlet lists.* A cell list fills an outer list with a wide skin; an inner list with a narrow one is filtered from
   it. The skins follow from the fastest grain and the time step. The inner list is valid while a running bound on the
