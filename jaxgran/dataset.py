@@ -26,7 +26,7 @@ _TENSOR_AXES = ("axis_a", "axis_b")
 
 
 class Replica(NamedTuple):
-    """Result of one replica: its sample, its worst status, and the strain that it took to become steady."""
+    """Result of one replica: its sample, its worst status, and the strain that was sheared before the sample."""
 
     sample: Sample
     status: int
@@ -57,8 +57,9 @@ def map_dataset(
     for point in range(count):
         finite = [results[point, s] for s in range(seeds) if NOT_RUN < status[point, s] < Status.nonfinite]
         if finite:
-            for name, (value, error) in _point_estimates(finite).items():
-                values[name][point], errors[name][point] = value, error
+            value, error = estimates([replica.sample for replica in finite])
+            for name in OBSERVABLES:
+                values[name][point], errors[name][point] = value[name], error[name]
 
     variables = {}
     for name, (long_name, units) in OBSERVABLES.items():
@@ -160,12 +161,6 @@ def _worst(status: np.ndarray) -> np.ndarray:
     """Worst status over the seeds of each point; not run where a seed is missing and no other is worse than ok."""
     worst = status.max(axis=1)
     return np.where((status.min(axis=1) == NOT_RUN) & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
-
-
-def _point_estimates(seeds: list[Replica]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Averages over all blocks of all seeds of one point, and their errors."""
-    values, errors = estimates([replica.sample for replica in seeds])
-    return {name: (values[name], errors[name]) for name in OBSERVABLES}
 
 
 def _attributes(settings: MapSettings) -> dict[str, Any]:

@@ -42,7 +42,7 @@ _COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
 _SHORTEST_CHUNK = 0.75  # strain
 _FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
 _SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
-_SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P
+_SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P or ln T
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call

@@ -35,9 +35,8 @@ class MapSettings:
                 list(values) != sorted(values) and list(values) != sorted(values)[::-1]
             ):
                 raise InputError(f"{name} must be sorted and without repetition, not {list(values)}.")
-        for value, name in ((self.seeds, "seeds"), (self.grains, "grains")):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise InputError(f"{name} must be a whole number of at least 1, not {value!r}.")
+        if isinstance(self.seeds, bool) or not isinstance(self.seeds, (int, np.integer)) or self.seeds < 1:
+            raise InputError(f"seeds must be a whole number of at least 1, not {self.seeds!r}.")
         require("strain", self.strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
         if self.equilibrate is not None:
             require("equilibrate", self.equilibrate, lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0")
