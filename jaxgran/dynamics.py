@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
+from jaxgran.delassus import grain_impulses
 from jaxgran.flow import ShearFlow
 from jaxgran.grains import Grains
 from jaxgran.pairs import (
@@ -30,7 +31,7 @@ from jaxgran.pairs import (
     set_bits,
 )
 from jaxgran.replica import any_replica, in_batch, largest_replica, where_active
-from jaxgran.solver import grain_impulses, solve
+from jaxgran.solver import solve
 from jaxgran.status import Status
 from jaxgran.tally import Sums, Tally, empty_sums
 
@@ -146,6 +147,16 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
     positions, tilt = present(end.hood, side)
     status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
     return State(grains, positions, end.velocities, side, tilt), replace(end.sums.tally(), status=status)
+
+
+def contacts_now(flow: ShearFlow, state: State) -> Contacts:
+    """The contact network that the next time step of a flow would solve, in a buffer that holds any packing."""
+    hood = neighbourhood(state.positions, state.grains, state.side, state.tilt)
+    pairs = _pairs_now(hood, state.velocities, flow.shear_rate)
+    separations, velocities = pairs.separations(), pairs.velocities()
+    contact, _ = is_contact(separations, velocities, hood.near.reach, flow.activation_fraction * flow.timestep)
+    index = set_bits(bit_words(contact), contact_capacities(state.grains.radii.size)[-1], contact.size)
+    return contact_network(index, hood.near, separations, velocities, state.grains)
 
 
 def _status_if_finite(*values: Array) -> Int[Array, ""]:
@@ -267,7 +278,9 @@ def _impulses(
 ) -> tuple[Array, Sums]:
     """Impulses of a network, and the sums with its contribution."""
     count = grains.radii.size
-    solution = solve(network, count, flow.shear_rate, flow.tolerance, flow.max_iterations, flow.solver, meets)
+    solution = solve(
+        network, count, flow.shear_rate, flow.tolerance, flow.max_iterations, flow.relaxation, flow.solver, meets
+    )
     bounce = 1 + flow.restitution
     impulses = bounce * solution.impulses
     approach, (nx, ny), length = network.approach, network.normals.T, network.distances

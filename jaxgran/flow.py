@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 
 Activation = Literal["midpoint", "touching"]
-Solver = Literal["nesterov", "jacobi"]
+Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83
 MIN_GRAINS = 16
@@ -43,7 +43,8 @@ class ShearFlow:
     max_iterations    –                  cap of one contact solve
     activation        –                  "midpoint": contact if half a step of free flight overlaps;
                                          "touching": contact if the grains overlap
-    solver            –                  "nesterov" or "jacobi", both with the spectral bound
+    relaxation        –                  ω in (0, 2] of the Jacobi methods
+    solver            –                  projected method of the contact solve, see ``methods``
     ================  =================  ===============================================================
 
     Raises:
@@ -58,6 +59,7 @@ class ShearFlow:
     polydispersity: float | jax.Array = 0.26
     tolerance: float | jax.Array = 1e-4
     max_iterations: int | jax.Array = 5000
+    relaxation: float | jax.Array = 1.8
     activation: Activation = field(default="midpoint", metadata=_STATIC)
     solver: Solver = field(default="nesterov", metadata=_STATIC)
 
@@ -67,7 +69,9 @@ class ShearFlow:
             raise InputError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
         for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
             if getattr(self, name) not in allowed:
-                raise InputError(f"{name} must be {' or '.join(allowed)}, not {getattr(self, name)!r}.")
+                raise InputError(
+                    f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {getattr(self, name)!r}."
+                )
         for name, (accepts, words) in _RANGES.items():
             require(name, getattr(self, name), accepts, words)
         timestep, shear_rate = _known(self.timestep), _known(self.shear_rate)
@@ -112,6 +116,7 @@ _RANGES = {
     "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
     "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
+    "relaxation": (lambda x: (x > 0) & (x <= 2), "above 0 and at most 2"),
     "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), "a whole number of at least 1"),
 }
 

@@ -136,7 +136,7 @@ MISTAKES = {
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "strain must be at least 160 time steps",
     "map --equilibrate -1": "equilibrate must be a number of at least 0",
     "map --tolerance 1": "tolerance must be between",
-    "map --solver gauss": "'nesterov', 'jacobi'",
+    "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
     "map --activation always": "'midpoint', 'touching'",
     "map --preset slow": "'quick', 'paper'",
     "map --batch 0": "batch must be auto or a whole number of at least 1",

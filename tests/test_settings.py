@@ -45,7 +45,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"equilibrate": -1.0}, "at least 0"),
     ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
     ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
-    ({"solver": "gauss"}, "nesterov or jacobi"),
+    ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
     ({"activation": "always"}, "midpoint or touching"),
 ]
 

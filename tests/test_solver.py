@@ -11,14 +11,17 @@ from hypothesis import strategies as st
 from oracles import MAX_DISCS, delassus, exact_velocities, padded_network, random_network
 
 from jaxgran.contacts import Contacts
-from jaxgran.solver import delassus_product, grain_impulses, solve, spectral_bound
+from jaxgran.delassus import count_bound, delassus_product, grain_impulses, spectral_bound
+from jaxgran.solver import solve
 from jaxgran.status import Status
 
 EPS = np.finfo(float).eps
-METHODS = ["nesterov", "jacobi"]
+METHODS = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]
 networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, MAX_DISCS))
 
-compiled_bound = jax.jit(spectral_bound, static_argnums=1)
+compiled_bounds = jax.jit(
+    lambda network: (spectral_bound(network, MAX_DISCS), count_bound(network, MAX_DISCS)),
+)
 compiled_product = jax.jit(delassus_product, static_argnums=2)
 compiled_impulses = jax.jit(grain_impulses, static_argnums=2)
 
@@ -29,11 +32,14 @@ def velocities_after(network: Contacts, masses: np.ndarray, velocities: np.ndarr
 
 @settings(max_examples=30, derandomize=True, deadline=None)
 @given(networks, st.sampled_from([1.0, 100.0, 1e6]))
-def test_delassus_operator_never_exceeds_the_spectral_bound(network_of, heaviest):
+def test_delassus_operator_never_exceeds_its_bounds(network_of, heaviest):
     network, masses, _ = random_network(*network_of, heaviest)
-    scale = 1 / np.sqrt(np.asarray(compiled_bound(network, MAX_DISCS)))
-    largest = np.linalg.eigvalsh(delassus(network, masses) * scale[:, None] * scale[None, :])[-1]
-    assert largest <= 1 + MAX_DISCS * EPS
+    spectral, count = (np.asarray(bound) for bound in compiled_bounds(network))
+    for bound in (spectral, count):
+        scale = 1 / np.sqrt(bound)
+        largest = np.linalg.eigvalsh(delassus(network, masses) * scale[:, None] * scale[None, :])[-1]
+        assert largest <= 1 + MAX_DISCS * EPS
+    assert np.all(spectral <= count * (1 + 8 * EPS))
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)
@@ -175,7 +181,14 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
     compiled = solved(network, 1e-4, 8)
     with jax.disable_jit():
         interpreted = solve(
-            network, MAX_DISCS, jnp.asarray(1.0), jnp.asarray(1e-4), jnp.asarray(8), "nesterov", jnp.asarray(True)
+            network,
+            MAX_DISCS,
+            jnp.asarray(1.0),
+            jnp.asarray(1e-4),
+            jnp.asarray(8),
+            jnp.asarray(1.8),
+            "nesterov",
+            jnp.asarray(True),
         )
     np.testing.assert_allclose(compiled.impulses, interpreted.impulses, rtol=0, atol=1e-12)
     np.testing.assert_allclose(compiled.residual, interpreted.residual, rtol=1e-10)
