@@ -33,7 +33,7 @@ from jaxgran.pairs import (
 from jaxgran.replica import any_replica, in_batch, largest_replica, where_active
 from jaxgran.solver import solve
 from jaxgran.status import Status
-from jaxgran.tally import Sums, Tally, empty_sums
+from jaxgran.tally import RESIDUAL_EDGES, Sums, Tally, empty_sums
 
 DEEP_OVERLAP = 1e-2
 _LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
@@ -146,7 +146,22 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
     positions, tilt = present(end.hood, side)
     status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
-    return State(grains, positions, end.velocities, side, tilt), replace(end.sums.tally(), status=status)
+    tally = end.sums.tally(
+        energy_change=_energy(grains, end.velocities) - _energy(grains, state.velocities),
+        momentum_drift=_relative_momentum(grains, end.velocities),
+    )
+    return State(grains, positions, end.velocities, side, tilt), replace(tally, status=status)
+
+
+def _energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
+    return jnp.sum(grains.masses * jnp.sum(velocities**2, axis=-1)) / 2
+
+
+def _relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
+    """|Σ m c| over Σ m |c|, zero at rest."""
+    momenta = grains.masses[:, None] * velocities
+    all_of_it = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
+    return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(all_of_it > 0, all_of_it, 1)
 
 
 def contacts_now(flow: ShearFlow, state: State) -> Contacts:
@@ -287,20 +302,26 @@ def _impulses(
     reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
     binary = bounce * reduced_mass * jnp.maximum(0, -approach)
     loss = -(approach + bounce / 2 * solution.response)
-    features = jnp.stack([jnp.ones_like(nx), nx * nx * length, nx * ny * length, ny * ny * length, loss])
+    overlaps = jnp.where(network.used, jnp.maximum(grains.radii[network.i] + grains.radii[network.j] - length, 0), 0)
+    deepest = jnp.max(overlaps)
+    slip = bounce / 2 * (approach + solution.response)
+    features = jnp.stack(
+        [jnp.ones_like(nx), nx * nx * length, nx * ny * length, ny * ny * length, loss, overlaps, slip]
+    )
     flags = jnp.stack([network.used, impulses > 0, network.used & (approach < 0)]).astype(nx.dtype)
     weights = jnp.concatenate([jnp.stack([impulses, binary]), flags])
-    overlaps = jnp.where(network.used, grains.radii[network.i] + grains.radii[network.j] - length, 0)
-    deepest = jnp.max(overlaps)
     status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
     status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok
-    counts = [jnp.ones_like(bounce), solution.iterations, unconverged, solution.residual]
+    counts = jnp.stack([jnp.asarray(x, nx.dtype) for x in (jnp.ones_like(bounce), solution.iterations, unconverged)])
+    edges = jnp.asarray(RESIDUAL_EDGES[1:-1], nx.dtype)
+    above = jnp.concatenate([jnp.ones(1, bool), solution.residual > edges])
+    by_residual = above & ~jnp.append(above[1:], False)
     return impulses, Sums(
         flights=sums.flights,
         contacts=sums.contacts + jnp.matmul(features, weights.T, precision=lax.Precision.HIGHEST),
-        solves=sums.solves + jnp.stack([jnp.asarray(value, nx.dtype) for value in counts]),
-        largest_overlap=jnp.maximum(sums.largest_overlap, deepest),
+        solves=sums.solves + jnp.concatenate([counts, by_residual.astype(nx.dtype)]),
+        largest=jnp.maximum(sums.largest, jnp.stack([deepest, solution.residual])),
         status=jnp.maximum(sums.status, status),
     )
 

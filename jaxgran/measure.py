@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics import State, advance
 from jaxgran.flow import InputError, ShearFlow, require, two_digits
-from jaxgran.observables import averages
+from jaxgran.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, jackknife
 from jaxgran.tally import Tally
 
@@ -96,8 +96,7 @@ class Sample:
 
     @property
     def _total(self) -> Tally:
-        total = jax.tree.map(lambda x: jnp.sum(x, axis=jnp.ndim(self.area)), self.tally)
-        return Tally(**{**vars(total), "largest_overlap": jnp.max(self.tally.largest_overlap, axis=-1)})
+        return self.tally.total(axis=jnp.ndim(self.area))
 
     def errors(self) -> dict[str, np.ndarray]:
         """Standard errors of the averages of one replica, by the names of the observables (see ``jackknife``)."""
@@ -109,16 +108,16 @@ class Sample:
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """Averages over all blocks of some replicas of one flow, and their standard errors by the jackknife.
 
-    The largest overlap is no average: its entry is the largest of all blocks, and its error the standard deviation of
-    the largest overlaps of the blocks.
+    Extremes are no averages: the entry of each is the largest of all blocks, and its error their standard deviation.
     """
     first = seeds[0]
     sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
     values, errors = jackknife(
         partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
     )
-    overlap = {"max_overlap": sums.largest_overlap.max()}, {"max_overlap": sums.largest_overlap.std()}
-    return values | overlap[0], errors | overlap[1]
+    extremes = {name: getattr(sums, field) for name, field in EXTREME_OBSERVABLES.items()}
+    largest, spread = ({name: of(x) for name, x in extremes.items()} for of in (np.max, np.std))
+    return values | largest, errors | spread
 
 
 def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = BLOCKS) -> tuple[State, Sample]:

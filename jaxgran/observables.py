@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from jaxgran.tally import Tally
+from jaxgran.tally import RESIDUAL_EDGES, Tally
 
 STRESS_UNIT = "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
 
@@ -27,13 +27,23 @@ OBSERVABLES: dict[str, tuple[str, str]] = {
     "inertial_number": ("shear rate times the square root of the mass of a mean grain over the pressure", "1"),
     "collision_rate": ("approaching contacts per grain and unit strain, each grain counting its own", "1"),
     "iterations": ("solver iterations per solved network", "1"),
-    "residual": ("mean relative residual of the solved networks", "1"),
+    "median_residual": ("median relative residual of the solved networks", "1"),
+    "worst_residual": ("largest relative residual of a solved network", "1"),
     "unconverged_share": ("share of the solved networks that ended above the tolerance", "1"),
+    "mean_overlap": ("mean overlap of the contacts of a solved network", "sigma"),
     "max_overlap": ("largest overlap of a contact", "sigma"),
+    "momentum_drift": ("largest total momentum over the sum of the momenta of the grains", "1"),
+    "energy_balance_error": ("shear work less dissipation and growth of the kinetic energy, over shear work", "1"),
+    "complementarity_power": ("sum of p (u+ + alpha u-)/2, which an exact solve makes zero, over shear work", "1"),
     "contact_stress": ("stress of the contact forces", STRESS_UNIT),
     "binary_stress": ("stress of the contact forces if collisions were binary", STRESS_UNIT),
     "kinetic_stress": ("stress of the peculiar motion", STRESS_UNIT),
     "stress_ratio": ("contact stress over binary stress, by component", "1"),
+}
+EXTREME_OBSERVABLES = {
+    "max_overlap": "largest_overlap",
+    "worst_residual": "worst_residual",
+    "momentum_drift": "momentum_drift",
 }
 TENSORS = ("contact_stress", "binary_stress", "kinetic_stress", "stress_ratio")
 
@@ -62,6 +72,7 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
     shear = {name: -s[..., 0, 1] for name, s in _named(contact, binary, kinetic)}
     total_pressure = pressure["contact"] + pressure["kinetic"]
     total_shear = shear["contact"] + shear["kinetic"]
+    work = total_shear * shear_rate * volume
     return {
         "force_ratio": _ratio(tally.impulse, tally.binary_impulse),
         "contact_force": _ratio(tally.impulse, tally.loaded_contacts * dt),
@@ -77,14 +88,32 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
         "inertial_number": shear_rate / jnp.sqrt(total_pressure),
         "collision_rate": 2 * tally.collisions / (grains * tally.duration * shear_rate),
         "iterations": _ratio(tally.iterations, tally.solves),
-        "residual": _ratio(tally.residual, tally.solves),
+        "median_residual": _median_residual(tally.residual_counts),
+        "worst_residual": tally.worst_residual,
         "unconverged_share": _ratio(tally.unconverged, tally.solves),
+        "mean_overlap": _ratio(tally.overlap, tally.contacts),
         "max_overlap": tally.largest_overlap,
+        "momentum_drift": tally.momentum_drift,
+        "energy_balance_error": _ratio(work - tally.dissipation - tally.energy_change, jnp.abs(work)),
+        "complementarity_power": _ratio(tally.complementarity, jnp.abs(work)),
         "contact_stress": contact,
         "binary_stress": binary,
         "kinetic_stress": kinetic,
         "stress_ratio": _ratio(contact, binary),
     }
+
+
+def _median_residual(counts: Array) -> Array:
+    """Median of counts by residual (..., bins), interpolated within its bin; zero where that is the lowest bin."""
+    below = jnp.cumsum(counts, axis=-1)
+    half = below[..., -1:] / 2
+    bin = jnp.argmax(below >= half, axis=-1, keepdims=True)
+    inside, upto = (jnp.take_along_axis(x, bin, axis=-1)[..., 0] for x in (counts, below))
+    bin, half = bin[..., 0], half[..., 0]
+    share = 1 - (upto - half) / jnp.where(inside > 0, inside, 1)
+    edges = jnp.log10(jnp.asarray(RESIDUAL_EDGES, counts.dtype))
+    median = 10 ** (edges[bin] + share * (edges[bin + 1] - edges[bin]))
+    return jnp.where(half > 0, jnp.where(bin == 0, 0, median), jnp.nan)
 
 
 def _named(contact: Array, binary: Array, kinetic: Array):

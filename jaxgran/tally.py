@@ -9,7 +9,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
+
+EXTREMES = ("largest_overlap", "worst_residual", "momentum_drift", "status")  # joined by the larger one, not added
+RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
 
 
 @jax.tree_util.register_dataclass
@@ -28,14 +32,19 @@ class Tally:
     binary_moment      (2, 2)   mσ²γ̇    the same with the binary impulses
     kinetic_moment     (2, 2)   mσ²γ̇    ∫ Σ m c ⊗ c dt, exact along the flights
     dissipation        ()       mσ²γ̇²   energy lost in contacts, −½ Σ p (u⁻ + u⁺)
+    complementarity    ()       mσ²γ̇²   ½ Σ p (u⁺ + α u⁻), zero where a solve is exact
+    energy_change      ()       mσ²γ̇²   growth of the kinetic energy ½ Σ m c²
     contacts           ()       –       contacts of the steps in which a network was solved
     loaded_contacts    ()       –       contacts that carry an impulse
     collisions         ()       –       contacts that approach
     solves             ()       –       networks solved
     iterations         ()       –       solver iterations
     unconverged        ()       –       solves that ended above the tolerance
-    residual           ()       –       relative residuals of the solves
+    residual_counts    (64,)    –       solves by relative residual, in the bins between ``RESIDUAL_EDGES``
+    overlap            ()       σ       overlaps of the contacts of solved networks
     largest_overlap    ()       σ       (the largest) overlap of a contact
+    worst_residual     ()       –       (the largest) relative residual of a solve
+    momentum_drift     ()       –       (the largest) |Σ m c| over Σ m |c|, at the end
     status             ()       –       (the worst) status
     =================  =======  ======  ==========================================================================
     """
@@ -48,30 +57,35 @@ class Tally:
     binary_moment: Float[Array, "*b 2 2"]
     kinetic_moment: Float[Array, "*b 2 2"]
     dissipation: Float[Array, "*b"]
+    complementarity: Float[Array, "*b"]
+    energy_change: Float[Array, "*b"]
     contacts: Float[Array, "*b"]
     loaded_contacts: Float[Array, "*b"]
     collisions: Float[Array, "*b"]
     solves: Float[Array, "*b"]
     iterations: Float[Array, "*b"]
     unconverged: Float[Array, "*b"]
-    residual: Float[Array, "*b"]
+    residual_counts: Float[Array, "*b 64"]
+    overlap: Float[Array, "*b"]
     largest_overlap: Float[Array, "*b"]
+    worst_residual: Float[Array, "*b"]
+    momentum_drift: Float[Array, "*b"]
     status: Int[Array, "*b"]
 
     def __add__(self, other: "Tally") -> "Tally":
-        total = jax.tree.map(jnp.add, self, other)
+        return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
+
+    def total(self, axis: int | tuple[int, ...]) -> "Tally":
+        """The tally of all that stands along leading axes: sums, and the larger of each of ``EXTREMES``."""
         return Tally(
-            **{
-                **vars(total),
-                "largest_overlap": jnp.maximum(self.largest_overlap, other.largest_overlap),
-                "status": jnp.maximum(self.status, other.status),
-            }
+            **{name: jnp.max(x, axis) if name in EXTREMES else jnp.sum(x, axis) for name, x in vars(self).items()}
         )
 
 
 def empty_tally(dtype: jnp.dtype) -> Tally:
     """The tally of no time at all."""
-    return empty_sums(dtype).tally()
+    zero = jnp.zeros((), dtype)
+    return empty_sums(dtype).tally(zero, zero)
 
 
 class Sums(NamedTuple):
@@ -81,22 +95,22 @@ class Sums(NamedTuple):
     field            shape    sum of
     ===============  =======  =====================================================================================
     flights          (5,)     time, steps, and the integrals of Σ m c_x c_x, Σ m c_x c_y, Σ m c_y c_y
-    contacts         (5, 5)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse), l the distance,
-                              times (p, binary p, used, loaded, approaching)
-    solves           (4,)     networks solved, iterations, unconverged solves, relative residuals
-    largest_overlap  ()       (the largest) overlap of a contact
+    contacts         (7, 5)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
+                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching)
+    solves           (67,)    networks solved, iterations, unconverged solves, and the counts by residual
+    largest          (2,)     (the largest) overlap of a contact and relative residual of a solve
     status           ()       (the worst) status
     ===============  =======  =====================================================================================
     """
 
     flights: Float[Array, "5"]
-    contacts: Float[Array, "5 5"]
-    solves: Float[Array, "4"]
-    largest_overlap: Float[Array, ""]
+    contacts: Float[Array, "7 5"]
+    solves: Float[Array, "67"]
+    largest: Float[Array, "2"]
     status: Int[Array, ""]
 
-    def tally(self) -> Tally:
-        """The tally with its named fields."""
+    def tally(self, energy_change: Array, momentum_drift: Array) -> Tally:
+        """The tally with its named fields, two of which are known from the ends of the advance."""
 
         def tensor(components: Array) -> Array:
             return components[jnp.asarray([0, 1, 1, 2])].reshape(2, 2)
@@ -110,14 +124,19 @@ class Sums(NamedTuple):
             binary_moment=tensor(self.contacts[1:4, 1]),
             kinetic_moment=tensor(self.flights[2:]),
             dissipation=self.contacts[4, 0],
+            complementarity=self.contacts[6, 0],
+            energy_change=energy_change,
             contacts=self.contacts[0, 2],
             loaded_contacts=self.contacts[0, 3],
             collisions=self.contacts[0, 4],
             solves=self.solves[0],
             iterations=self.solves[1],
             unconverged=self.solves[2],
-            residual=self.solves[3],
-            largest_overlap=self.largest_overlap,
+            residual_counts=self.solves[3:],
+            overlap=self.contacts[5, 2],
+            largest_overlap=self.largest[0],
+            worst_residual=self.largest[1],
+            momentum_drift=momentum_drift,
             status=self.status,
         )
 
@@ -126,8 +145,8 @@ def empty_sums(dtype: jnp.dtype) -> Sums:
     """The sums of no time at all."""
     return Sums(
         flights=jnp.zeros(5, dtype),
-        contacts=jnp.zeros((5, 5), dtype),
-        solves=jnp.zeros(4, dtype),
-        largest_overlap=jnp.zeros((), dtype),
+        contacts=jnp.zeros((7, 5), dtype),
+        solves=jnp.zeros(3 + RESIDUAL_EDGES.size - 1, dtype),
+        largest=jnp.zeros(2, dtype),
         status=jnp.int32(0),
     )

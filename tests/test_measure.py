@@ -18,6 +18,7 @@ from jaxgran.measure import BLOCKS, Sample, _sample, check_precision, sample
 from jaxgran.observables import OBSERVABLES
 from jaxgran.protocol import Batch, prepare_batch, sample_batch, stack
 from jaxgran.status import Status
+from jaxgran.tally import EXTREMES
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.32
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
@@ -65,8 +66,9 @@ def test_blocks_add_up_to_the_whole(batch, measured) -> None:
     end, whole = protocol._advance(batch.flow, batch.state, steps)
     tally, whole = measured[1].tally, replica(whole, 0)
     for name in vars(tally):
-        if name not in ("largest_overlap", "status"):
+        if name not in (*EXTREMES, "residual_counts"):
             np.testing.assert_allclose(np.sum(getattr(tally, name), axis=0), getattr(whole, name), rtol=1e-5, atol=1e-9)
+    assert np.sum(tally.residual_counts) == np.sum(tally.solves)
     assert np.max(tally.largest_overlap) == pytest.approx(float(whole.largest_overlap), rel=1e-5)
     np.testing.assert_allclose(measured[0].velocities, end.velocities[0], atol=1e-6)
     assert np.sum(tally.duration) == pytest.approx(STRAIN)

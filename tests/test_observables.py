@@ -5,7 +5,7 @@ import pytest
 from synthetic import random_tally
 
 from jaxgran.observables import OBSERVABLES, TENSORS, averages
-from jaxgran.tally import Tally, empty_tally
+from jaxgran.tally import RESIDUAL_EDGES, Tally, empty_tally
 
 GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 
@@ -13,7 +13,9 @@ DATASET_NAMES = """
     force_ratio contact_force binary_force
     pressure contact_pressure binary_pressure kinetic_pressure
     shear_stress contact_shear_stress binary_shear_stress kinetic_shear_stress
-    granular_temperature coordination_number macroscopic_friction inertial_number collision_rate iterations max_overlap
+    granular_temperature coordination_number macroscopic_friction inertial_number collision_rate iterations
+    median_residual worst_residual unconverged_share mean_overlap max_overlap
+    momentum_drift energy_balance_error complementarity_power
     contact_stress binary_stress kinetic_stress stress_ratio
 """
 
@@ -55,14 +57,19 @@ def tally(microscopic) -> Tally:
         binary_moment=moment("binary"),
         kinetic_moment=kinetic,
         dissipation=np.float64(0.3),
+        complementarity=np.float64(0.02),
+        energy_change=np.float64(-0.1),
         contacts=np.float64(len(impulses)),
         loaded_contacts=np.float64(np.sum(impulses > 0)),
         collisions=np.float64(np.sum(binary > 0)),
         solves=np.float64(4.0),
         iterations=np.float64(24.0),
         unconverged=np.float64(1.0),
-        residual=np.float64(2e-4),
+        residual_counts=np.histogram([3e-5, 4e-5, 9e-5, 0.02], RESIDUAL_EDGES)[0].astype(float),
+        overlap=np.float64(6e-3),
         largest_overlap=np.float64(3e-3),
+        worst_residual=np.float64(0.02),
+        momentum_drift=np.float64(1e-15),
         status=np.int32(0),
     )
 
@@ -120,8 +127,38 @@ def test_counts_are_per_grain_and_step(microscopic, measured, tally) -> None:
     assert measured["collision_rate"] == pytest.approx(2 * np.sum(np.concatenate(binary) > 0) / GRAINS / strain)
     assert measured["iterations"] == 6.0
     assert measured["unconverged_share"] == 0.25
-    assert measured["residual"] == pytest.approx(5e-5)
+    assert measured["mean_overlap"] == pytest.approx(6e-3 / sum(len(p) for p in impulses))
     assert measured["max_overlap"] == tally.largest_overlap
+    assert measured["worst_residual"] == tally.worst_residual
+    assert measured["momentum_drift"] == tally.momentum_drift
+
+
+def test_powers_are_shares_of_the_shear_work(tally, measured) -> None:
+    work = -SHEAR_RATE * (tally.contact_moment + tally.kinetic_moment)[0, 1]
+    assert measured["energy_balance_error"] == pytest.approx((work - 0.3 + 0.1) / abs(work))
+    assert measured["complementarity_power"] == pytest.approx(0.02 / abs(work))
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 1000])
+def test_median_residual_is_that_of_the_solves_within_the_width_of_a_bin(count) -> None:
+    residuals = 10 ** np.random.default_rng(count).normal(-5, 1.5, (3, count))
+    counts = np.stack([np.histogram(row, RESIDUAL_EDGES)[0] for row in residuals]).astype(float)
+    below, above = (np.quantile(residuals, 0.5, axis=1, method=way) for way in ("lower", "higher"))
+    bin = RESIDUAL_EDGES[1] / RESIDUAL_EDGES[0]
+    found = averages_of(residual_counts=counts)["median_residual"]
+    assert np.all((found >= below / bin) & (found <= above * bin))
+
+
+def test_median_residual_of_lone_contacts_is_zero() -> None:
+    assert averages_of(residual_counts=np.eye(64)[[0]] * 5)["median_residual"] == 0
+
+
+def averages_of(**fields) -> dict[str, np.ndarray]:
+    """Averages of random tallies with some fields given, whose leading axis is that of the tallies."""
+    shape = next(iter(fields.values())).shape[:1]
+    tally = random_tally(np.random.default_rng(3), *shape)
+    found = averages(Tally(**{**vars(tally), **fields}), np.full(shape, AREA), GRAINS, np.full(shape, SHEAR_RATE))
+    return {name: np.asarray(value) for name, value in found.items()}
 
 
 def test_leading_axes_are_kept() -> None:
@@ -133,7 +170,15 @@ def test_leading_axes_are_kept() -> None:
 
 def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
     found = averages(empty_tally(np.dtype(float)), np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
-    for name in ("force_ratio", "contact_force", "binary_force", "iterations", "residual", "stress_ratio"):
+    for name in (
+        "force_ratio",
+        "contact_force",
+        "binary_force",
+        "iterations",
+        "median_residual",
+        "mean_overlap",
+        "stress_ratio",
+    ):
         assert np.isnan(found[name]).all(), name
 
 

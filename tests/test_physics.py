@@ -11,6 +11,7 @@ from oracles import gaps_of, kinetic_energy
 from jaxgran.cell import displacement, relative_velocity
 from jaxgran.dynamics import State
 from jaxgran.flow import ShearFlow
+from jaxgran.observables import averages
 from jaxgran.status import Status
 
 EPS = np.finfo(float).eps
@@ -136,6 +137,20 @@ def test_shear_power_is_dissipation_and_change_of_energy(run, flowing, packing_f
     assert tally.dissipation + change == pytest.approx(float(power), rel=0, abs=1e-11 * float(tally.dissipation))
 
 
+def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver(run, flowing):
+    """The balance closes however badly a network is solved; the power that impulses waste falls with the tolerance."""
+    flow, state = flow_of(0.75, restitution=0.1), flowing(0.75)
+    wasted = []
+    for tolerance, cap in ((1e-12, 1), (1e-2, 5000), (1e-4, 5000), (1e-8, 5000)):
+        _, tally = run(replace(flow, tolerance=tolerance, max_iterations=cap), state, 300)
+        measured = averages(tally, state.side**2, pytest.GRAINS, jnp.asarray(1.0))
+        assert abs(measured["energy_balance_error"]) < 1e-11
+        assert measured["momentum_drift"] < 1e-13
+        wasted.append(abs(float(measured["complementarity_power"])))
+    assert wasted[0] > 1e-2
+    assert np.all(np.array(wasted[1:]) < [1e-2, 1e-4, 1e-8])
+
+
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_no_contact_is_missed_over_large_shear(run, flowing, packing_fraction):
     """Overlaps by brute force stay within those that were met as contacts and one step of the fastest pair."""
@@ -168,7 +183,7 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     np.testing.assert_array_equal(fast.tilt, slow.tilt)
     np.testing.assert_array_equal(fast.velocities, 2 * slow.velocities)
     powers = {"impulse": 2, "binary_impulse": 2, "contact_moment": 2, "binary_moment": 2, "kinetic_moment": 2}
-    powers |= {"dissipation": 4, "duration": 0.5}
+    powers |= {"dissipation": 4, "complementarity": 4, "energy_change": 4, "duration": 0.5}
     for name, leaf in vars(slow_tally).items():
         np.testing.assert_array_equal(getattr(fast_tally, name), powers.get(name, 1) * leaf, err_msg=name)
 

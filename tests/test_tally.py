@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.status import Status
-from jaxgran.tally import Tally, empty_tally
+from jaxgran.tally import EXTREMES, Tally, empty_tally
 
 
 def random_tally(seed: int) -> Tally:
@@ -14,12 +14,12 @@ def random_tally(seed: int) -> Tally:
     return jax.tree.map(lambda leaf: jnp.asarray(rng.integers(0, 7, leaf.shape), leaf.dtype), empty)
 
 
-def test_joined_sample_has_the_sums_the_deepest_overlap_and_the_worst_status():
+def test_joined_sample_has_the_sums_and_the_larger_of_each_extreme():
     for seed in range(5):
         one, two = random_tally(seed), random_tally(seed + 100)
         joined = one + two
         for name in Tally.__dataclass_fields__:
-            expected = np.maximum if name in ("largest_overlap", "status") else np.add
+            expected = np.maximum if name in EXTREMES else np.add
             np.testing.assert_array_equal(getattr(joined, name), expected(getattr(one, name), getattr(two, name)))
             assert getattr(joined, name).dtype == getattr(one, name).dtype
 
