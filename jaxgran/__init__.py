@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jaxgran.dynamics import State, advance
-    from jaxgran.figures import ratio_contours, ratio_curves, save_figures
+    from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
     from jaxgran.grains import Grains, polydisperse
     from jaxgran.measure import Sample, sample
@@ -45,6 +45,7 @@ _HOME = {
     "sample": "measure",
     "prepare": "protocol",
     "ratio_map": "sweep",
+    "ratio_against_timestep": "figures",
     "ratio_curves": "figures",
     "ratio_contours": "figures",
     "save_figures": "figures",
@@ -60,6 +61,7 @@ __all__ = [
     "pack",
     "polydisperse",
     "prepare",
+    "ratio_against_timestep",
     "ratio_contours",
     "ratio_curves",
     "ratio_map",

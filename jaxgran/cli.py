@@ -82,7 +82,7 @@ def number_list(text: str, name: str) -> tuple[float, ...]:
         return tuple(float(x) for x in text.split(","))
     except ValueError:
         raise InputError(
-            f"{name} must be a list like 0.1,0.5,0.9 or start:stop:count with count >= 2, not {text!r}."
+            f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with count >= 2, not {text!r}."
         ) from None
 
 
@@ -95,7 +95,9 @@ def map_command(
     packing_fraction: Annotated[str | None, typer.Option(help="List of packing fractions, up to 0.83.")] = None,
     grains: Annotated[int | None, typer.Option(help="Grains of a replica.")] = None,
     seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
-    timestep: Annotated[float | None, typer.Option(help="Time step of the sample, in 1/shear rate.")] = None,
+    timestep: Annotated[
+        str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or a list that adds a dimension.")
+    ] = None,
     equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
     strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
     tolerance: Annotated[
@@ -114,12 +116,13 @@ def map_command(
     for name, wanted in (("--scheduler", scheduler is not None), ("--resume", resume)):
         if wanted:
             raise InputError(f"{name} is not available yet: run the map here, from the start.")
+    timesteps = None if timestep is None else number_list(timestep, "timestep")
     given = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,
         "grains": grains,
         "seeds": seeds,
-        "timestep": timestep,
+        "timestep": timesteps[0] if timesteps and len(timesteps) == 1 else timesteps,
         "equilibrate": equilibrate,
         "strain": strain,
         "tolerance": tolerance,
@@ -134,7 +137,8 @@ def map_command(
     from jaxgran.figures import save_figures
 
     pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
-    _print_table(_ratio_table(data))
+    for one in _by_timestep(data):
+        _print_table(_ratio_table(one))
     _finish(data, [output, *pictures], interrupted)
 
 
@@ -143,7 +147,7 @@ def plot_command(
     file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
     output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
 ) -> None:
-    """Draw Figures 1 and 2 of a map that has been run."""
+    """Draw the figures of a map that has been run."""
     from jaxgran.dataset import read_dataset
     from jaxgran.figures import save_figures
 
@@ -333,17 +337,27 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.4g} ± {error:.2g}"
 
 
+def _by_timestep(data) -> list:
+    """The part of a map for each of its time steps, which is the attribute ``timestep`` of the part."""
+    if "timestep" not in data.dims:
+        return [data]
+    return [data.sel(timestep=dt).assign_attrs(timestep=dt) for dt in data.timestep.values.tolist()]
+
+
 def _bad_points(data) -> dict[str, list[str]]:
     """Points by the name of their bad status."""
     names = dict(
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
     )
     bad: dict[str, list[str]] = {}
-    for nu in data.packing_fraction.values:
-        for alpha in data.restitution.values:
-            name = names[int(data.status.sel(packing_fraction=nu, restitution=alpha))]
-            if name != "ok":
-                bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g})")
+    parts = _by_timestep(data)
+    for part in parts:
+        which = f", time step {part.attrs['timestep']:g}" if len(parts) > 1 else ""
+        for nu in part.packing_fraction.values:
+            for alpha in part.restitution.values:
+                name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
+                if name != "ok":
+                    bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g}{which})")
     return bad
 
 

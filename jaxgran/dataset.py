@@ -1,5 +1,6 @@
 """The dataset of a ratio map: observables with errors on the grid, statuses, and every parameter of the run."""
 
+import math
 import os
 import platform
 import tempfile
@@ -15,14 +16,18 @@ import xarray as xr
 
 from jaxgran.flow import InputError
 from jaxgran.measure import Sample, estimates
-from jaxgran.observables import OBSERVABLES, TENSORS
+from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
 
 NOT_RUN = -1
-Key = tuple[int, int]  # point of the grid, packing fraction first; seed
-_POINT = ("packing_fraction", "restitution")
+Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
 _TENSOR_AXES = ("axis_a", "axis_b")
+_AXES = {
+    "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
+    "packing_fraction": {"long_name": "packing fraction", "units": "1"},
+    "restitution": {"long_name": "restitution", "units": "1"},
+}
 
 
 class Replica(NamedTuple):
@@ -40,11 +45,15 @@ def map_dataset(
 
     Args:
       settings: the map.
-      results: replicas by point (packing fraction first) and seed.
+      results: replicas by point (in the order of the flows of the settings) and seed.
       run: what else to store as attributes: command, wall time, speed.
+
+    Returns:
+      Observables, their standard errors and statuses on (packing_fraction, restitution), and by seed with the dimension
+      ``seed`` behind these. Where the time step of the settings is a list, ``timestep`` is the first dimension of all.
     """
-    shape = (len(settings.packing_fraction), len(settings.restitution))
-    count, seeds = shape[0] * shape[1], settings.seeds
+    point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
+    count, seeds = math.prod(shape), settings.seeds
     values = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
     errors = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
     by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
@@ -63,33 +72,33 @@ def map_dataset(
 
     variables = {}
     for name, (long_name, units) in OBSERVABLES.items():
-        dims = _POINT + (_TENSOR_AXES if name in TENSORS else ())
+        tensor_dims = _TENSOR_AXES if name in TENSORS else ()
+        dims = point_dims + tensor_dims
         attrs = {"long_name": long_name, "units": units}
         variables[name] = (dims, values[name].reshape(*shape, *_tail(name)), attrs)
-        spread = "standard deviation over blocks" if name == "max_overlap" else "standard error"
+        spread = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
         about = {"long_name": f"{spread} of {long_name}", "units": units}
         variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
-        seed_dims = (*_POINT, "seed", *dims[2:])
+        seed_dims = (*point_dims, "seed", *tensor_dims)
         variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
     flags = {
         "long_name": "worst status of a point",
         "flag_values": np.array([NOT_RUN, *Status], np.int8),
         "flag_meanings": " ".join(["not_run", *(s.name for s in Status)]),
     }
-    variables["status"] = (_POINT, _worst(status).reshape(shape), flags)
-    variables["status_by_seed"] = ((*_POINT, "seed"), status.reshape(*shape, seeds), {**flags, "long_name": "status"})
+    variables["status"] = (point_dims, _worst(status).reshape(shape), flags)
+    variables["status_by_seed"] = (
+        (*point_dims, "seed"),
+        status.reshape(*shape, seeds),
+        {**flags, "long_name": "status"},
+    )
     variables["equilibration_strain_by_seed"] = (
-        (*_POINT, "seed"),
+        (*point_dims, "seed"),
         strain.reshape(*shape, seeds),
         {"long_name": "strain sheared before the sample", "units": "1"},
     )
     coordinates = {
-        "packing_fraction": (
-            "packing_fraction",
-            list(settings.packing_fraction),
-            {"long_name": "packing fraction", "units": "1"},
-        ),
-        "restitution": ("restitution", list(settings.restitution), {"long_name": "restitution", "units": "1"}),
+        **{name: (name, list(values), _AXES[name]) for name, values in settings.axes.items()},
         "seed": ("seed", np.arange(seeds), {"long_name": "seed of the random numbers"}),
         "axis_a": ("axis_a", ["x", "y"], {"long_name": "direction of the centre-to-centre vector"}),
         "axis_b": ("axis_b", ["x", "y"], {"long_name": "direction of the force"}),
@@ -101,7 +110,7 @@ def check_output(path: Path) -> None:
     """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
     if path.suffix != ".nc":
         raise InputError(f"output must be a file name that ends in .nc, not {str(path)!r}.")
-    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in ("curves", "contours"))):
+    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in ("curves", "contours", "timestep"))):
         if file.is_dir():
             raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
     if not path.parent.is_dir():

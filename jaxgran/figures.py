@@ -1,12 +1,14 @@
-"""The two figures of a ratio map: curves of the force ratio, and contours of its excess over one.
+"""The figures of a ratio map: curves of the force ratio, contours of its excess over one, and its time steps.
 
-Both are drawn from the dataset of :func:`jaxgran.ratio_map` without any global plotting state, so they
-need no display. The figures follow Figures 1 and 2 of Lois, Lemaître and Carlson, *Momentum transport in
-granular flows*; the force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is ⟨F⟩/⟨F_bc⟩ − 1.
+All are drawn from the dataset of :func:`jaxgran.ratio_map` without any global plotting state, so they
+need no display. Curves and contours follow Figures 1 and 2 of Lois, Lemaître and Carlson, *Momentum transport
+in granular flows*, and show the shortest time step of a map that has several; the third figure shows what the
+time step does. The force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is ⟨F⟩/⟨F_bc⟩ − 1.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import textwrap
 from collections import Counter
@@ -25,17 +27,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
 """Contour values of the excess, those of Figure 2."""
 
 _LINEAR_BELOW = 0.01  # excess under which the contour variable turns from logarithmic to linear
 _SUBDIVISIONS = 12  # steps of the bilinear interpolation between neighbouring grid points
+_MOST_TOGETHER = 8  # points whose curves share one panel of the time steps
 _LOG_SPAN = 2.5  # largest over smallest force ratio from which the axis is logarithmic
 _MARKERS = "os^DvP<X>ph*"
 _LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
 _LABEL, _TICK, _SMALL = 9.0, 8.0, 7.0  # font sizes in points
+_RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 _BAND = "#e08214"
 _RING: dict[str, Any] = {
     "linestyle": "none",
@@ -54,33 +58,28 @@ def ratio_curves(data: xr.Dataset) -> Figure:
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) `force_ratio`, `force_ratio_stderr` (dimensionless)
-                                             and, where present, the CF flag variable `status`
+                                             and, where present, the CF flag variable `status`;
+                                             the shortest of several time steps is drawn
     returns  Figure                          error bars are one standard error; a point whose
                                              status is not `ok` is an open symbol in a ring
     ======== =============================== =====================================================
     """
-    data = _ordered(data)
+    data = _finest(_ordered(data))
     figure, axes = _new_figure(width=5.0, height=3.5)
     axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
     styles = zip(data.restitution.values, _curve_styles(data.sizes["restitution"]), strict=True)
-    handles = [_draw_curve(axes, data.sel(restitution=value), style) for value, style in styles]
+    handles = [
+        _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}")
+        for value, style in styles
+    ]
     _set_ratio_scale(axes, data.force_ratio.values)
     axes.set_xlim(_padded(data.packing_fraction.values))
     axes.set_xlabel(r"packing fraction $\nu$", fontsize=_LABEL)
-    axes.set_ylabel(r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$", fontsize=_LABEL)
-    figure.legend(
-        handles=handles,
-        title="restitution α",
-        loc="outside right upper",
-        ncols=1 + (len(handles) - 1) // 16,
-        fontsize=_SMALL + 0.5,
-        title_fontsize=_TICK,
-        frameon=False,
-        handlelength=3.2,
-    )
+    axes.set_ylabel(_RATIO_LABEL, fontsize=_LABEL)
+    _add_curve_legend(figure, handles, "restitution α")
     if _suspect(data).any():
         figure.legend(handles=[_ring_key()], loc="outside upper left", fontsize=_SMALL, frameon=False)
-    _finish(figure, axes, data, [_status_note(data), _missing_note(data)])
+    _finish(figure, data, [_status_note(data), _missing_note(data)])
     return figure
 
 
@@ -100,7 +99,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     ======== =============================== =====================================================
     """
     _require_plane(data)
-    data = _ordered(data)
+    data = _finest(_ordered(data))
     x, y = _refined(1.0 - data.restitution.values), _refined(data.packing_fraction.values)
     excess, stderr = data.force_ratio.values - 1.0, data.force_ratio_stderr.values
     field = _interpolated(_contour_variable(excess))
@@ -117,19 +116,65 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     axes.set_ylim(_padded(y))
     _add_contour_legend(figure, data, banded)
     absent = [level for level in EXCESS_LEVELS if level not in lines]
-    _finish(figure, axes, data, [_contour_note(absent), _status_note(data), _missing_note(data, " (hatched)")])
+    _finish(figure, data, [_contour_note(absent), _status_note(data), _missing_note(data, " (hatched)")])
     _label_contours(figure, axes, lines)
     return figure
 
 
+def ratio_against_timestep(data: xr.Dataset) -> Figure:
+    """Return the force ratio against the time step, a curve for each restitution and packing fraction.
+
+    Up to eight points share one panel. More have one for each packing fraction, with a force-ratio axis of its own.
+
+    ======== ========================================= =============================================
+    data     (timestep, packing_fraction, restitution) as in :func:`ratio_curves`; `timestep` in
+                                                       units of 1/γ̇
+    returns  Figure                                    error bars are one standard error; a point
+                                                       whose status is not `ok` is an open symbol in
+                                                       a ring
+    raises   ValueError                                fewer than two time steps
+    ======== ========================================= =============================================
+    """
+    if not _has_timesteps(data):
+        raise ValueError(
+            f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
+        )
+    data = _ordered(data)
+    panels, title = _timestep_panels(data)
+    columns = math.ceil(math.sqrt(len(panels)))
+    rows = math.ceil(len(panels) / columns)
+    width, height = (5.0, 3.5) if len(panels) == 1 else (1.0 + 1.9 * columns, 1.0 + 1.6 * rows)
+    figure = _empty_figure(width, height)
+    grid = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
+    handles: list[Line2D] = []
+    for axes, (name, curves) in zip(grid, panels, strict=False):
+        axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
+        styles = zip(curves, _curve_styles(len(curves)), strict=True)
+        handles = [_draw_curve(axes, curve, "timestep", style, label) for (label, curve), style in styles]
+        _set_ratio_scale(axes, np.concatenate([curve.force_ratio.values for _, curve in curves]))
+        axes.set_title(name, fontsize=_TICK)
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    for axes in grid[max(0, len(panels) - columns) : len(panels)]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(r"time step $\dot{\gamma}\,\mathrm{d}t$", fontsize=_LABEL)
+    _set_timestep_scale(grid[0], data.timestep.values)
+    figure.supylabel(_RATIO_LABEL, fontsize=_LABEL)
+    _add_curve_legend(figure, handles, title)
+    if _suspect(data).any():
+        figure.legend(handles=[_ring_key()], loc="outside upper left", fontsize=_SMALL, frameon=False)
+    _finish(figure, data, [_status_note(data), _missing_note(data)])
+    return figure
+
+
 def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
-    """Write `{stem}_curves.png` and `{stem}_contours.png` and return the paths written.
+    """Write `{stem}_curves.png`, `{stem}_contours.png` and `{stem}_timestep.png` and return the paths written.
 
     Each file appears whole or not at all. A map with a single restitution or packing fraction has no
-    contours: only the curves are written and returned.
+    contours, and one with a single time step has nothing to draw against it: these are left out.
 
     ======== ============= =====================================================================
-    data     Dataset       as in :func:`ratio_curves`
+    data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
     stem     path          folder and beginning of the names; the folder must exist
     returns  list of Path  the files written, the curves first
     ======== ============= =====================================================================
@@ -138,6 +183,8 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     written = [_write(ratio_curves(data), stem.with_name(f"{stem.name}_curves.png"))]
     if _is_plane(data):
         written.append(_write(ratio_contours(data), stem.with_name(f"{stem.name}_contours.png")))
+    if _has_timesteps(data):
+        written.append(_write(ratio_against_timestep(data), stem.with_name(f"{stem.name}_timestep.png")))
     return written
 
 
@@ -145,11 +192,23 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
 
 
 def _ordered(data: xr.Dataset) -> xr.Dataset:
-    """Return the variables drawn here, as (packing_fraction, restitution), both ascending."""
+    """Return the variables drawn here, as ([timestep,] packing_fraction, restitution), all ascending."""
     names = [name for name in ("force_ratio", "force_ratio_stderr", "status") if name in data]
-    ordered = data[names].sortby(["packing_fraction", "restitution"])
-    ordered = ordered.transpose("packing_fraction", "restitution", ...)
+    dims = [name for name in ("timestep", "packing_fraction", "restitution") if name in data.dims]
+    ordered = data[names].sortby(dims).transpose(*dims)
     return ordered.assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
+
+
+def _finest(data: xr.Dataset) -> xr.Dataset:
+    """Return the shortest time step of an ordered map, as its attribute `timestep`."""
+    if "timestep" not in data.coords:
+        return data
+    data = data.isel(timestep=0) if "timestep" in data.dims else data
+    return data.assign_attrs(timestep=float(data.timestep))
+
+
+def _has_timesteps(data: xr.Dataset) -> bool:
+    return data.sizes.get("timestep", 1) >= 2
 
 
 def _is_plane(data: xr.Dataset) -> bool:
@@ -219,10 +278,10 @@ def _curve_styles(count: int) -> list[dict]:
     ]
 
 
-def _draw_curve(axes: Axes, curve: xr.Dataset, style: dict) -> Line2D:
-    """Draw one curve with its error bars and suspect points; return its legend entry."""
+def _draw_curve(axes: Axes, curve: xr.Dataset, along: str, style: dict, label: str) -> Line2D:
+    """Draw one curve along a coordinate with its error bars and suspect points; return its legend entry."""
     axes.errorbar(
-        curve.packing_fraction.values,
+        curve[along].values,
         curve.force_ratio.values,
         yerr=curve.force_ratio_stderr.values,
         **style,
@@ -231,9 +290,9 @@ def _draw_curve(axes: Axes, curve: xr.Dataset, style: dict) -> Line2D:
         elinewidth=0.8,
         capsize=2,
     )
-    bad = curve.isel(packing_fraction=_suspect(curve))
+    bad = curve.isel({along: _suspect(curve)})
     axes.plot(
-        bad.packing_fraction.values,
+        bad[along].values,
         bad.force_ratio.values,
         linestyle="none",
         marker=style["marker"],
@@ -242,8 +301,7 @@ def _draw_curve(axes: Axes, curve: xr.Dataset, style: dict) -> Line2D:
         markeredgecolor=style["color"],
         zorder=4,
     )
-    _mark_bad(axes, bad.packing_fraction.values, bad.force_ratio.values)
-    label = f"{float(curve.restitution):.4g}"
+    _mark_bad(axes, bad[along].values, bad.force_ratio.values)
     return Line2D([], [], **style, markersize=4, linewidth=1.1, label=label)
 
 
@@ -255,6 +313,20 @@ def _mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
 
 def _ring_key() -> Line2D:
     return Line2D([], [], **_RING, label="status not ok")
+
+
+def _add_curve_legend(figure: Figure, handles: Sequence[Line2D], title: str) -> None:
+    """Name the curves beside the axes."""
+    figure.legend(
+        handles=handles,
+        title=title,
+        loc="outside right upper",
+        ncols=1 + (len(handles) - 1) // 16,
+        fontsize=_SMALL + 0.5,
+        title_fontsize=_TICK,
+        frameon=False,
+        handlelength=3.2,
+    )
 
 
 def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
@@ -269,6 +341,39 @@ def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+# ----------------------------------------------------------------------------------------- time steps
+
+
+def _timestep_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.Dataset]]]], str]:
+    """Return the panels, each a name and its curves with their labels, and the title of the labels."""
+    alphas, nus = data.restitution.values, data.packing_fraction.values
+    if len(alphas) * len(nus) <= _MOST_TOGETHER:
+        curves = [
+            (f"{alpha:.4g}, {nu:.4g}", data.sel(packing_fraction=nu, restitution=alpha))
+            for nu in nus
+            for alpha in alphas
+        ]
+        return [("", curves)], "α, ν"
+    panels = [
+        (f"ν = {nu:.4g}", [(f"{alpha:.4g}", data.sel(packing_fraction=nu, restitution=alpha)) for alpha in alphas])
+        for nu in nus
+    ]
+    return panels, "restitution α"
+
+
+def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
+    """Make the time-step axis logarithmic; where it has no two powers of ten, its ends are labelled."""
+    axes.set_xscale("log")
+    low, high = timesteps.min(), timesteps.max()
+    margin = (high / low) ** 0.06
+    axes.set_xlim(low / margin, high * margin)
+    powers = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9)
+    if powers < 1:
+        axes.xaxis.set_major_locator(FixedLocator([low, high]))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"${_scientific(value)}$"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 # ------------------------------------------------------------------------------------------- contours
@@ -395,19 +500,25 @@ def _add_contour_legend(figure: Figure, data: xr.Dataset, banded: bool) -> None:
 # ------------------------------------------------------------------------------------- frame and text
 
 
-def _new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """Return a figure of a size in inches that draws without a display, and its axes."""
+def _empty_figure(width: float, height: float) -> Figure:
+    """Return a figure of a size in inches that draws without a display."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _new_figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """Return an empty figure and its only axes."""
+    figure = _empty_figure(width, height)
     return figure, figure.add_subplot()
 
 
 def _run_description(attrs: dict) -> str:
-    """Return the parameters without which a force ratio means nothing, in one line."""
+    """Return the parameters without which a force ratio means nothing, in one line; several time steps have an axis."""
     parts = [f"$N={attrs['grains']}$"] if "grains" in attrs else []
     if attrs.get("seeds") is not None:
         parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
-    if "timestep" in attrs:
+    if np.ndim(attrs.get("timestep", ())) == 0:
         parts.append(rf"$\mathrm{{d}}t={_scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
     if "activation" in attrs:
         parts.append(f"{attrs['activation']} activation")
@@ -446,12 +557,14 @@ def _padded(values: np.ndarray) -> tuple[float, float]:
     return float(values.min() - margin), float(values.max() + margin)
 
 
-def _finish(figure: Figure, axes: Axes, data: xr.Dataset, notes: Sequence[str]) -> None:
+def _finish(figure: Figure, data: xr.Dataset, notes: Sequence[str]) -> None:
     """Set the tick style and write the caption lines under the axes."""
-    axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=_TICK)
-    if not np.isfinite(data.force_ratio.values).any():
-        box = {"facecolor": "white", "edgecolor": "none"}
-        axes.text(0.5, 0.6, "no measured values", transform=axes.transAxes, ha="center", fontsize=_LABEL, bbox=box)
+    measured = np.isfinite(data.force_ratio.values).any()
+    for axes in figure.axes:
+        axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=_TICK)
+        if not measured:
+            box = {"facecolor": "white", "edgecolor": "none"}
+            axes.text(0.5, 0.6, "no measured values", transform=axes.transAxes, ha="center", fontsize=_LABEL, bbox=box)
     caption = "\n".join(line for line in (_run_description(data.attrs), *notes) if line)
     figure.supxlabel(caption, fontsize=_SMALL)
 

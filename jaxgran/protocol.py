@@ -14,6 +14,7 @@ flow says.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import zip_longest
 from typing import NamedTuple
 
 import jax
@@ -239,17 +240,27 @@ def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> B
 
 
 def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
-    """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one."""
+    """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one.
+
+    Every replica goes down a ladder of its own, computed alone, whatever the others of its batch do; those that are at
+    the foot of theirs wait.
+    """
     coarse, final = np.asarray(batch.flow.timestep), np.asarray(flow.timestep)
-    steps = max(0, int(np.ceil(np.log(np.max(coarse / final)) / np.log(SHORTENING) - 1e-9)))
-    for k in range(1, steps):
-        between = jnp.asarray(coarse * (final / coarse) ** (k / steps), batch.state.side.dtype)
-        batch = _sheared(
-            batch._replace(flow=replace(flow, timestep=between)), np.full(len(coarse), _SHORTENING_STRAIN), report
-        )
+    ladders = [_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
+    for rungs in zip_longest(*ladders, fillvalue=np.nan):
+        going = np.isfinite(rungs)
+        between = jnp.asarray(np.where(going, rungs, final), batch.state.side.dtype)
+        batch = batch._replace(flow=replace(flow, timestep=between))
+        batch = _sheared(batch, np.where(going, _SHORTENING_STRAIN, 0.0), report)
     batch = batch._replace(flow=flow)
     relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
     return _sheared(batch, relaxation, report) if relaxation.any() else batch
+
+
+def _ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:
+    """Time steps strictly between a coarse and a final one, (1,) each, in equal ratios of at most ``SHORTENING``."""
+    steps = int(np.ceil(np.log(coarse / final) / np.log(SHORTENING) - 1e-9).item())
+    return [(coarse * (final / coarse) ** (k / steps)).item() for k in range(1, steps)]
 
 
 def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:

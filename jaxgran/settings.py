@@ -18,7 +18,7 @@ class MapSettings:
     packing_fraction: tuple[float, ...]
     grains: int = 256
     seeds: int = 2
-    timestep: float = 1e-3
+    timestep: float | tuple[float, ...] = 1e-3
     equilibrate: float | None = None
     strain: float = 10.0
     tolerance: float = 1e-4
@@ -26,8 +26,7 @@ class MapSettings:
     activation: Activation = "midpoint"
 
     def __post_init__(self):
-        for name in ("restitution", "packing_fraction"):
-            values = getattr(self, name)
+        for name, values in self.axes.items():
             if len(values) == 0:
                 raise InputError(f"{name} must be a list of at least one number, and it is empty.")
             require(name, np.asarray(values), lambda x: x.ndim == 1, "a list of numbers")
@@ -42,24 +41,33 @@ class MapSettings:
             require("equilibrate", self.equilibrate, lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0")
         flows = stack(self.flows())
         check_timestep(flows, predicted(flows))
-        if round(self.strain / self.timestep) < _FEWEST_STEPS:
+        longest = max(flow.timestep for flow in self.flows())
+        if round(self.strain / longest) < _FEWEST_STEPS:
             raise InputError(
-                f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * self.timestep:g}, "
+                f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * longest:g}, "
                 f"not {self.strain:g}."
             )
 
+    @property
+    def axes(self) -> dict[str, tuple[float, ...]]:
+        """Values of the dimensions of a map by name, the slowest first; the time step is one where it is a list."""
+        steps = {"timestep": self.timestep} if isinstance(self.timestep, tuple) else {}
+        return {**steps, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
+
     def flows(self) -> list[ShearFlow]:
-        """One flow a point, packing fraction first; raises ValueError where a number is out of range."""
+        """One flow a point, in the order of ``axes``; raises ValueError where a number is out of range."""
+        timesteps = self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
         return [
             ShearFlow(
                 grains=self.grains,
                 restitution=alpha,
                 packing_fraction=nu,
-                timestep=self.timestep,
+                timestep=dt,
                 tolerance=self.tolerance,
                 solver=self.solver,
                 activation=self.activation,
             )
+            for dt in timesteps
             for nu in self.packing_fraction
             for alpha in self.restitution
         ]

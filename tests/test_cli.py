@@ -99,7 +99,9 @@ def test_range_has_no_noise_in_its_last_digits() -> None:
 
 @pytest.mark.parametrize("text", ["", ",", "0.1,", "a", "0.1;0.5", "0.1:0.9", "0.1:0.9:1", "0.1:0.9:x", "0:1:2:3"])
 def test_what_is_no_list_is_refused(text: str) -> None:
-    with pytest.raises(InputError, match=r"restitution must be a list like 0\.1,0\.5,0\.9 or start:stop:count"):
+    with pytest.raises(
+        InputError, match=r"restitution must be a number, a list like 0\.1,0\.5,0\.9 or start:stop:count"
+    ):
         cli.number_list(text, "restitution")
 
 
@@ -119,7 +121,7 @@ MISTAKES = {
     "map --restitution -0.1,0.5": "restitution must be between 0 and 1",
     "map --restitution 0.5,1.1": "restitution must be between 0 and 1",
     "map --restitution nan": "restitution must be between 0 and 1",
-    "map --restitution ''": "restitution must be a list",
+    "map --restitution ''": "restitution must be a number, a list",
     "map --restitution 0.5,0.1,0.9": "restitution must be sorted",
     "map --restitution 0.5,0.5": "without repetition",
     "map --packing-fraction 0,0.5": "packing_fraction must be above 0 and at most 0.83",
@@ -130,6 +132,11 @@ MISTAKES = {
     "map --seeds 0": "seeds must be a whole number of at least 1",
     "map --timestep 0": "timestep must be a positive number",
     "map --timestep -1e-3": "timestep must be a positive number",
+    "map --timestep fine": "timestep must be a number, a list",
+    "map --timestep 1e-3,1e-3": "without repetition",
+    "map --timestep 1e-3,1e-5,1e-4": "timestep must be sorted",
+    "map --timestep 1e-3,0": "timestep must be a positive number",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 1e-3,0.09": "timestep must be at most",
     "map --timestep 0.2": "timestep must be at most 0.1 / shear_rate",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.09": "timestep must be at most",
     "map --strain 0": "strain must be a positive number",
@@ -145,6 +152,7 @@ MISTAKES = {
     "map --output map.txt": "ends in .nc",
     "map --output none/map.nc": "a folder that exists",
     "map --output folder.nc": "is a folder",
+    "map --output picture.nc": "picture_timestep.png' is a folder",
     "map --resume": "--resume is not available yet",
     "map --scheduler tcp://localhost": "--scheduler is not available yet",
     "map --wrong": "--wrong",
@@ -164,8 +172,9 @@ MISTAKES = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a folder and a text file whose names end in .nc."""
+    """A folder with a folder and a text file whose names end in .nc, and a folder with the name of a picture."""
     (tmp_path / "folder.nc").mkdir()
+    (tmp_path / "picture_timestep.png").mkdir()
     (tmp_path / "text.nc").write_text("not a map")
     return tmp_path
 
@@ -318,6 +327,39 @@ def test_bad_status_is_named_with_its_point(status: Status, tmp_path: Path, monk
     (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("0.6"))
     assert row.count("*") == 1
     assert "jaxgran_map.nc" in files(tmp_path)
+
+
+def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_theirs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    statuses = {(point, 0): Status.deep_overlap if point == 3 else Status.ok for point in range(6)}
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--timestep", "1e-3,1e-4,1e-5")
+    assert outcome.status == 3
+    assert "deep overlap: (restitution 0.9, packing fraction 0.6, time step 0.0001)." in outcome.err
+    assert "6/6 points" in outcome.err
+    assert files(tmp_path) == {"jaxgran_map.nc", "jaxgran_map_curves.png", "jaxgran_map_timestep.png"}
+    assert "wrote jaxgran_map_timestep.png" in outcome.err
+    data = read_dataset(tmp_path / "jaxgran_map.nc")
+    assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
+    tables = " ".join(outcome.out.split()).split("Force ratio at dt = ")[1:]
+    assert len(tables) == 3
+    for table, dt in zip(tables, (1e-3, 1e-4, 1e-5), strict=True):
+        assert table.startswith(f"{dt:g} / shear rate, midpoint activation")
+        for alpha in (0.5, 0.9):
+            value = data.force_ratio.sel(timestep=dt, packing_fraction=0.6, restitution=alpha)
+            assert f"{float(value):.4g} ±" in table
+        assert table.count("*") == (dt == 1e-4)
+
+
+def test_single_time_step_is_a_number_and_no_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    for words in ([], ["--timestep", "1e-3"]):
+        assert jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", *words).status == 0
+        data = read_dataset(tmp_path / "jaxgran_map.nc")
+        assert data.force_ratio.dims == ("packing_fraction", "restitution")
+        assert "timestep" not in data.variables and data.attrs["timestep"] == 1e-3
+    assert "jaxgran_map_timestep.png" not in files(tmp_path)
 
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

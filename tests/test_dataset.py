@@ -98,6 +98,36 @@ def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
     assert (nothing.status == NOT_RUN).all()
 
 
+def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: Path) -> None:
+    timesteps = (1e-2, 1e-3, 1e-4)
+    settings = MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=timesteps, strain=2.0)
+    rng = np.random.default_rng(1)
+    keys = [(point, seed) for point in range(12) for seed in range(SEEDS)]
+    results = {key: random_replica(rng, settings, Status.deep_overlap if key[0] == 7 else Status.ok) for key in keys}
+    data = map_dataset(settings, results, {})
+    point = ("timestep", "packing_fraction", "restitution")
+    for name in OBSERVABLES:
+        tail = ("axis_a", "axis_b") if name in TENSORS else ()
+        assert data[name].dims == data[f"{name}_stderr"].dims == (*point, *tail)
+        assert data[f"{name}_by_seed"].dims == (*point, "seed", *tail)
+    assert data.status.dims == point
+    for name in ("status_by_seed", "equilibration_strain_by_seed"):
+        assert data[name].dims == (*point, "seed")
+    for (k, seed), replica in results.items():
+        there = data.sel(timestep=timesteps[k // 4], packing_fraction=NUS[k // 2 % 2], restitution=ALPHAS[k % 2])
+        np.testing.assert_allclose(there.pressure_by_seed[seed], replica.sample.averages["pressure"], rtol=1e-12)
+        assert there.status == (Status.deep_overlap if k == 7 else Status.ok)
+    assert data.attrs["timestep"] == data.timestep.values.tolist() == list(timesteps)
+    assert data.timestep.attrs == {"long_name": "time step of the sample", "units": "1 / shear rate"}
+    write_dataset(data, tmp_path / "map.nc")
+    xr.testing.assert_equal(read_dataset(tmp_path / "map.nc"), data)
+
+
+def test_a_list_of_one_time_step_keeps_its_dimension() -> None:
+    data = map_dataset(MapSettings(ALPHAS, NUS, grains=64, timestep=(1e-2,), strain=2.0), {}, {})
+    assert data.force_ratio.sizes == {"timestep": 1, "packing_fraction": 2, "restitution": 2}
+
+
 def test_missing_seed_does_not_hide_a_bad_status(settings, results) -> None:
     some = {key: replica for key, replica in results.items() if key in ((0, 1), (2, 0))}
     status = map_dataset(settings, some, {}).status
@@ -175,10 +205,17 @@ def test_reading_what_is_no_map_is_one_sentence(data, kind: str, tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("name", "accepted"),
-    [("map.txt", "ends in .nc"), ("map", "ends in .nc"), ("folder.nc", "a folder"), ("none/map.nc", "exists")],
+    [
+        ("map.txt", "ends in .nc"),
+        ("map", "ends in .nc"),
+        ("folder.nc", "a folder"),
+        ("picture.nc", "picture_timestep.png' is a folder"),
+        ("none/map.nc", "exists"),
+    ],
 )
 def test_output_that_cannot_be_a_dataset_is_one_sentence(name: str, accepted: str, tmp_path: Path) -> None:
     (tmp_path / "folder.nc").mkdir()
+    (tmp_path / "picture_timestep.png").mkdir()
     with pytest.raises(ValueError, match=accepted) as caught:
         check_output(tmp_path / name)
     assert one_sentence(str(caught.value))

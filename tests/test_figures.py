@@ -10,7 +10,7 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.figures import EXCESS_LEVELS, ratio_contours, ratio_curves, save_figures
+from jaxgran.figures import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves, save_figures
 
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
@@ -36,6 +36,13 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
         coords={"packing_fraction": nu, "restitution": alpha},
         attrs={"timestep": 3e-4, "activation": "midpoint", "grains": 256, "seeds": 2, "strain": 5.0},
     )
+
+
+def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
+    """Return a map of several time steps whose excess is that of a map at the first and twice as large at each next."""
+    parts = [data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0)) for k in range(len(timesteps))]
+    several = xr.concat(parts, xr.Variable("timestep", list(timesteps)))
+    return several.assign_attrs(data.attrs | {"timestep": list(timesteps)})
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
@@ -220,6 +227,99 @@ def test_caption_names_what_the_ratio_depends_on() -> None:
             assert words in caption(figure)
 
 
+@pytest.mark.parametrize("draw", [ratio_curves, ratio_contours])
+def test_curves_and_contours_of_several_time_steps_are_those_of_the_shortest(draw) -> None:
+    data = ratio_dataset()
+    several = with_timesteps(data, 3e-4, 1e-3, 1e-2)
+    for same in (several, several.isel(timestep=[2, 0, 1]), several.sel(timestep=3e-4), several.isel(timestep=[0])):
+        figure, expected = draw(same), draw(data)
+        assert caption(figure) == caption(expected)
+        assert r"3\times 10^{-4}" in caption(figure)
+        for line, other in zip(figure.axes[0].lines, expected.axes[0].lines, strict=True):
+            np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), (1, 8), (3, 3), (5, 6)])
+def test_every_point_is_a_curve_against_the_time_step_with_its_errors(alphas: int, nus: int) -> None:
+    data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 1e-4, 1e-5)
+    figure = ratio_against_timestep(data)
+    together = alphas * nus <= 8
+    assert len(figure.axes) == (1 if together else nus)
+    assert all(axes.get_xscale() == "log" for axes in figure.axes)
+    curves = [container for axes in figure.axes for container in axes.containers]
+    points = [(nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values]
+    for container, (nu, alpha) in zip(curves, points, strict=True):
+        point = data.sel(packing_fraction=nu, restitution=alpha).sortby("timestep")
+        np.testing.assert_array_equal(
+            container.lines[0].get_xydata(), np.stack([point.timestep, point.force_ratio], -1)
+        )
+        ends = np.array([segment[:, 1] for segment in container.lines[2][0].get_segments()])
+        np.testing.assert_allclose(np.diff(ends)[:, 0], 2.0 * point.force_ratio_stderr, rtol=1e-9)
+    labels = [f"{alpha:.4g}, {nu:.4g}" for nu, alpha in points] if together else [f"{x:.4g}" for x in data.restitution]
+    assert legend_texts(figure) == labels
+    if not together:
+        assert [axes.get_title() for axes in figure.axes] == [f"ν = {nu:.4g}" for nu in data.packing_fraction.values]
+    assert r"\mathrm{d}t" not in caption(figure) and "N=256" in caption(figure)
+
+
+def test_curves_against_the_time_step_are_told_apart_without_colour() -> None:
+    lines = [
+        c.lines[0] for c in ratio_against_timestep(with_timesteps(ratio_dataset(4, 2), 1e-3, 1e-4)).axes[0].containers
+    ]
+    assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 8
+
+
+def test_bad_status_has_a_ring_at_its_time_step() -> None:
+    data = with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4)
+    data.status[0, 1, 0] = 1
+    figure = ratio_against_timestep(data)
+    np.testing.assert_array_equal(rings(figure), [[1e-3, data.force_ratio[0, 1, 0]]])
+    assert "status not ok" in legend_texts(figure)
+    assert "Status not ok: iteration limit (1)" in caption(figure)
+
+
+@pytest.mark.parametrize(
+    "timesteps", [(1e-2, 1e-3, 1e-4), (1e-3, 1e-4), (5e-4, 3e-4), (2e-3, 5e-4), (1e-3, 9e-4, 8e-4)]
+)
+def test_time_step_axis_has_at_least_two_numbers(timesteps: tuple[float, ...]) -> None:
+    figure = ratio_against_timestep(with_timesteps(ratio_dataset(2, 2), *timesteps))
+    figure.canvas.draw()
+    low, high = figure.axes[0].get_xlim()
+    labels = [label for label in figure.axes[0].get_xticklabels() if low <= label.get_position()[0] <= high]
+    assert sum(bool(label.get_text()) for label in labels) >= 2
+
+
+def test_one_time_step_is_nothing_to_draw_against() -> None:
+    for data in (ratio_dataset(), with_timesteps(ratio_dataset(), 1e-3)):
+        with pytest.raises(ValueError, match="at least two time steps, and this map has 1"):
+            ratio_against_timestep(data)
+
+
+def test_time_steps_without_any_value_are_drawn() -> None:
+    data = with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4)
+    figure = ratio_against_timestep(data.assign(force_ratio=data.force_ratio * np.nan))
+    figure.canvas.draw()
+    assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), (5, 5), (10, 12)])
+def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
+    data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 3e-4, 1e-5)
+    data.status[0, 1, 0] = 1
+    figure = ratio_against_timestep(data)
+    figure.canvas.draw()
+    texts = [figure._supxlabel, figure._supylabel]
+    boxes = [artist.get_window_extent() for artist in (*texts, *figure.legends)]
+    boxes += [axes.get_tightbbox() for axes in figure.axes]
+    for k, box in enumerate(boxes):
+        assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
+        assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
+    for axes in figure.axes:
+        labels = [t.get_window_extent() for t in axes.get_xticklabels() if t.get_visible() and t.get_text()]
+        labels = [box for box in labels if axes.bbox.x0 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1]
+        assert not any(box.overlaps(other) for k, box in enumerate(labels) for other in labels[:k])
+
+
 def test_nothing_overlaps_on_the_page() -> None:
     data = ratio_dataset()
     data.status[5, 0] = 1
@@ -241,6 +341,14 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
 
 def test_line_of_points_writes_only_the_curves(tmp_path: Path) -> None:
     assert save_figures(ratio_dataset(alphas=1), tmp_path / "line") == [tmp_path / "line_curves.png"]
+
+
+def test_several_time_steps_have_a_file_of_their_own(tmp_path: Path) -> None:
+    written = save_figures(with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4), tmp_path / "map")
+    assert [path.name for path in written] == ["map_curves.png", "map_contours.png", "map_timestep.png"]
+    assert sorted(tmp_path.iterdir()) == sorted(written)
+    line = save_figures(with_timesteps(ratio_dataset(1, 2), 1e-3), tmp_path / "line")
+    assert [path.name for path in line] == ["line_curves.png"]
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Every mistake in the parameters of a map is one sentence that names the accepted range, before anything runs."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -39,9 +40,17 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"timestep": float("nan")}, "a positive number"),
     ({"timestep": 0.2}, "at most 0.1"),
     ({"timestep": 0.09}, "at most"),  # a grain would cross more than a tenth of a diameter
+    ({"timestep": ()}, "at least one number"),
+    ({"timestep": (1e-3, 1e-2, 1e-4)}, "sorted"),
+    ({"timestep": (1e-2, 1e-2)}, "without repetition"),
+    ({"timestep": ((1e-2, 1e-3),)}, "a list of numbers"),
+    ({"timestep": [1e-2, 1e-3]}, "a positive number"),  # a list is for ratio_map; settings are tuples
+    ({"timestep": (1e-3, 0.0)}, "a positive number"),
+    ({"timestep": (1e-3, 0.09)}, "at most"),
     ({"strain": 0.0}, "a positive number"),
     ({"strain": float("inf")}, "a positive number"),
     ({"strain": 0.1}, "at least 160 time steps"),
+    ({"strain": 1.0, "timestep": (1e-3, 1e-2)}, "at least 160 time steps, that is 1.6"),
     ({"equilibrate": -1.0}, "at least 0"),
     ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
     ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
@@ -73,3 +82,17 @@ def test_flows_are_the_points_packing_fraction_first() -> None:
 
 def test_numbers_of_numpy_are_accepted() -> None:
     MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-2)})
+
+
+def test_time_step_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
+    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "timestep": (1e-2, 1e-3)})
+    assert list(one.axes) == ["packing_fraction", "restitution"]
+    assert list(some.axes) == ["timestep", "packing_fraction", "restitution"]
+    points = [(flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
+    assert points == list(product(*some.axes.values()))
+    assert some.flows()[:2] == one.flows()
+
+
+def test_time_steps_may_fall_as_well_as_rise() -> None:
+    for timesteps in ((1e-2, 1e-3), (1e-3, 1e-2), (1e-3,)):
+        assert MapSettings(**{**GOOD, "timestep": timesteps}).axes["timestep"] == timesteps

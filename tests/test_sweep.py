@@ -1,11 +1,13 @@
 """Every replica runs once, and its numbers depend on nothing but its seed and its place in the grid."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,13 +50,13 @@ numbers = st.floats(0.0, 1.0)
 
 
 @given(
-    points=st.lists(st.tuples(numbers, st.floats(0.01, 0.83)), min_size=1, max_size=12),
+    points=st.lists(st.tuples(numbers, st.floats(0.01, 0.83), st.sampled_from([1e-3, 1e-5])), min_size=1, max_size=12),
     seeds=st.integers(1, 5),
     batch=st.one_of(st.just("auto"), st.integers(1, 20)),
     workers=st.integers(1, 4),
 )
 def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int, batch, workers: int) -> None:
-    flows = [ShearFlow(64, alpha, nu, 1e-3) for alpha, nu in points]
+    flows = [ShearFlow(64, alpha, nu, dt) for alpha, nu, dt in points]
     settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, grains=64)
     tasks = sweep._tasks(settings, batch, workers)
     keys = [key for task in tasks for key in task]
@@ -67,11 +69,12 @@ def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int
         assert max(map(len, tasks)) <= batch
 
 
-def test_cost_grows_with_density_and_dissipation() -> None:
-    def cost(alpha: float, nu: float) -> float:
-        return predicted_cost(ShearFlow(64, alpha, nu, 1e-3))
+def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_number_of_steps() -> None:
+    def cost(alpha: float, nu: float, dt: float = 1e-3) -> float:
+        return predicted_cost(ShearFlow(64, alpha, nu, dt))
 
     assert cost(0.1, 0.8) > cost(0.5, 0.8) > cost(0.5, 0.6) > cost(0.9, 0.6)
+    assert cost(0.5, 0.6) < cost(0.5, 0.6, 1e-4) < 10 * cost(0.5, 0.6)
 
 
 def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> None:
@@ -104,6 +107,28 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     assert data.attrs["wall_time_seconds"] > 0
     steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-2)
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
+
+
+def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
+    some = replace(settings, timestep=(1e-2, 5e-3))
+    both = dict(replicas(some, batch=8))
+    assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
+    data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
+    xr.testing.assert_equal(data.isel(timestep=0, drop=True), alone)
+    assert not np.any(data.force_ratio_by_seed[0] == data.force_ratio_by_seed[1])
+
+
+@pytest.mark.parametrize(
+    "timestep", [[1e-2, 2e-2], (1e-2, 2e-2), np.array([1e-2, 2e-2])], ids=["list", "tuple", "array"]
+)
+def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", lambda *_: iter(()))
+    data = ratio_map(**{**SETTINGS, "timestep": timestep, "strain": 4.0})
+    assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
+    assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-2, 2e-2]
+    for one in (1e-2, np.float64(1e-2), np.array(1e-2)):
+        data = ratio_map(**{**SETTINGS, "timestep": one})
+        assert "timestep" not in data.variables and data.attrs["timestep"] == 1e-2
 
 
 @pytest.mark.parametrize("mistake", [{"batch": 0}, {"batch": 1.5}, {"batch": "all"}, {"workers": 0}, {"workers": 2.0}])
