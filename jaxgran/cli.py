@@ -103,7 +103,9 @@ def map_command(
     tolerance: Annotated[
         float | None, typer.Option(help="Relative residual of a contact solve. [default: 1e-4]")
     ] = None,
-    solver: Annotated[Solver | None, typer.Option(help="Iteration of the contact solve. [default: nesterov]")] = None,
+    solver: Annotated[
+        Solver | None, typer.Option(help="Iteration of the contact solve. [default: barzilai-borwein]")
+    ] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,

@@ -61,7 +61,7 @@ class ShearFlow:
     max_iterations: int | jax.Array = 5000
     relaxation: float | jax.Array = 1.8
     activation: Activation = field(default="midpoint", metadata=_STATIC)
-    solver: Solver = field(default="nesterov", metadata=_STATIC)
+    solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
 
     def __post_init__(self):
         whole = isinstance(self.grains, (int, np.integer)) and not isinstance(self.grains, bool)

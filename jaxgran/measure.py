@@ -116,8 +116,8 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
         partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
     )
     extremes = {name: getattr(sums, field) for name, field in EXTREME_OBSERVABLES.items()}
-    largest = {name: np.max(x) for name, x in extremes.items()}
-    spread = {name: np.std(x) for name, x in extremes.items()}
+    largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
+    spread = {name: np.asarray(x.std()) for name, x in extremes.items()}
     return values | largest, errors | spread
 
 

@@ -10,7 +10,7 @@ jacobi-diagonal     diag(W)          p                               relaxation 
 jacobi-count        contact counts   p                               ω
 jacobi              spectral bound   p                               ω
 nesterov            spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
-barzilai-borwein    spectral bound   p                               curvature along the last step
+barzilai-borwein    spectral bound   p                               curvature along the last step; guarded
 ==================  ===============  ==============================  ========================================
 
 Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ = 1. With diag(W)
@@ -18,9 +18,8 @@ neither holds: "jacobi-diagonal" is kept because it shows what the bound is for.
 
 Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at least 1 as W ⪯ D.
 The objective does not fall in every step, and with a projection the iterates can cycle. The safeguard needs no values
-of the objective: a ceiling on τ is halved whenever the best residual has fallen by less than a tenth over 100 steps.
-Either the residual goes on falling, or the ceiling sinks to 1.9, where every step is one of the convergent Jacobi
-method.
+of the objective: where the best residual has not halved over 100 steps, the method goes on as Nesterov's. So either the
+residual falls at that rate, or the iteration is one that converges.
 
 Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988); Birgin, Martínez
 and Raydan (2000) for projected spectral gradients; Tonge, Benevolenski and Voroshilov (2012) for mass splitting.
@@ -37,8 +36,8 @@ from jaxgran.contacts import Contacts
 from jaxgran.delassus import count_bound, diagonal, spectral_bound
 from jaxgran.flow import Solver
 
-_HIGHEST_CEILING, _LOWEST_CEILING = 1e4, 1.9
-_WINDOW, _PROGRESS = 100, 0.9
+_LONGEST_STRIDE = 1e4
+_WINDOW, _PROGRESS = 100, 0.5
 
 
 class Iterate(NamedTuple):
@@ -94,27 +93,33 @@ def _restart_uphill(now: Iterate, start: Array, point: Array, bound: Array, resi
 
 
 def _stride(now: Iterate, relaxation: Array) -> tuple[Array, Array]:
-    return now.point, now.memory[0]
+    stride, k, _ = now.memory
+    momentum = jnp.maximum(k, 0)
+    return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
 
 
 def _spectral_stride(now: Iterate, start: Array, point: Array, bound: Array, residual: Array) -> tuple[Array, ...]:
-    """Step length, its ceiling, and the best residual when the ceiling was last judged."""
-    _, ceiling, before = now.memory
+    """Step length, momentum (negative as long as the method is not Nesterov's), best residual when last judged."""
+    _, k, before = now.memory
+    judged = now.iterations % _WINDOW == _WINDOW - 1
+    guarded = (k >= 0) | (judged & ~(residual < _PROGRESS * before))
     step, response = point - now.point
     long = now.iterations % 2 == 1
-    other = jnp.where(long, bound * step, response / bound)
-    own, mixed = dot(other, jnp.where(long, step, response)), dot(step, response)
+    left = jnp.where(long | guarded, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
+    own, mixed = dot(left, jnp.where(long | guarded, step, response)), dot(step, response)
     over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
-    stride = jnp.where(under > 0, over / jnp.where(under > 0, under, 1), ceiling)
-    judged = now.iterations % _WINDOW == _WINDOW - 1
-    stalled = judged & ~(residual < _PROGRESS * before)
-    ceiling = jnp.where(stalled, jnp.maximum(ceiling / 2, _LOWEST_CEILING), ceiling)
-    return jnp.minimum(stride, ceiling), ceiling, jnp.where(judged, residual, before)
+    stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), _LONGEST_STRIDE), _LONGEST_STRIDE)
+    momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
+    return (
+        jnp.where(guarded, 1, stride),
+        jnp.where(guarded, momentum, -1),
+        jnp.where(judged, residual, before),
+    )
 
 
 METHODS: dict[Solver, Method] = {
     "nesterov": Method(spectral_bound, (0.0,), _extrapolate, _restart_uphill),
-    "barzilai-borwein": Method(spectral_bound, (1.0, _HIGHEST_CEILING, float("inf")), _stride, _spectral_stride),
+    "barzilai-borwein": Method(spectral_bound, (1.0, -1.0, float("inf")), _stride, _spectral_stride),
     "jacobi": Method(spectral_bound, (), _relax, _forget),
     "jacobi-count": Method(count_bound, (), _relax, _forget),
     "jacobi-diagonal": Method(diagonal, (), _relax, _forget),

@@ -22,7 +22,7 @@ class MapSettings:
     equilibrate: float | None = None
     strain: float = 10.0
     tolerance: float = 1e-4
-    solver: Solver = "nesterov"
+    solver: Solver = "barzilai-borwein"
     activation: Activation = "midpoint"
 
     def __post_init__(self):

@@ -22,7 +22,7 @@ from jaxgran.methods import METHODS, Iterate, dot
 from jaxgran.replica import any_replica, where_active
 from jaxgran.status import Status
 
-_JAMMED_RESPONSE = 1e-3  # impulses that grow without moving anything: a direction of W p = 0 with p·u⁻ < 0
+_JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
 
 
 @jax.tree_util.register_dataclass
@@ -107,7 +107,7 @@ def solve(
     impulses, response = end.best
 
     def is_jammed():
-        return (dot(b, impulses) < 0) & (jnp.linalg.norm(response) < _JAMMED_RESPONSE * jnp.linalg.norm(own * impulses))
+        return dot(impulses, response) < _JAMMED_RESPONSE * -dot(b, impulses)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))

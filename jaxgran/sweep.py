@@ -43,7 +43,7 @@ def ratio_map(
     equilibrate: float | None = None,
     strain: float = 10.0,
     tolerance: float = 1e-4,
-    solver: Solver = "nesterov",
+    solver: Solver = "barzilai-borwein",
     activation: Activation = "midpoint",
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
@@ -60,7 +60,7 @@ def ratio_map(
       equilibrate: strain before the sample, or None to shear until the flow is steady.
       strain: sampled strain of each seed.
       tolerance: relative residual of a contact solve.
-      solver: "nesterov" or "jacobi".
+      solver: projected method of the contact solve, see ``methods``.
       activation: "midpoint" or "touching".
       batch: replicas that run together, or "auto".
       workers: processes; more than one only on a CPU, and then a script must guard its main part by

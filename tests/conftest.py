@@ -117,7 +117,7 @@ def solved():
     """``solved(network, tolerance, max_iterations, method, active, relaxation)``: the contact solve, compiled."""
     compiled = jax.jit(solve, static_argnums=(1, 6))
 
-    def call(network, tolerance=1e-12, max_iterations=100_000, method="nesterov", active=True, relaxation=1.8):
+    def call(network, tolerance=1e-12, max_iterations=100_000, method="barzilai-borwein", active=True, relaxation=1.8):
         numbers = jnp.asarray(1.0), jnp.asarray(tolerance), jnp.asarray(max_iterations), jnp.asarray(relaxation)
         return compiled(network, 60, *numbers, method, jnp.asarray(active))
 

@@ -79,7 +79,7 @@ def test_all_methods_give_the_same_trajectory(run, flowing, packing_fraction):
     flow, state = flow_of(packing_fraction), flowing(packing_fraction)
     one, tally = run(flow, state, 100)
     assert tally.status == Status.ok and tally.solves > 5
-    for solver in ("barzilai-borwein", "jacobi"):
+    for solver in ("nesterov", "jacobi"):
         two, other = run(replace(flow, solver=solver), state, 100)
         assert_same_state(one, two, 1e-8)
         assert_same_tally(tally, other, 1e-8, but=("loaded_contacts",))

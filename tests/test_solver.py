@@ -187,7 +187,7 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
             jnp.asarray(1e-4),
             jnp.asarray(8),
             jnp.asarray(1.8),
-            "nesterov",
+            "barzilai-borwein",
             jnp.asarray(True),
         )
     np.testing.assert_allclose(compiled.impulses, interpreted.impulses, rtol=0, atol=1e-12)

@@ -1,0 +1,249 @@
+"""Whole runs: errors of stresses, temperature and force ratio against the time that a unit of strain costs.
+
+A few flows are brought to their steady states once. From there each is sampled with every combination of time step,
+tolerance and activation rule, several seeds each, and compared with a reference: the finest time step and tolerance,
+run longest. A force ratio is a result only together with its time step and rule, so its reference is the tightest
+tolerance at the same time step and rule: its error is that of the solver alone.
+"""
+
+import json
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hardware import hardware
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+import jaxgran as jg
+from jaxgran.measure import estimates
+from jaxgran.protocol import prepare_batch, stack
+from jaxgran.sweep import usable_cores
+
+OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "force_ratio")
+advance = jax.jit(jg.advance)
+DEFAULT = (1e-3, 1e-4, "midpoint")  # of the command line
+RELAXATION = 1.0  # strain after a change of the time step
+
+
+class Config(NamedTuple):
+    timestep: float
+    tolerance: float
+    activation: str
+
+
+class Plan(NamedTuple):
+    """What is run: flows as (restitution, packing fraction), strains of each seed, and the grid of configurations."""
+
+    flows: tuple[tuple[float, float], ...]
+    grains: int
+    seeds: int
+    strain: float
+    reference: Config
+    reference_strain: float
+    configs: tuple[Config, ...]
+
+
+FULL = Plan(
+    flows=((0.9, 0.7), (0.5, 0.8), (0.2, 0.7)),
+    grains=256,
+    seeds=4,
+    strain=20.0,
+    reference=Config(1e-4, 1e-6, "midpoint"),
+    reference_strain=40.0,
+    configs=(
+        *(Config(*c, "midpoint") for c in product((1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-1, 1e-2, 1e-3, 1e-4, 1e-6))),
+        *(Config(*c, "touching") for c in product((1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-2, 1e-4, 1e-6))),
+    ),
+)
+QUICK = Plan(
+    flows=((0.5, 0.7),),
+    grains=64,
+    seeds=3,
+    strain=8.0,
+    reference=Config(3e-4, 1e-6, "midpoint"),
+    reference_strain=24.0,
+    configs=tuple(Config(*c) for c in product((1e-2, 1e-3), (1e-1, 1e-4, 1e-6), ("midpoint", "touching"))),
+)
+
+
+def chart(quick: bool, output: Path) -> None:
+    """Run the plan on all cores, print a table, and write ``runs.json`` and ``runs.png``."""
+    plan = QUICK if quick else FULL
+    tasks = list(product(plan.flows, range(plan.seeds)))
+    context = multiprocessing.get_context("spawn")
+    start = time.perf_counter()
+    with ProcessPoolExecutor(min(usable_cores(), len(tasks)), context) as pool:
+        measured = dict(zip(tasks, pool.map(run, [plan] * len(tasks), tasks), strict=True))
+    flows = [summary(plan, flow, [measured[flow, seed] for seed in range(plan.seeds)]) for flow in plan.flows]
+    for flow in flows:
+        report(flow)
+    result = {
+        "hardware": hardware(),
+        "plan": {name: value for name, value in plan._asdict().items() if name != "configs"},
+        "wall_seconds": time.perf_counter() - start,
+        "flows": flows,
+    }
+    stem = output / ("runs_quick" if quick else "runs")
+    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(flows).savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def run(plan: Plan, task: tuple[tuple[float, float], int]) -> dict[Config, tuple[jg.Sample, float, int]]:
+    """Samples of one seed of one flow for every configuration, with seconds per unit strain and the status."""
+    jax.config.update("jax_enable_x64", True)
+    (alpha, nu), seed = task
+    flow = jg.ShearFlow(plan.grains, alpha, nu, 1e-3)
+    batch = prepare_batch(stack([flow]), jax.random.key(seed)[None])
+    state = jax.tree.map(lambda x: x[0], batch.state)
+    measured = {}
+    for config in dict.fromkeys((plan.reference, *plan.configs)):
+        strain = plan.reference_strain if config == plan.reference else plan.strain
+        here = jg.ShearFlow(plan.grains, alpha, nu, config.timestep, tolerance=config.tolerance, activation=config[2])
+        relaxed, _ = advance(here, state, jnp.int32(round(RELAXATION / config.timestep)))
+        jax.block_until_ready(jg.sample(here, relaxed, 16 * config.timestep))  # compiled before it is timed
+        begin = time.process_time()
+        _, sample = jax.block_until_ready(jg.sample(here, relaxed, strain))
+        seconds = (time.process_time() - begin) / strain
+        measured[config] = jax.tree.map(np.asarray, sample), seconds, int(sample.status)
+    return measured
+
+
+def summary(plan: Plan, flow: tuple[float, float], seeds: list[dict]) -> dict:
+    """Estimates of every configuration of a flow, and their errors relative to the references."""
+    found = {config: estimates([seed[config][0] for seed in seeds]) for config in seeds[0]}
+    rows = []
+    for config in plan.configs:
+        tightest = Config(config.timestep, min(c.tolerance for c in plan.configs), config.activation)
+        errors = {}
+        for name in OBSERVABLES:
+            reference = tightest if name == "force_ratio" else plan.reference
+            (value, error), (right, unsure) = ((x[0][name], x[1][name]) for x in (found[config], found[reference]))
+            noise = 0.0 if config == reference else float(np.hypot(error, unsure) / abs(right))
+            errors[name] = (float(value / right - 1), noise)
+        rows.append(
+            {
+                **config._asdict(),
+                "seconds_per_strain": float(np.median([seed[config][1] for seed in seeds])),
+                "status": jg.Status(max(seed[config][2] for seed in seeds)).name,
+                "errors": errors,
+                "values": {name: [float(x[name]) for x in found[config]] for name in OBSERVABLES},
+            }
+        )
+    for row in rows:
+        row["on_front"] = {name: on_front(row, rows, name) for name in OBSERVABLES}
+    values = {name: [float(x[name]) for x in found[plan.reference]] for name in OBSERVABLES}
+    return {"restitution": flow[0], "packing_fraction": flow[1], "reference": values, "rows": rows}
+
+
+def bound(row: dict, name: str) -> float:
+    """Size of an error and one standard error of it: what the error of a configuration may be."""
+    error, noise = row["errors"][name]
+    return abs(error) + noise
+
+
+def on_front(row: dict, rows: list[dict], name: str) -> bool:
+    """Whether no other configuration costs less and is more accurate beyond the noise of both."""
+    error, noise = row["errors"][name]
+
+    def beats(other: dict) -> bool:
+        its_error, its_noise = other["errors"][name]
+        cheaper = other["seconds_per_strain"] < row["seconds_per_strain"]
+        return cheaper and other["status"] == "ok" and abs(error) - abs(its_error) > np.hypot(noise, its_noise)
+
+    return row["status"] == "ok" and not any(beats(other) for other in rows)
+
+
+def staircase(rows: list[dict], name: str) -> list[dict]:
+    """Configurations that are cheaper than all with a smaller error bound, the cheapest first."""
+    steps = []
+    for row in sorted((row for row in rows if row["status"] == "ok"), key=lambda row: row["seconds_per_strain"]):
+        if not steps or bound(row, name) < bound(steps[-1], name):
+            steps.append(row)
+    return steps
+
+
+def report(flow: dict) -> None:
+    """Print the table of a flow; a star marks what is on the front."""
+    print(f"restitution {flow['restitution']:g}, packing fraction {flow['packing_fraction']:g}")
+    print("      dt   tolerance  activation   s/strain   " + "".join(f"{name:>24s}" for name in OBSERVABLES))
+    for row in sorted(flow["rows"], key=lambda row: row["seconds_per_strain"]):
+        cells = (
+            f"{100 * error:11.2f} ± {100 * noise:5.2f} %{'*' if row['on_front'][name] else ' '}"
+            for name, (error, noise) in row["errors"].items()
+        )
+        head = (
+            f"{row['timestep']:8.0e}{row['tolerance']:12.0e}  {row['activation']:11s}{row['seconds_per_strain']:10.4f} "
+        )
+        print(head + "  ".join(cells) + f"  {row['status']}", flush=True)
+
+
+MARKERS = "osD^v"
+FLOOR = 1e-3  # smallest error that is drawn
+
+
+def draw(flows: list[dict]) -> Figure:
+    """Size of the error against cost: a row of panels for every flow and a column for every observable."""
+    figure = Figure(figsize=(11, 0.9 + 2.6 * len(flows)), layout="constrained")
+    panels = figure.subplots(len(flows), len(OBSERVABLES), sharex="row", sharey=True, squeeze=False)
+    timesteps, tolerances = (
+        sorted({row[key] for f in flows for row in f["rows"]}) for key in ("timestep", "tolerance")
+    )
+    marker = dict(zip(timesteps, MARKERS, strict=False))
+    shade = dict(zip(tolerances, np.linspace(0, 0.78, len(tolerances)), strict=True))
+    for flow, row_of_panels in zip(flows, panels, strict=True):
+        for name, axes in zip(OBSERVABLES, row_of_panels, strict=True):
+            for row in flow["rows"]:
+                draw_point(axes, row, name, marker[row["timestep"]], str(shade[row["tolerance"]]))
+            steps = staircase(flow["rows"], name)
+            axes.step(
+                [row["seconds_per_strain"] for row in steps],
+                [max(bound(row, name), FLOOR) for row in steps],
+                where="post",
+                color="#b35806",
+                zorder=1,
+            )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_ylim(FLOOR, 1)
+            axes.axhline(0.02, color="0.6", linestyle=":", zorder=0)
+        row_of_panels[0].set_ylabel(f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}\n|relative error|")
+    for name, axes in zip(OBSERVABLES, panels[0], strict=True):
+        axes.set_title(name.replace("_", " "), fontsize="medium")
+    for axes in panels[-1]:
+        axes.set_xlabel("CPU seconds per unit strain")
+    style = {"linestyle": "none", "markersize": 6, "color": "0.3"}
+    handles = [
+        *(Line2D([], [], marker=marker[dt], label=f"dt {dt:g}", **style) for dt in timesteps),
+        *(
+            Line2D([], [], marker="o", label=f"tolerance {t:g}", **{**style, "color": str(shade[t])})
+            for t in tolerances
+        ),
+        Line2D([], [], marker="o", label="touching (midpoint filled)", markerfacecolor="white", **style),
+        Line2D([], [], marker="x", label="status not ok", **style),
+        Line2D([], [], marker="*", label="default", **{**style, "markersize": 13, "color": "#b35806"}),
+        Line2D([], [], color="#b35806", label="front of |error| + its standard error"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", frameon=False)
+    return figure
+
+
+def draw_point(axes, row: dict, name: str, marker: str, shade: str) -> None:
+    error, noise = row["errors"][name]
+    if error == 0 and noise == 0:
+        return  # the reference itself
+    size, place = max(abs(error), FLOOR), row["seconds_per_strain"]
+    lower = min(noise, size - FLOOR)
+    face = shade if row["activation"] == "midpoint" else "white"
+    axes.errorbar(place, size, [[lower], [noise]], color="0.75", elinewidth=0.8, zorder=2)
+    axes.plot(place, size, marker, color=shade, markerfacecolor=face, markersize=5, zorder=3)
+    if row["status"] != "ok":
+        axes.plot(place, size, "x", color="#b2182b", markersize=8, zorder=4)
+    if (row["timestep"], row["tolerance"], row["activation"]) == DEFAULT:
+        axes.plot(place, size, "*", color="#b35806", markersize=13, markeredgecolor="black", zorder=5)
