@@ -86,6 +86,14 @@ def number_list(text: str, name: str) -> tuple[float, ...]:
         ) from None
 
 
+def _numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | str | None:
+    """One number, several, or the word auto, of an option that may be absent."""
+    if text is None or text == "auto":
+        return text
+    numbers = number_list(text, name)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
 @app.command("map")
 def map_command(
     preset: Annotated[Literal["quick", "paper"], typer.Option(help="Starting point for all other options.")] = "quick",
@@ -96,13 +104,17 @@ def map_command(
     grains: Annotated[int | None, typer.Option(help="Grains of a replica.")] = None,
     seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
     timestep: Annotated[
-        str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or a list that adds a dimension.")
+        str | None,
+        typer.Option(help="Time step of the sample, in 1/shear rate, auto, or a list that adds a dimension."),
     ] = None,
     equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
     strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
     tolerance: Annotated[
-        float | None, typer.Option(help="Relative residual of a contact solve. [default: 1e-4]")
+        str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
     ] = None,
+    target_error: Annotated[
+        float, typer.Option(help="Relative error of the stresses that auto aims at, 1e-4 to 0.1.")
+    ] = 0.02,
     solver: Annotated[
         Solver | None, typer.Option(help="Iteration of the contact solve. [default: barzilai-borwein]")
     ] = None,
@@ -118,23 +130,22 @@ def map_command(
     for name, wanted in (("--scheduler", scheduler is not None), ("--resume", resume)):
         if wanted:
             raise InputError(f"{name} is not available yet: run the map here, from the start.")
-    timesteps = None if timestep is None else number_list(timestep, "timestep")
     given = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,
         "grains": grains,
         "seeds": seeds,
-        "timestep": timesteps[0] if timesteps and len(timesteps) == 1 else timesteps,
+        "timestep": _numbers_or_auto(timestep, "timestep"),
         "equilibrate": equilibrate,
         "strain": strain,
-        "tolerance": tolerance,
+        "tolerance": _numbers_or_auto(tolerance, "tolerance"),
         "solver": solver,
         "activation": activation,
     }
     chosen = PRESETS[preset] | {name: value for name, value in given.items() if value is not None}
     for name in ("restitution", "packing_fraction"):
         chosen[name] = number_list(chosen[name], name)
-    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet)
+    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error)
 
     from jaxgran.figures import save_figures
 
@@ -238,17 +249,25 @@ def _batch(text: str) -> int | Literal["auto"]:
 
 
 def _measure(
-    chosen: dict[str, Any], batch: int | Literal["auto"], workers: int | None, output: Path | None, quiet: bool
+    chosen: dict[str, Any],
+    batch: int | Literal["auto"],
+    workers: int | None,
+    output: Path | None,
+    quiet: bool,
+    target_error: float = 0.02,
 ):
     """Run a map with progress, write its dataset, and return it and whether it was interrupted."""
     jax = _configured_jax()
     from jaxgran.dataset import check_output, map_dataset, write_dataset
-    from jaxgran.settings import MapSettings
+    from jaxgran.settings import MapSettings, automatic
     from jaxgran.sweep import check_batches, predicted_cost, replicas, usable_cores
 
     if output is not None:
         check_output(output)
-    settings = MapSettings(**chosen)
+    numbers, automatic_choice = automatic(chosen, target_error)
+    settings = MapSettings(**numbers)
+    if automatic_choice:
+        print(f"chosen: {automatic_choice}", file=sys.stderr)
     on_cpu = jax.default_backend() == "cpu"
     check_batches(batch, 1 if workers is None else workers)
     count = len(settings.flows()) * settings.seeds
@@ -268,6 +287,7 @@ def _measure(
             running.close()
     seconds = time.perf_counter() - start
     run = {
+        "automatic_choice": automatic_choice,
         "command": shlex.join(["jaxgran", *sys.argv[1:]]),
         "wall_time_seconds": seconds,
         "replica_steps_per_second": meter.done_steps / seconds,

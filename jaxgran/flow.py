@@ -43,7 +43,7 @@ class ShearFlow:
     max_iterations    –                  cap of one contact solve
     activation        –                  "midpoint": contact if half a step of free flight overlaps;
                                          "touching": contact if the grains overlap
-    relaxation        –                  ω in (0, 2] of the Jacobi methods
+    relaxation        –                  ω in (0, 2) of the Jacobi methods
     solver            –                  projected method of the contact solve, see ``methods``
     ================  =================  ===============================================================
 
@@ -116,7 +116,7 @@ _RANGES = {
     "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
     "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
-    "relaxation": (lambda x: (x > 0) & (x <= 2), "above 0 and at most 2"),
+    "relaxation": (lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded"),
     "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), "a whole number of at least 1"),
 }
 

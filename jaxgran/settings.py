@@ -1,13 +1,17 @@
 """MapSettings: everything that decides the numbers of a ratio map, validated before anything runs."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from jaxgran.flow import Activation, InputError, ShearFlow, Solver, require
-from jaxgran.protocol import check_timestep, predicted, stack
+from jaxgran.accuracy import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
+from jaxgran.flow import Activation, InputError, ShearFlow, Solver, require, two_digits
+from jaxgran.protocol import predicted, stack
 
 _FEWEST_STEPS = 160  # ten time steps in each block of a sample
+_SHORT = 1e-6  # a time step that all flows accept
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,14 @@ class MapSettings:
         if self.equilibrate is not None:
             require("equilibrate", self.equilibrate, lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0")
         flows = stack(self.flows())
-        check_timestep(flows, predicted(flows))
+        limits = longest_timestep(_temperature(flows), flows.packing_fraction, self.activation)
+        excess = np.asarray(flows.timestep) / limits
+        worst = int(np.argmax(excess))
+        if excess[worst] > 1:
+            raise InputError(
+                f"timestep must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)}, or grains "
+                "would overlap deeply; auto chooses one."
+            )
         longest = max(flow.timestep for flow in self.flows())
         if round(self.strain / longest) < _FEWEST_STEPS:
             raise InputError(
@@ -71,3 +82,35 @@ class MapSettings:
             for nu in self.packing_fraction
             for alpha in self.restitution
         ]
+
+
+def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str, Any], str]:
+    """The choices of a map with numbers in place of "auto", and what was chosen in words, empty if nothing was.
+
+    Args:
+      choices: keyword arguments of ``MapSettings``, in which ``timestep`` and ``tolerance`` may be "auto".
+      target_error: relative error of the stresses and the temperature to stay within.
+    """
+    require("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
+    chosen, words = dict(choices), []
+    if chosen.get("timestep") == "auto":
+        flows = stack(MapSettings(**{**chosen, "timestep": _SHORT, "tolerance": 1e-4, "strain": 1.0}).flows())
+        activation = flows.activation
+        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, activation, target_error)
+        least = int(np.argmin(steps))
+        chosen["timestep"] = float(two_digits(steps[least], up=False))
+        words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
+    if chosen.get("tolerance") == "auto":
+        chosen["tolerance"] = automatic_tolerance(target_error)
+        words.append(f"tolerance {chosen['tolerance']:g}")
+    return chosen, f"{'; '.join(words)}: for an error of {target_error:g} in the stresses." if words else ""
+
+
+def _temperature(flows: ShearFlow) -> np.ndarray:
+    theory = predicted(flows).granular_temperature
+    return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
+
+
+def _point(flows: ShearFlow, k: int) -> str:
+    alpha, nu = (float(np.asarray(x)[k]) for x in (flows.restitution, flows.packing_fraction))
+    return f"restitution {alpha:g} and packing fraction {nu:g}"

@@ -24,7 +24,7 @@ import xarray as xr
 from jaxgran.dataset import Key, Replica, map_dataset
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver
 from jaxgran.protocol import Report, prepare_batch, sample_batch, stack
-from jaxgran.settings import MapSettings
+from jaxgran.settings import MapSettings, automatic
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
@@ -39,10 +39,11 @@ def ratio_map(
     *,
     grains: int = 256,
     seeds: int = 2,
-    timestep: float | Sequence[float] = 1e-3,
+    timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
     equilibrate: float | None = None,
     strain: float = 10.0,
-    tolerance: float = 1e-4,
+    tolerance: float | Literal["auto"] = 1e-4,
+    target_error: float = 0.02,
     solver: Solver = "barzilai-borwein",
     activation: Activation = "midpoint",
     batch: int | Literal["auto"] = "auto",
@@ -56,10 +57,12 @@ def ratio_map(
       packing_fraction: values of ν in (0, 0.83], sorted.
       grains: number of grains of a replica.
       seeds: replicas of each point.
-      timestep: dt of the sample in units of 1/γ̇; a sorted list of them adds a dimension to the map.
+      timestep: dt of the sample in units of 1/γ̇; a sorted list of them adds a dimension to the map; "auto" for the
+        longest whose stresses are within the target error at every point.
       equilibrate: strain before the sample, or None to shear until the flow is steady.
       strain: sampled strain of each seed.
-      tolerance: relative residual of a contact solve.
+      tolerance: relative residual of a contact solve, or "auto".
+      target_error: relative error of the stresses and the temperature that "auto" aims at.
       solver: projected method of the contact solve, see ``methods``.
       activation: "midpoint" or "touching".
       batch: replicas that run together, or "auto".
@@ -76,18 +79,20 @@ def ratio_map(
       ValueError: a parameter is out of range; the sentence says what is accepted.
     """
     dt = np.asarray(timestep).tolist()
-    settings = MapSettings(
-        restitution=tuple(float(x) for x in restitution),
-        packing_fraction=tuple(float(x) for x in packing_fraction),
-        grains=grains,
-        seeds=seeds,
-        timestep=tuple(dt) if isinstance(dt, list) else dt,
-        equilibrate=equilibrate,
-        strain=strain,
-        tolerance=tolerance,
-        solver=solver,
-        activation=activation,
-    )
+    choices = {
+        "restitution": tuple(float(x) for x in restitution),
+        "packing_fraction": tuple(float(x) for x in packing_fraction),
+        "grains": grains,
+        "seeds": seeds,
+        "timestep": tuple(dt) if isinstance(dt, list) else dt,
+        "equilibrate": equilibrate,
+        "strain": strain,
+        "tolerance": tolerance,
+        "solver": solver,
+        "activation": activation,
+    }
+    numbers, automatic_choice = automatic(choices, target_error)
+    settings = MapSettings(**numbers)
     check_batches(batch, workers)
     start, done = perf_counter(), 0.0
 
@@ -99,7 +104,12 @@ def ratio_map(
 
     results = dict(replicas(settings, batch, workers, count))
     seconds = perf_counter() - start
-    run = {"wall_time_seconds": seconds, "replica_steps_per_second": done / seconds, "workers": workers}
+    run = {
+        "automatic_choice": automatic_choice,
+        "wall_time_seconds": seconds,
+        "replica_steps_per_second": done / seconds,
+        "workers": workers,
+    }
     return map_dataset(settings, results, run)
 
 

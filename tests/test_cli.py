@@ -23,7 +23,7 @@ from jaxgran.flow import InputError
 from jaxgran.status import Status
 
 SMALL_MAP = (
-    "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-2 "
+    "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
@@ -136,9 +136,9 @@ MISTAKES = {
     "map --timestep 1e-3,1e-3": "without repetition",
     "map --timestep 1e-3,1e-5,1e-4": "timestep must be sorted",
     "map --timestep 1e-3,0": "timestep must be a positive number",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 1e-3,0.09": "timestep must be at most",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 1e-3,0.01": "timestep must be at most",
     "map --timestep 0.2": "timestep must be at most 0.1 / shear_rate",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.09": "timestep must be at most",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.01": "auto chooses one",
     "map --strain 0": "strain must be a positive number",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "strain must be at least 160 time steps",
     "map --equilibrate -1": "equilibrate must be a number of at least 0",

@@ -18,7 +18,7 @@ RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_s
 
 @pytest.fixture(scope="module")
 def settings() -> MapSettings:
-    return MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=1e-2, strain=2.0, activation="touching")
+    return MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=5e-4, strain=2.0, activation="touching")
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
 
 
 def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: Path) -> None:
-    timesteps = (1e-2, 1e-3, 1e-4)
+    timesteps = (1e-3, 1e-4, 1e-5)
     settings = MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=timesteps, strain=2.0)
     rng = np.random.default_rng(1)
     keys = [(point, seed) for point in range(12) for seed in range(SEEDS)]
@@ -124,7 +124,7 @@ def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: 
 
 
 def test_a_list_of_one_time_step_keeps_its_dimension() -> None:
-    data = map_dataset(MapSettings(ALPHAS, NUS, grains=64, timestep=(1e-2,), strain=2.0), {}, {})
+    data = map_dataset(MapSettings(ALPHAS, NUS, grains=64, timestep=(1e-3,), strain=2.0), {}, {})
     assert data.force_ratio.sizes == {"timestep": 1, "packing_fraction": 2, "restitution": 2}
 
 

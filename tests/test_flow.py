@@ -33,7 +33,7 @@ RANGES = {
     "polydispersity": "between 0 and 0.5",
     "tolerance": "between 1e-12 and 0.1",
     "max_iterations": "a whole number of at least 1",
-    "relaxation": "above 0 and at most 2",
+    "relaxation": "between 0 and 2, both excluded",
     "activation": "midpoint or touching",
     "solver": "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal",
 }
@@ -56,7 +56,7 @@ def refusal(**change) -> str:
         *[("polydispersity", value) for value in (-0.1, 0.51)],
         *[("tolerance", value) for value in (0.0, 1e-13, 0.2)],
         *[("max_iterations", value) for value in (0, -1, 2**31, 2.5)],
-        *[("relaxation", value) for value in (0.0, -1.0, 2.01)],
+        *[("relaxation", value) for value in (0.0, -1.0, 2.0)],
         *[(name, value) for name in NUMBERS for value in (np.nan, "0.05", True, 0.05j, [0.05, 0.1])],
         *[("activation", value) for value in ("Midpoint", "", 1, None)],
         *[("solver", value) for value in ("gauss-seidel", "", 0, None)],

@@ -15,7 +15,7 @@ SOURCES = sorted(path for path in Path(jaxgran.__file__).parent.glob("*.py") if 
 # A module imports only modules before it.
 LAYERS = """
     replica status flow grains cell neighbours pairs contacts delassus methods solver tally dynamics packing
-    observables statistics measure kinetic_theory protocol settings dataset sweep figures cli
+    observables statistics measure kinetic_theory protocol accuracy settings dataset sweep figures cli
 """
 
 

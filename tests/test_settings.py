@@ -8,14 +8,14 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran.flow import InputError
-from jaxgran.settings import MapSettings
+from jaxgran.settings import MapSettings, automatic
 
 GOOD: dict[str, Any] = {
     "restitution": (0.5, 0.9),
     "packing_fraction": (0.6,),
     "grains": 64,
     "seeds": 2,
-    "timestep": 1e-2,
+    "timestep": 1e-3,
     "strain": 2.0,
 }
 
@@ -39,18 +39,18 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"timestep": -1e-3}, "a positive number"),
     ({"timestep": float("nan")}, "a positive number"),
     ({"timestep": 0.2}, "at most 0.1"),
-    ({"timestep": 0.09}, "at most"),  # a grain would cross more than a tenth of a diameter
+    ({"timestep": 5e-3}, "at most .* at restitution 0.9 and packing fraction 0.6, or grains would overlap"),
     ({"timestep": ()}, "at least one number"),
-    ({"timestep": (1e-3, 1e-2, 1e-4)}, "sorted"),
-    ({"timestep": (1e-2, 1e-2)}, "without repetition"),
-    ({"timestep": ((1e-2, 1e-3),)}, "a list of numbers"),
-    ({"timestep": [1e-2, 1e-3]}, "a positive number"),  # a list is for ratio_map; settings are tuples
+    ({"timestep": (1e-4, 1e-3, 1e-5)}, "sorted"),
+    ({"timestep": (1e-3, 1e-3)}, "without repetition"),
+    ({"timestep": ((1e-3, 1e-4),)}, "a list of numbers"),
+    ({"timestep": [1e-3, 1e-4]}, "a positive number"),  # a list is for ratio_map; settings are tuples
     ({"timestep": (1e-3, 0.0)}, "a positive number"),
-    ({"timestep": (1e-3, 0.09)}, "at most"),
+    ({"timestep": (1e-3, 5e-3)}, "at most"),
     ({"strain": 0.0}, "a positive number"),
     ({"strain": float("inf")}, "a positive number"),
     ({"strain": 0.1}, "at least 160 time steps"),
-    ({"strain": 1.0, "timestep": (1e-3, 1e-2)}, "at least 160 time steps, that is 1.6"),
+    ({"strain": 0.1, "timestep": (1e-4, 1e-3)}, "at least 160 time steps, that is 0.16"),
     ({"equilibrate": -1.0}, "at least 0"),
     ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
     ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
@@ -77,15 +77,15 @@ def test_flows_are_the_points_packing_fraction_first() -> None:
     points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
-        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-2, "touching")
+        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
 
 
 def test_numbers_of_numpy_are_accepted() -> None:
-    MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-2)})
+    MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-3)})
 
 
 def test_time_step_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
-    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "timestep": (1e-2, 1e-3)})
+    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "timestep": (1e-3, 1e-4)})
     assert list(one.axes) == ["packing_fraction", "restitution"]
     assert list(some.axes) == ["timestep", "packing_fraction", "restitution"]
     points = [(flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
@@ -93,6 +93,31 @@ def test_time_step_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
     assert some.flows()[:2] == one.flows()
 
 
+def test_automatic_choices_are_accepted_and_finer_for_a_smaller_error() -> None:
+    choices = {**GOOD, "restitution": (0.1, 0.9), "timestep": "auto", "tolerance": "auto"}
+    found = []
+    for target_error in (0.05, 0.02, 0.005):
+        numbers, words = automatic(choices, target_error)
+        settings = MapSettings(**numbers)
+        assert "restitution 0.9 and packing fraction 0.6" in words and f"error of {target_error:g}" in words
+        found.append((settings.timestep, settings.tolerance))
+    timesteps, tolerances = zip(*found, strict=True)
+    assert list(timesteps) == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
+    assert list(tolerances) == sorted(set(tolerances), reverse=True)
+
+
+def test_given_numbers_stay_as_they_are() -> None:
+    assert automatic(GOOD, 0.02) == (GOOD, "")
+    numbers, words = automatic({**GOOD, "tolerance": "auto"}, 0.02)
+    assert numbers["timestep"] == GOOD["timestep"] and "timestep" not in words
+
+
+@pytest.mark.parametrize("target_error", [0.0, 1.0, float("nan"), "small"])
+def test_target_error_out_of_range_is_one_sentence(target_error) -> None:
+    with pytest.raises(InputError, match="target_error must be between 1e-4 and"):
+        automatic(GOOD, target_error)
+
+
 def test_time_steps_may_fall_as_well_as_rise() -> None:
-    for timesteps in ((1e-2, 1e-3), (1e-3, 1e-2), (1e-3,)):
+    for timesteps in ((1e-3, 1e-4), (1e-4, 1e-3), (1e-3,)):
         assert MapSettings(**{**GOOD, "timestep": timesteps}).axes["timestep"] == timesteps

@@ -23,10 +23,13 @@ SETTINGS = {
     "packing_fraction": (0.6,),
     "grains": 64,
     "seeds": 2,
-    "timestep": 1e-2,
+    "timestep": 1e-3,
     "equilibrate": 0.5,
     "strain": 1.6,
 }
+
+
+MEASURED = ("wall_time_seconds", "replica_steps_per_second", "workers")
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +92,7 @@ def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -
 def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
     told = []
     assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
-    steps = round(SETTINGS["strain"] / 1e-2) + round(SETTINGS["equilibrate"] / 1e-2)
+    steps = round(SETTINGS["strain"] / 1e-3) + round(SETTINGS["equilibrate"] / 1e-3)
     assert sum(told) == pytest.approx(4 * steps)
 
 
@@ -103,14 +106,14 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     expected = map_dataset(settings, results, {})
     np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
     np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
-    assert set(data.attrs) - set(expected.attrs) == {"wall_time_seconds", "replica_steps_per_second", "workers"}
+    assert set(data.attrs) - set(expected.attrs) == {"automatic_choice", *MEASURED}
     assert data.attrs["wall_time_seconds"] > 0
-    steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-2)
+    steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-3)
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
 
 
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
-    some = replace(settings, timestep=(1e-2, 5e-3))
+    some = replace(settings, timestep=(1e-3, 5e-4))
     both = dict(replicas(some, batch=8))
     assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
@@ -119,16 +122,16 @@ def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settin
 
 
 @pytest.mark.parametrize(
-    "timestep", [[1e-2, 2e-2], (1e-2, 2e-2), np.array([1e-2, 2e-2])], ids=["list", "tuple", "array"]
+    "timestep", [[1e-3, 5e-4], (1e-3, 5e-4), np.array([1e-3, 5e-4])], ids=["list", "tuple", "array"]
 )
 def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep, "replicas", lambda *_: iter(()))
     data = ratio_map(**{**SETTINGS, "timestep": timestep, "strain": 4.0})
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
-    assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-2, 2e-2]
-    for one in (1e-2, np.float64(1e-2), np.array(1e-2)):
+    assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-3, 5e-4]
+    for one in (1e-3, np.float64(1e-3), np.array(1e-3)):
         data = ratio_map(**{**SETTINGS, "timestep": one})
-        assert "timestep" not in data.variables and data.attrs["timestep"] == 1e-2
+        assert "timestep" not in data.variables and data.attrs["timestep"] == 1e-3
 
 
 @pytest.mark.parametrize("mistake", [{"batch": 0}, {"batch": 1.5}, {"batch": "all"}, {"workers": 0}, {"workers": 2.0}])

@@ -1,0 +1,298 @@
+"""What fails first as the time step grows and the packing becomes dense, and where nothing fails.
+
+For every restitution α and packing fraction ν a flow of 128 grains is brought to its steady state at a fine time step.
+From that state it is sheared by a half (at least 20 steps, at most 3000) at each time step, for the default and for
+other solvers, relaxations, contact rules and precisions. The numbers go beyond what the package accepts. Each cell of
+the chart shows what failed first; the axis is dt √T / σ, the distance that a grain of thermal speed moves in one step.
+
+The steps of a cell are done in ten parts, each as long as all before it, and it ends with the first part that fails.
+Only deep overlaps do not end it. In the part that fails the worst failure counts, in the order of ``OUTCOMES``. An
+energy gain is a negative dissipation, or kinetic energy beyond the shear work less the dissipation.
+
+    python benchmarks/stability.py            # about 10 minutes on one core
+    python benchmarks/stability.py --quick    # about half a minute
+"""
+
+import argparse
+import json
+import os
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hardware import hardware
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import jaxgran as jg
+from jaxgran.flow import InputError
+from jaxgran.observables import averages
+from jaxgran.protocol import predicted, stack
+from jaxgran.settings import MapSettings
+
+RESTITUTIONS = (0.0, 0.5, 0.9)
+PACKING_FRACTIONS = (0.3, 0.5, 0.6, 0.7, 0.75, 0.8, 0.82, 0.83, 0.835, 0.84)
+CROSSINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # dt √T / σ
+COARSE_GRID = (0.3, 0.6, 0.75, 0.8, 0.82, 0.83, 0.84), CROSSINGS[3:9]  # of all variants but the default
+VARIANTS = {
+    "default": {},
+    "touching": {"activation": "touching"},
+    "float32": {"dtype": "float32"},
+    "Nesterov": {"solver": "nesterov"},
+    **{f"Jacobi, ω = {omega:g}": {"solver": "jacobi", "relaxation": omega} for omega in (1.0, 1.8, 1.99, 2.0)},
+    "Jacobi with diag W, ω = 1": {"solver": "jacobi-diagonal", "relaxation": 1.0},
+}
+GRAINS = 128
+STRAIN, FEWEST_STEPS, MOST_STEPS, PARTS = 0.5, 20, 3000, 10
+PREPARATION = [(0.05, 1e-3)] * 20 + [(0.2, 1e-3)] * 8 + [(0.1, 3e-4)] * 4  # strain, dt √T / σ
+GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged; what rounding does not explain
+
+# Mildest first: letter, colour, meaning.
+OUTCOMES = {
+    "ok": ("·", "1.0", "nothing fails"),
+    "iteration_limit": ("i", "0.85", "a solve ends above the tolerance"),
+    "deep_overlap": ("o", "0.72", "an overlap beyond 0.01 σ"),
+    "infeasible": ("J", "0.58", "no impulses exist: jammed"),
+    "energy_gain": ("E", "0.46", "energy gained"),
+    "capacity": ("C", "0.34", "a step outruns the lists of near pairs"),
+    "nonfinite": ("N", "0.15", "not finite"),
+}
+
+advance = jax.jit(jg.advance)
+pack = jax.jit(jg.pack)
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="nine cells of two variants")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    jax.config.update("jax_enable_x64", True)
+    chart(chosen.quick, chosen.output)
+
+
+def chart(quick: bool, output: Path) -> list[dict]:
+    """Measure all cells, write them with their figures, and return them (see ``cell``)."""
+    restitutions, packing_fractions, crossings, names = RESTITUTIONS, PACKING_FRACTIONS, CROSSINGS, tuple(VARIANTS)
+    if quick:
+        restitutions, packing_fractions, crossings = (0.5,), (0.6, 0.75, 0.8), (3e-4, 3e-3, 3e-2)
+        names = ("default", "float32")
+    starts = {(alpha, nu): prepared(alpha, nu) for alpha in restitutions for nu in packing_fractions}
+    cells = []
+    for name in names:
+        if name != "default" and not quick:
+            packing_fractions, crossings = COARSE_GRID
+        for alpha, nu in ((alpha, nu) for alpha in restitutions for nu in packing_fractions):
+            column = [cell(name, alpha, nu, crossing, *starts[alpha, nu]) for crossing in crossings]
+            whole = [one["pressure"] for one in column if one["strain"] > 0.99 * STRAIN] or [np.nan]
+            ratios = [one["pressure"] / whole[0] if one["strain"] > 0.99 * STRAIN else np.nan for one in column]
+            cells += [{**one, "pressure_ratio": ratio} for one, ratio in zip(column, ratios, strict=True)]
+            print(f"{name:26s} α = {alpha:3g}  ν = {nu:5g}  {' '.join(OUTCOMES[c['outcome']][0] for c in column)}")
+    output.mkdir(parents=True, exist_ok=True)
+    stem = output / ("stability_quick" if quick else "stability")
+    result = {
+        "hardware": hardware(),
+        "grains": GRAINS,
+        "strain": STRAIN,
+        "steps": [FEWEST_STEPS, MOST_STEPS],
+        "cells": [{k: None if v != v else v for k, v in one.items()} for one in cells],
+    }
+    stem.with_suffix(".json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+    draw_default(cells).savefig(stem.with_suffix(".png"), dpi=150)
+    draw_variants(cells).savefig(stem.with_name(stem.name + "_variants.png"), dpi=150)
+    return cells
+
+
+def unjudged(variant: str, alpha: float, nu: float, **numbers: float) -> jg.ShearFlow:
+    """A flow whose numbers are not judged, in the precision of a variant: leaves of a pytree never are."""
+    choice = {"activation": "midpoint", "solver": "barzilai-borwein", "dtype": "float64"} | VARIANTS[variant]
+    dtype, fixed = choice.pop("dtype"), {name: choice.pop(name) for name in ("activation", "solver")}
+    numbers = {"restitution": alpha, "packing_fraction": nu} | choice | numbers
+
+    def leaf(path, value) -> jax.Array:
+        name = path[-1].name
+        return jnp.asarray(numbers.get(name, value), "int32" if name == "max_iterations" else dtype)
+
+    return jax.tree_util.tree_map_with_path(leaf, jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3, **fixed))
+
+
+def prepared(alpha: float, nu: float) -> tuple[jg.State, float]:
+    """A sheared state, the same for all variants, and its temperature in mσ²γ̇², an average over the last strain.
+
+    The temperature of theory is a poor start where the flow is dense, so the time step follows the temperature.
+    """
+    for seed in range(10):
+        state, found = pack(unjudged("default", alpha, nu), jax.random.key(seed))
+        if found:
+            break
+    masses = np.asarray(state.grains.masses)[:, None]
+    velocities = np.random.default_rng(0).normal(size=state.velocities.shape) / np.sqrt(masses)
+    velocities -= np.sum(masses * velocities, axis=0) / np.sum(masses)
+    theory = jax.tree.map(lambda x: x[0], predicted(stack([unjudged("default", alpha, nu)])))
+    state = replace(state, velocities=jnp.asarray(velocities * np.sqrt(float(theory.granular_temperature))))
+    temperatures = []
+    for strain, crossing in PREPARATION:
+        dt = crossing / np.sqrt(energy(state) / GRAINS)
+        flow = unjudged("default", alpha, nu, timestep=dt, max_iterations=500)
+        state, tally = advance(flow, state, jnp.int32(round(strain / dt)))
+        temperatures.append(float(averages(tally, state.side**2, GRAINS, flow.shear_rate)["granular_temperature"]))
+    return state, float(np.mean(temperatures[-8:]))
+
+
+def energy(state: jg.State) -> float:
+    """Kinetic energy of the peculiar velocities, mσ²γ̇²; N of them are the temperature."""
+    velocities = np.asarray(state.velocities, float)
+    return float(np.sum(np.asarray(state.grains.masses, float)[:, None] * velocities**2) / 2)
+
+
+def cell(variant: str, alpha: float, nu: float, crossing: float, state: jg.State, temperature: float) -> dict:
+    """What failed first at one time step, and averages over the steps until then.
+
+    ============================  ==============  ===============================================================
+    key                           unit            meaning
+    ============================  ==============  ===============================================================
+    variant, alpha, nu            –               where
+    crossing, dt, temperature     σ, 1/γ̇, mσ²γ̇²   dt √T, time step, T of the state it started from
+    accepted                      –               whether a map accepts this flow
+    outcome, failed_after         –               a key of ``OUTCOMES``, the strain to the end of the failing part
+    strain                        –               that was sheared
+    largest_overlap               σ               of a contact
+    unconverged, iterations       –               share of the solves above the tolerance, mean iterations
+    pressure                      mγ̇²             contact and kinetic
+    ============================  ==============  ===============================================================
+    """
+    dt = crossing / np.sqrt(temperature)
+    flow = unjudged(variant, alpha, nu, timestep=dt)
+    precision = flow.timestep.dtype
+    state = jax.tree.map(lambda x: x.astype(precision), state)
+    total = int(np.clip(np.ceil(STRAIN / dt), FEWEST_STEPS, MOST_STEPS))
+    edges = np.unique(np.ceil(total / 2.0 ** np.arange(PARTS)).astype(int))
+    outcome, failed_after, whole = "ok", np.nan, None
+    for steps, end in zip(np.diff(edges, prepend=0), edges, strict=True):
+        before = energy(state)
+        state, tally = advance(flow, state, jnp.int32(steps))
+        whole = tally if whole is None else whole + tally
+        now = jg.Status(int(tally.status)).name
+        if gains(tally, energy(state) - before, GAIN[precision.name] * (before + energy(state))):
+            now = max(now, "energy_gain", key=list(OUTCOMES).index)
+        if outcome == "ok" and now != "ok":
+            outcome, failed_after = now, float(end * dt)
+        if now not in ("ok", "deep_overlap"):
+            break
+    measured = averages(whole, state.side**2, GRAINS, flow.shear_rate)
+    return {
+        "variant": variant,
+        "alpha": alpha,
+        "nu": nu,
+        "crossing": crossing,
+        "dt": float(dt),
+        "temperature": temperature,
+        "accepted": accepts(alpha, nu, dt),
+        "outcome": outcome,
+        "failed_after": failed_after,
+        "strain": float(whole.duration),
+        "largest_overlap": float(whole.largest_overlap),
+        "unconverged": float(measured["unconverged_share"]),
+        "iterations": float(measured["iterations"]),
+        "pressure": float(measured["pressure"]),
+    }
+
+
+def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
+    """Whether a contact law gave energy: dissipation below zero, or more kinetic energy than the balance allows."""
+    work = -float(tally.contact_moment[0, 1] + tally.kinetic_moment[0, 1])  # shear rate one
+    dissipation = float(tally.dissipation)
+    rounding += 1e-6 * abs(work)
+    return dissipation < -rounding or rise > work - dissipation + rounding
+
+
+def accepts(alpha: float, nu: float, dt: float) -> bool:
+    """Whether a map would run this flow."""
+    try:
+        MapSettings((alpha,), (nu,), GRAINS, timestep=dt, strain=1e4)
+    except InputError:
+        return False
+    return True
+
+
+def draw_default(cells: list[dict]) -> Figure:
+    """The default, with the pressure over that of the finest step in every cell, and what a map accepts."""
+    cells = [one for one in cells if one["variant"] == "default"]
+    alphas = sorted({one["alpha"] for one in cells})
+    figure = Figure(figsize=(1.6 + 4.4 * len(alphas), 5.6), layout="constrained")
+    for axes, alpha in zip(np.atleast_1d(figure.subplots(1, len(alphas), sharey=True)), alphas, strict=True):
+        panel(axes, [one for one in cells if one["alpha"] == alpha], True)
+        axes.set_title(f"α = {alpha:g}")
+        axes.set_xlabel("packing fraction ν")
+    figure.axes[0].set_ylabel(r"$\mathrm{d}t\,\sqrt{T}\,/\,\sigma$")
+    legend(
+        figure,
+        cells,
+        [
+            "small: pressure over that of the finest step that was sheared by 0.5",
+            "thick line: a map accepts what is inside",
+        ],
+    )
+    return figure
+
+
+def draw_variants(cells: list[dict]) -> Figure:
+    """All variants, a row each, where all of them were run."""
+    places = [{(c["nu"], c["crossing"]) for c in cells if c["variant"] == name} for name in VARIANTS]
+    shared = set.intersection(*filter(None, places))
+    cells = [one for one in cells if (one["nu"], one["crossing"]) in shared]
+    alphas, names = sorted({one["alpha"] for one in cells}), list(dict.fromkeys(one["variant"] for one in cells))
+    figure = Figure(figsize=(1.4 + 3.6 * len(alphas), 0.9 + 2.6 * len(names)), layout="constrained")
+    grid = figure.subplots(len(names), len(alphas), sharex=True, sharey=True, squeeze=False)
+    for row, name in zip(grid, names, strict=True):
+        for axes, alpha in zip(row, alphas, strict=True):
+            panel(axes, [one for one in cells if (one["variant"], one["alpha"]) == (name, alpha)], False)
+            axes.set_title(f"{name}, α = {alpha:g}", fontsize="medium")
+        row[0].set_ylabel(r"$\mathrm{d}t\,\sqrt{T}\,/\,\sigma$")
+    for axes in grid[-1]:
+        axes.set_xlabel("packing fraction ν")
+    legend(figure, cells, [])
+    return figure
+
+
+def panel(axes: Axes, cells: list[dict], detailed: bool) -> None:
+    """One field of lettered cells; both axes list their values and are not to scale."""
+    nus, crossings = (sorted({one[name] for one in cells}) for name in ("nu", "crossing"))
+    for one in cells:
+        x, y = nus.index(one["nu"]), crossings.index(one["crossing"])
+        letter, colour, _ = OUTCOMES[one["outcome"]]
+        ink = "white" if float(colour) < 0.5 else "black"
+        axes.fill(
+            [x - 0.5, x + 0.5, x + 0.5, x - 0.5], [y - 0.5, y - 0.5, y + 0.5, y + 0.5], fc=colour, ec="white", lw=0.5
+        )
+        axes.text(x, y + (0.2 if detailed else 0), letter, ha="center", va="center", color=ink, weight="bold")
+        if detailed and np.isfinite(one["pressure_ratio"]):
+            ratio = one["pressure_ratio"]
+            words = f"{ratio:.2f}" if ratio < 10 else ">10"
+            axes.text(x, y - 0.2, words, ha="center", va="center", color=ink, fontsize=6)
+    if detailed:
+        tops = [
+            max([crossings.index(one["crossing"]) + 1 for one in cells if one["nu"] == nu and one["accepted"]] or [0])
+            for nu in nus
+        ]
+        axes.stairs(np.array(tops) - 0.5, np.arange(len(nus) + 1) - 0.5, baseline=-0.5, color="black", lw=2.5)
+    axes.set(xlim=(-0.5, len(nus) - 0.5), ylim=(-0.5, len(crossings) - 0.5))
+    axes.set_xticks(range(len(nus)), [f"{nu:g}" for nu in nus], rotation=90 if len(nus) > 4 else 0)
+    axes.set_yticks(range(len(crossings)), [f"{crossing:.0e}".replace("e-0", "e-") for crossing in crossings])
+    axes.tick_params(length=0, labelsize="small")
+
+
+def legend(figure: Figure, cells: list[dict], more: list[str]) -> None:
+    """What the letters and lines mean, as many to a line as fit."""
+    seen = {one["outcome"] for one in cells}
+    entries = [f"{letter} {words}" for name, (letter, _, words) in OUTCOMES.items() if name in seen] + more
+    unbroken = ";  ".join(entry.replace(" ", "\u00a0") for entry in entries)
+    figure.suptitle(textwrap.fill(unbroken, width=int(11 * figure.get_figwidth())), fontsize="medium")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""Where methods for the contact problem fail, and where they do not: laws on the collection of the benchmarks."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import delassus, exact_velocities, incidence
+
+from jaxgran.delassus import spectral_bound
+from jaxgran.flow import ShearFlow
+from jaxgran.solver import solve
+from jaxgran.status import Status
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from gauss_seidel import exact, gauss_seidel
+from networks import CHAINS, INFEASIBLE, chain, collection
+
+DEFAULT = ShearFlow(16, 0.5, 0.5, 1e-3).solver
+BOUNDED = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]
+SIZE_RATIO, MASS_RATIO, HEXAGONAL = "size ratio 10", "mass ratio 10⁴", "hexagonal cluster"
+compiled_bound = jax.jit(spectral_bound, static_argnums=1)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    return collection(quick=True)
+
+
+@pytest.fixture(scope="module")
+def feasible(networks):
+    return [network for group, members in networks.items() if group != INFEASIBLE for network in members]
+
+
+@pytest.fixture(scope="module")
+def solution_of():
+    """``solution_of(network, tolerance, cap, method, relaxation)``: the contact solve, compiled."""
+    compiled = jax.jit(solve, static_argnums=(1, 6))
+
+    def call(network, tolerance=1e-4, cap=5000, method=DEFAULT, relaxation=1.8):
+        numbers = jnp.asarray(1.0), jnp.asarray(tolerance), jnp.asarray(cap), jnp.asarray(relaxation)
+        return compiled(network.contacts, network.grains, *numbers, method, jnp.asarray(True))
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def exact_of():
+    """``exact_of(network)``: the exact solution, computed once."""
+    known = {}
+
+    def call(network):
+        if id(network) not in known:
+            known[id(network)] = network, exact(network.contacts, network.masses)
+        return known[id(network)][1]
+
+    return call
+
+
+def changes(network, impulses) -> np.ndarray:
+    """Changes of the velocities (grains, 2) by the impulses."""
+    matrix = incidence(network.contacts, network.grains)
+    return (matrix.T @ np.asarray(impulses)).reshape(-1, 2) / network.masses[:, None]
+
+
+def energy(network, velocities) -> float:
+    return float(np.sum(network.masses[:, None] * velocities**2) / 2)
+
+
+def operator_and_approach(network) -> tuple[np.ndarray, np.ndarray]:
+    """W and u⁻ of the contacts in use, dense."""
+    used = np.asarray(network.contacts.used)
+    matrix = delassus(network.contacts, network.masses)
+    return matrix[np.ix_(used, used)], np.asarray(network.contacts.approach)[used]
+
+
+def test_collection_is_the_same_twice(networks):
+    again = collection(quick=True)
+    assert again.keys() == networks.keys()
+    jax.tree.map(np.testing.assert_array_equal, again, networks)
+
+
+def test_networks_are_padded_and_consistent(networks):
+    for members in networks.values():
+        for contacts, _, masses, _ in members:
+            used = np.asarray(contacts.used)
+            assert np.any(used & (np.asarray(contacts.approach) < 0))
+            np.testing.assert_allclose(np.linalg.norm(contacts.normals, axis=1), used, atol=1e-12)
+            np.testing.assert_allclose(contacts.inverse_mass_i, np.where(used, 1 / masses[contacts.i], 0), rtol=1e-12)
+            np.testing.assert_allclose(contacts.inverse_mass_j, np.where(used, 1 / masses[contacts.j], 0), rtol=1e-12)
+
+
+def test_exact_solution_is_the_projection_of_the_velocities(networks, exact_of):
+    """Against the oracle of the other tests, where the approach follows from velocities of the grains.
+
+    Not on hexagonal clusters, whose impulses are not unique: SciPy's non-negative least squares, applied to them
+    directly, can end early.
+    """
+    compared = 0
+    for network in (one for group in networks if group not in (INFEASIBLE, HEXAGONAL) for one in networks[group]):
+        matrix, approach = incidence(network.contacts, network.grains), np.asarray(network.contacts.approach)
+        before = np.linalg.lstsq(matrix, approach)[0]
+        if np.linalg.norm(matrix @ before - approach) > 1e-9 * np.linalg.norm(approach):
+            continue  # a network that spans the sheared cell
+        before = before.reshape(-1, 2)
+        oracle = exact_velocities(network.contacts, network.masses, before) - before
+        assert energy(network, exact_of(network).changes - oracle) < 1e-12 * energy(network, oracle)
+        compared += 1
+    assert compared > 20
+
+
+def test_exact_solution_satisfies_the_contact_law_to_rounding(feasible, exact_of):
+    for network in feasible:
+        assert exact_of(network).residual < 1e-11
+
+
+def test_exact_solution_tells_what_has_none(networks, exact_of):
+    for members in networks.values():
+        for network in members:
+            assert exact_of(network).feasible == network.feasible
+
+
+def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_of):
+    for network in feasible:
+        solution, reference = solution_of(network, 1e-10, 20_000), exact_of(network)
+        assert solution.status == Status.ok
+        error = energy(network, changes(network, solution.impulses) - reference.changes)
+        assert error < 1e-12 * energy(network, reference.changes)
+
+
+def test_gauss_seidel_converges_to_the_exact_velocities(networks, exact_of):
+    for group in ("flow φ 0.8, α 0", "flow φ 0.82, α 0.9", "flow φ 0.6, α 0.5", SIZE_RATIO, HEXAGONAL):
+        for network in networks[group]:
+            solution = gauss_seidel(network.contacts, network.grains, 1e-10, 20_000)
+            reference = exact_of(network)
+            assert solution.status == Status.ok
+            np.testing.assert_allclose(
+                solution.response, incidence(network.contacts, network.grains) @ reference.changes.ravel(), atol=1e-7
+            )
+
+
+def test_scaling_by_the_diagonal_diverges_where_it_does_not_bound(feasible, solution_of, exact_of):
+    """Where λmax(diag(W)⁻¹ W) > 2 on the contacts that push, the solution repels Jacobi with diag(W)."""
+    repelled = 0
+    for network in feasible:
+        pushing = exact_of(network).impulses > 0
+        matrix = delassus(network.contacts, network.masses)[np.ix_(pushing, pushing)]
+        scale = 1 / np.sqrt(np.diag(matrix))
+        if np.linalg.eigvalsh(matrix * scale[:, None] * scale[None, :])[-1] > 2.1:
+            assert solution_of(network, 1e-8, 20_000).status == Status.ok
+            assert solution_of(network, 1e-8, 5000, "jacobi-diagonal", 1.0).status == Status.iteration_limit
+            repelled += 1
+    assert repelled > 10
+
+
+def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasible, solution_of):
+    """The iteration p ← max(0, p − ω D⁻¹(W p + b)) for ω close to 2, dense; compiled, capped solves follow it."""
+    for number, network in enumerate(feasible):
+        used = np.asarray(network.contacts.used)
+        matrix, approach = operator_and_approach(network)
+        bound = np.asarray(compiled_bound(network.contacts, network.grains))[used]
+        impulses, objectives, residuals, iterates = np.zeros(len(approach)), [0.0], [], []
+        for _ in range(30):
+            impulses = np.maximum(0, impulses - 1.99 * (matrix @ impulses + approach) / bound)
+            objectives.append(impulses @ (matrix @ impulses / 2 + approach))
+            residuals.append(np.linalg.norm(np.minimum(np.diag(matrix) * impulses, matrix @ impulses + approach)))
+            iterates.append(impulses)
+        assert np.all(np.diff(objectives) <= 1e-14 * abs(objectives[-1]))
+        for cap in range(1, 31) if number % 8 == 0 else ():
+            found = np.asarray(solution_of(network, 1e-12, cap, "jacobi", 1.99).impulses)[used]
+            best = iterates[int(np.argmin(residuals[:cap]))]
+            np.testing.assert_allclose(found, best, rtol=0, atol=1e-9 * max(np.max(best), 1e-3))
+
+
+def test_iterations_on_chains_grow_no_faster_than_their_length(solution_of):
+    """A shock must travel along the chain; diffusion would take the square of the length."""
+    products = [int(solution_of(chain(discs), 1e-6, method="nesterov").iterations) for discs in CHAINS]
+    exponent = np.polyfit(np.log(CHAINS), np.log(products), 1)[0]
+    assert exponent < 1.2
+    sweeps = [int(gauss_seidel(chain(n).contacts, chain(n).grains, 1e-6, 100_000).iterations) for n in CHAINS[:4]]
+    assert np.polyfit(np.log(CHAINS[:4]), np.log(sweeps), 1)[0] > 1.5
+
+
+@pytest.mark.parametrize("method", BOUNDED)
+def test_nothing_fails_in_silence(feasible, solution_of, method):
+    """A solve is within its tolerance or flagged, and what is called infeasible has no solution."""
+    for network in feasible:
+        solution = solution_of(network, 1e-4, 1000, method)
+        matrix, approach = operator_and_approach(network)
+        impulses = np.asarray(solution.impulses)[np.asarray(network.contacts.used)]
+        residual = np.linalg.norm(np.minimum(np.diag(matrix) * impulses, matrix @ impulses + approach))
+        within = residual <= 1.001e-4 * np.linalg.norm(np.minimum(approach, 0))
+        assert solution.status == (Status.ok if within else Status.iteration_limit)
+
+
+@pytest.mark.parametrize("method", BOUNDED)
+def test_infeasible_networks_are_flagged_and_finite(networks, solution_of, method):
+    for network in networks[INFEASIBLE]:
+        solution = solution_of(network, 1e-4, 5000, method)
+        assert solution.status == Status.infeasible
+        assert np.all(np.isfinite(solution.impulses)) and np.all(np.isfinite(solution.response))
+
+
+@pytest.mark.parametrize("method", ["nesterov", "barzilai-borwein"])
+@pytest.mark.parametrize("group", [SIZE_RATIO, MASS_RATIO])
+def test_fast_methods_converge_at_large_ratios_of_size_and_mass(networks, solution_of, method, group):
+    for network in networks[group]:
+        assert solution_of(network, 1e-4, 20_000, method).status == Status.ok

@@ -1,0 +1,118 @@
+"""Where the time step, the packing fraction and the precision fail, every failure is flagged or refused."""
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.dynamics import DEEP_OVERLAP, State
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.grains import Grains
+from jaxgran.measure import sample
+from jaxgran.observables import averages
+from jaxgran.status import Status
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import stability
+
+PAIRS = stability.GRAINS // 2
+
+
+def test_quick_chart_is_written_and_nothing_fails_where_a_map_is_accepted(tmp_path: Path) -> None:
+    cells = stability.chart(quick=True, output=tmp_path)
+    assert json.loads((tmp_path / "stability_quick.json").read_text())["cells"]
+    for name in ("stability_quick.png", "stability_quick_variants.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+    default = [one for one in cells if one["variant"] == "default"]
+    accepted = [one for one in default if one["accepted"]]
+    assert accepted and {one["outcome"] for one in accepted} == {"ok"}
+    assert {one["outcome"] for one in default} > {"ok"}, "the chart looks beyond what is accepted"
+
+
+@pytest.mark.parametrize("packing_fraction", [0.80, 0.82, 0.83, 0.835, 0.84])
+def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
+    """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no energy appears."""
+    state, _ = warm(0.0, packing_fraction)
+    flow = stability.unjudged("default", 0.0, packing_fraction, timestep=3e-4)
+    before = stability.energy(state)
+    state, tally = stability.advance(flow, state, jnp.int32(300))
+    finite = all(np.isfinite(x).all() for x in jax.tree.leaves((state, tally)))
+    status = Status(int(tally.status))
+    assert finite or status == Status.nonfinite
+    if status == Status.ok:
+        assert tally.largest_overlap <= DEEP_OVERLAP
+        assert tally.worst_residual <= 1.01 * flow.tolerance
+    else:
+        assert tally.unconverged > 0 or tally.largest_overlap > DEEP_OVERLAP or not finite
+    assert not stability.gains(tally, stability.energy(state) - before, 1e-6 * before)
+
+
+@pytest.mark.parametrize("packing_fraction", [0.6, 0.8])
+def test_float32_positions_give_the_pressure_of_float64_at_a_short_timestep(packing_fraction: float) -> None:
+    """At dt = 1e-5 a program that adds to absolute positions loses the motion; separations since a rebuild keep it."""
+    state, _ = warm(0.9, packing_fraction)
+    (wide, wide_error), (narrow, narrow_error) = (
+        pressure(variant, 0.9, packing_fraction, 1e-5, state) for variant in ("default", "float32")
+    )
+    error = np.hypot(wide_error, narrow_error)
+    assert 4 * error < 0.4 * wide, "an error by half would be seen"
+    assert abs(narrow - wide) < 4 * error
+
+
+def test_float32_positions_lose_collisions_at_a_timestep_below_their_rounding() -> None:
+    """Where a step moves a pair by less than half a rounding of its separation, 6e-8 σ or less, it stands still."""
+    for timestep, found in ((1e-5, True), (1e-6, True), (1e-8, False)):
+        wide, narrow = (collisions(variant, timestep) for variant in ("default", "float32"))
+        assert wide == PAIRS
+        lost = PAIRS - narrow
+        assert lost == 0 if found else lost > 4 * np.sqrt(PAIRS) / 2, timestep  # four errors of a count out of PAIRS
+
+
+def test_sample_refuses_float32_positions_at_a_short_timestep() -> None:
+    state = jax.tree.map(lambda x: x.astype("float32"), warm(0.9, 0.6)[0])
+    with pytest.raises(InputError, match="float64"):
+        sample(ShearFlow(stability.GRAINS, 0.9, 0.6, 1e-5), state, strain=1.0)
+
+
+@cache
+def warm(restitution: float, packing_fraction: float) -> tuple[State, float]:
+    """``stability.prepared`` of less strain, shared by the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stability, "PREPARATION", [(0.05, 1e-3)] * 8)
+        return stability.prepared(restitution, packing_fraction)
+
+
+def pressure(variant: str, alpha: float, nu: float, timestep: float, state: State) -> tuple[float, float]:
+    """Pressure over a strain of 4 in 16 blocks, and its standard error, in m γ̇²."""
+    flow = stability.unjudged(variant, alpha, nu, timestep=timestep)
+    state = jax.tree.map(lambda x: x.astype(flow.timestep.dtype), state)
+    blocks = []
+    for _ in range(16):
+        state, tally = stability.advance(flow, state, jnp.int32(round(0.25 / timestep)))
+        assert tally.status == Status.ok
+        blocks.append(float(averages(tally, state.side**2, stability.GRAINS, flow.shear_rate)["pressure"]))
+    return float(np.mean(blocks)), float(np.std(blocks, ddof=1) / 4)
+
+
+def collisions(variant: str, timestep: float) -> int:
+    """How many of lone pairs, at speeds of 0.5 to 2 σγ̇ and gaps of 1e-5 σ, collide in the time in which all should."""
+    flow = stability.unjudged(variant, 0.9, 0.1, timestep=timestep)
+    dtype, random, gap, row = flow.timestep.dtype, np.random.default_rng(0), 1e-5, np.arange(PAIRS)
+    angle, speed = random.uniform(0, 2 * np.pi, PAIRS), random.uniform(0.5, 2, PAIRS)[:, None]
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    radii = random.uniform(0.4, 0.6, (2, PAIRS))
+    places = 4.0 + 6.0 * np.stack([row % 8, row // 8], axis=-1)
+    positions = np.concatenate([places, places + along * (radii.sum(axis=0) + gap)[:, None]])
+    velocities = np.concatenate([along * speed / 2, -along * speed / 2])
+    velocities[:, 0] -= positions[:, 1]  # peculiar; the shear rate is one
+    radii = radii.ravel()
+    state = State(Grains(radii, 4 * radii**2), positions, velocities, np.asarray(54.0), np.asarray(0.0))
+    state = jax.tree.map(lambda x: jnp.asarray(x, dtype), state)
+    steps = jnp.int32(np.ceil(4 * gap / timestep) + 4)
+    state, tally = stability.advance(flow, state, steps)
+    return int(tally.collisions)
