@@ -177,7 +177,7 @@ def run_command(
     packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
     grains: Annotated[int, typer.Option(help="Number of grains.")] = 256,
     strain: Annotated[float, typer.Option(help="Sampled strain.")] = 5.0,
-    timestep: Annotated[float, typer.Option(help="Time step of the sample, in 1/shear rate.")] = 1e-3,
+    timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the trajectory (not available yet).")] = None,
     movie: Annotated[Path | None, typer.Option(help="GIF of the flow (not available yet).")] = None,
     output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
@@ -186,12 +186,15 @@ def run_command(
     for name, wanted in (("--trajectory", trajectory), ("--movie", movie)):
         if wanted is not None:
             raise InputError(f"{name} is not available yet: run without it.")
+    step = _numbers_or_auto(timestep, "timestep")
+    if isinstance(step, tuple):
+        raise InputError(f"timestep must be one number or auto, not {timestep!r}.")
     chosen = {
         "restitution": (restitution,),
         "packing_fraction": (packing_fraction,),
         "grains": grains,
         "seeds": 1,
-        "timestep": timestep,
+        "timestep": step,
         "strain": strain,
     }
     data, interrupted = _measure(chosen, "auto", 1, output, quiet=False)

@@ -107,7 +107,8 @@ def solve(
     impulses, response = end.best
 
     def is_jammed():
-        return dot(impulses, response) < _JAMMED_RESPONSE * -dot(b, impulses)
+        last, moved = end.at.point  # the best iterate may be an early one, whose impulses have not grown yet
+        return dot(last, moved) < _JAMMED_RESPONSE * -dot(b, last)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))

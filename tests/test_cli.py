@@ -143,6 +143,10 @@ MISTAKES = {
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "strain must be at least 160 time steps",
     "map --equilibrate -1": "equilibrate must be a number of at least 0",
     "map --tolerance 1": "tolerance must be between",
+    "map --tolerance 1e-3,1e-4": "tolerance must be between",
+    "map --tolerance loose": "tolerance must be a number",
+    "map --timestep auto --target-error 1": "target_error must be between 1e-4 and 0.1",
+    "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
     "map --activation always": "'midpoint', 'touching'",
     "map --preset slow": "'quick', 'paper'",
@@ -281,11 +285,14 @@ def test_plot_into_a_folder_that_is_not_there_is_one_sentence(small_map) -> None
 
 
 def test_run_prints_every_average_with_its_error_and_unit(tmp_path: Path) -> None:
-    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep 1e-3 --strain 4 --output flow.nc"
+    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep auto --strain 4 --output flow.nc"
     outcome = jaxgran(tmp_path, *words.split())
     assert outcome.status in (0, 3)
     assert files(tmp_path) == {"flow.nc"}
-    data = read_dataset(tmp_path / "flow.nc").isel(restitution=0, packing_fraction=0)
+    data = read_dataset(tmp_path / "flow.nc")
+    assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
+    assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
+    data = data.isel(restitution=0, packing_fraction=0)
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
         (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
         assert f"{float(data[name]):.4g} ± {float(data[f'{name}_stderr']):.2g}" in row

@@ -1,23 +1,17 @@
 """Where methods for the contact problem fail, and where they do not: laws on the collection of the benchmarks."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gauss_seidel import exact, gauss_seidel
+from networks import CHAINS, INFEASIBLE, chain, collection
 from oracles import delassus, exact_velocities, incidence
 
 from jaxgran.delassus import spectral_bound
 from jaxgran.flow import ShearFlow
 from jaxgran.solver import solve
 from jaxgran.status import Status
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-from gauss_seidel import exact, gauss_seidel
-from networks import CHAINS, INFEASIBLE, chain, collection
 
 DEFAULT = ShearFlow(16, 0.5, 0.5, 1e-3).solver
 BOUNDED = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]

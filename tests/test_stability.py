@@ -1,7 +1,6 @@
 """Where the time step, the packing fraction and the precision fail, every failure is flagged or refused."""
 
 import json
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stability
 
 from jaxgran.dynamics import DEEP_OVERLAP, State
 from jaxgran.flow import InputError, ShearFlow
@@ -16,9 +16,6 @@ from jaxgran.grains import Grains
 from jaxgran.measure import sample
 from jaxgran.observables import averages
 from jaxgran.status import Status
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import stability
 
 PAIRS = stability.GRAINS // 2
 

@@ -1,0 +1,108 @@
+"""The choice of time step and tolerance: against temperatures of other programs and the charts that it was read off."""
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.accuracy import (
+    automatic_timestep,
+    automatic_tolerance,
+    expected_temperature,
+    longest_timestep,
+    stress_error,
+)
+from jaxgran.dynamics import DEEP_OVERLAP
+from jaxgran.flow import ShearFlow
+from jaxgran.protocol import predicted, stack
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+# (packing fraction, restitution): temperature of event-driven hard discs, and of soft ones in the stiff limit
+TEMPERATURES = {
+    (0.20, 0.9): 10.92,
+    (0.20, 0.7): 3.105,
+    (0.20, 0.5): 1.633,
+    (0.60, 0.9): 2.057,
+    (0.60, 0.7): 0.548,
+    (0.60, 0.5): 0.344,
+    (0.70, 0.9): 1.97,
+    (0.70, 0.7): 0.537,
+    (0.70, 0.5): 0.369,
+    (0.80, 0.5): 1.27,
+    (0.80, 0.8): 1.59,
+}
+
+
+def test_expected_temperature_is_within_a_factor_of_two_of_other_programs() -> None:
+    flows = stack([ShearFlow(64, alpha, nu, 1e-5) for nu, alpha in TEMPERATURES])
+    expected = expected_temperature(predicted(flows).granular_temperature, flows.packing_fraction)
+    ratio = expected / np.array(list(TEMPERATURES.values()))
+    assert np.all((ratio > 0.5) & (ratio < 2))
+
+
+def test_expected_temperature_scales_with_the_square_of_the_shear_rate() -> None:
+    flow, faster = (stack([ShearFlow(64, 0.5, 0.8, 1e-5, shear_rate=rate)]) for rate in (1.0, 2.0))
+    cold, hot = (expected_temperature(predicted(f).granular_temperature, 0.8, f.shear_rate) for f in (flow, faster))
+    np.testing.assert_allclose(hot, 4 * cold, rtol=1e-6)
+
+
+@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+def test_time_steps_shorten_with_heat_with_density_and_with_the_error_asked_for(activation) -> None:
+    nu = np.linspace(0.1, 0.83, 20)
+    for steps in (longest_timestep(1.0, nu, activation), automatic_timestep(1.0, nu, activation, 1e-3)):
+        assert np.all(np.diff(steps) < 0) and steps[-1] > 0
+    np.testing.assert_allclose(longest_timestep(4.0, nu, activation), longest_timestep(1.0, nu, activation) / 2)
+    assert np.all(automatic_timestep(1.0, nu, activation, 1e-3) < automatic_timestep(1.0, nu, activation, 1e-2))
+    assert np.all(automatic_timestep(1.0, nu, activation, 0.1) <= longest_timestep(1.0, nu, activation))
+
+
+def test_touching_needs_the_shorter_time_step_for_the_same_error() -> None:
+    nu = np.linspace(0.1, 0.83, 20)
+    touching, midpoint = (automatic_timestep(1.0, nu, rule, 5e-3) for rule in ("touching", "midpoint"))
+    assert np.all(touching < midpoint)
+
+
+def test_numbers_of_jax_are_accepted() -> None:
+    assert longest_timestep(jnp.asarray([1.0]), jnp.asarray([0.5]), "midpoint").shape == (1,)
+
+
+def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_its_noise() -> None:
+    chart = json.loads((RESULTS / "runs.json").read_text())
+    for flow in chart["flows"]:
+        temperature = flow["reference"]["granular_temperature"][0]
+        for row in flow["rows"]:
+            crossing = row["timestep"] * np.sqrt(temperature)
+            if crossing > 5e-3 or row["tolerance"] > 1e-4:
+                continue
+            bound = stress_error(crossing, flow["packing_fraction"], row["activation"])
+            for name in ("pressure", "shear_stress", "granular_temperature"):
+                error, noise = row["errors"][name]
+                assert abs(error) < bound + 3 * noise + 0.01, (flow["packing_fraction"], row["timestep"], name)
+
+
+def test_stress_of_a_solve_in_the_committed_chart_is_within_half_the_target() -> None:
+    """Of flows: static packings and chains of hundreds of discs, which no flow forms, need a tighter tolerance."""
+    chart = json.loads((RESULTS / "methods.json").read_text())
+    rows = [r for r in chart["summary"] if r["group"].startswith("flow") and r["method"] == "barzilai-borwein"]
+    found = [(r["tolerance"], r["stress_error"]["worst"]) for r in rows if r["precision"] == "float64"]
+    assert found
+    for target_error in (0.1, 0.02, 1e-3, 1e-4):
+        tolerance = automatic_tolerance(target_error)
+        worst = max(error / near for near, error in found if 1e-8 <= near <= 1e-2)
+        assert worst * tolerance <= target_error / 2
+
+
+def test_default_is_on_the_committed_front_of_cost_and_error_of_the_pressure() -> None:
+    chart = json.loads((RESULTS / "runs.json").read_text())
+    for flow in chart["flows"]:
+        rows = [r for r in flow["rows"] if (r["timestep"], r["tolerance"], r["activation"]) == (1e-3, 1e-4, "midpoint")]
+        assert len(rows) == 1 and rows[0]["on_front"]["pressure"], flow["packing_fraction"]
+
+
+def test_no_accepted_flow_of_the_committed_stability_chart_overlaps_deeply() -> None:
+    cells = json.loads((RESULTS / "stability.json").read_text())["cells"]
+    accepted = [c for c in cells if c["accepted"] and c["variant"] == "default"]
+    assert len(accepted) > 100
+    assert all(c["largest_overlap"] <= DEEP_OVERLAP and c["outcome"] == "ok" for c in accepted)
