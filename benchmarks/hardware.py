@@ -1,5 +1,6 @@
-"""What a result was measured with: processor, versions and commit."""
+"""What a result was measured with: processor, versions and commit; and its file."""
 
+import json
 import os
 import platform
 import subprocess
@@ -26,3 +27,12 @@ def hardware() -> dict[str, str | int]:
         **{name: version(name) for name in packages},
         "commit": commit,
     }
+
+
+def json_with_rows(head: dict, name: str, rows: list[dict]) -> str:
+    """JSON text of a result with many rows, one to a line; what is not a number is null."""
+    lines = ",\n".join(
+        "  " + json.dumps({k: None if v != v else v for k, v in row.items()}, ensure_ascii=False, allow_nan=False)
+        for row in rows
+    )
+    return json.dumps(head, indent=1, ensure_ascii=False)[:-2] + f',\n "{name}": [\n{lines}\n ]\n}}\n'

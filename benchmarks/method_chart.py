@@ -10,7 +10,6 @@ in a compiled loop on one core, without compilation; Gauss–Seidel is a loop in
 """
 
 import argparse
-import json
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -24,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gauss_seidel import Exact, exact, gauss_seidel
-from hardware import hardware
+from hardware import hardware, json_with_rows
 from jax import lax
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -89,9 +88,8 @@ def chart(quick: bool, output: Path) -> None:
         "hardware": hardware(),
         "cap": QUICK_CAP if quick else CAP,
         "relaxation": RELAXATION,
-        "summary": summary(rows),
     }
-    (output / f"{stem}.json").write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    (output / f"{stem}.json").write_text(json_with_rows(result, "summary", summary(rows)))
     flows = [group for group in dict.fromkeys(row.group for row in rows) if group not in _CONSTRUCTED]
     solvable = [group for group in _CONSTRUCTED if group != INFEASIBLE]
     for name, groups, precision in (

@@ -14,7 +14,6 @@ energy gain is a negative dissipation, or kinetic energy beyond the shear work l
 """
 
 import argparse
-import json
 import os
 import textwrap
 from dataclasses import replace
@@ -23,7 +22,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware
+from hardware import hardware, json_with_rows
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -99,9 +98,8 @@ def chart(quick: bool, output: Path) -> list[dict]:
         "grains": GRAINS,
         "strain": STRAIN,
         "steps": [FEWEST_STEPS, MOST_STEPS],
-        "cells": [{k: None if v != v else v for k, v in one.items()} for one in cells],
     }
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+    stem.with_suffix(".json").write_text(json_with_rows(result, "cells", cells))
     draw_default(cells).savefig(stem.with_suffix(".png"), dpi=150)
     draw_variants(cells).savefig(stem.with_name(stem.name + "_variants.png"), dpi=150)
     return cells

@@ -10,7 +10,7 @@ from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
 from jaxgran.cell import displacement, remap_tilt
-from jaxgran.dynamics import advance, contact_capacities
+from jaxgran.dynamics import advance, contact_capacities, contacts_now
 from jaxgran.flow import ShearFlow
 from jaxgran.status import Status
 from jaxgran.tally import Tally
@@ -117,6 +117,17 @@ def test_change_of_a_number_compiles_nothing(run, flowing):
     ):
         run(flow_of(**change), state, 5)
     assert run.compiled.traces == before
+
+
+def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing):
+    flow = flow_of(0.75, activation="touching", timestep=5e-3)
+    state, _ = run(flow, flowing(0.75), 100)
+    network = jax.jit(contacts_now)(flow, state)
+    gaps = gaps_of(state.positions, state.grains.radii, state.side, state.tilt)
+    found = {(min(i, j), max(i, j)) for i, j in np.stack([network.i, network.j], axis=1)[np.asarray(network.used)]}
+    assert found == set(zip(*np.nonzero(gaps <= 0), strict=True)) and len(found) > 3
+    depths = state.grains.radii[network.i] + state.grains.radii[network.j] - network.distances
+    np.testing.assert_allclose(np.sort(depths[network.used]), np.sort(-gaps[gaps <= 0]), atol=64 * EPS)
 
 
 def test_contact_buffers_hold_every_planar_network():
