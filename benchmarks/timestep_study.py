@@ -2,9 +2,12 @@
 
 Six flows, both activation rules, several seeds. Each seed reaches its steady state at dt = 1e-3; from there the coarser
 time steps are sampled, then the finer ones in turn, each after a strain of 0.5 in which the contact network forgets the
-one before. The excess of the force ratio over one is fitted by R₀ − 1 + A dt^β over the finer half of the time steps.
-The error of R₀ holds the noise, by refitting data redrawn within their standard errors, and the choice of the range, as
-the spread of the fits that leave out the coarsest of them or take in one more.
+one before. Steps without an approaching contact are jumped over, so that the finest step can be paid for.
+
+As dt → 0 both rules become the same law. So the excess of the force ratio over one is fitted, over the finer time steps
+of both, by L + A dt^β with one limit L and an amplitude and an exponent for each rule. The interval of L is where χ²
+exceeds its minimum by no more than its value per degree of freedom (at least one), joined over fits that take in one
+time step less and one more.
 
     python benchmarks/timestep_study.py           # about 15 minutes on two cores
     python benchmarks/timestep_study.py --quick   # two flows down to 1e-4, under a minute
@@ -26,8 +29,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from hardware import hardware
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.optimize import curve_fit
+from matplotlib.lines import Line2D
+from scipy.optimize import minimize_scalar
 
 import jaxgran as jg
 from jaxgran.measure import estimates
@@ -36,8 +41,8 @@ from jaxgran.sweep import usable_cores
 RULES = ("midpoint", "touching")
 START = 1e-3  # time step of the steady state
 RELAXATION = 0.5
-REDRAWN = 200
-FEWEST_FITTED = 4
+FEWEST_FITTED = 5
+TRIED_LIMITS = 60
 
 advance = jax.jit(jg.advance)
 
@@ -74,22 +79,23 @@ def main() -> None:
 def study(quick: bool, output: Path) -> None:
     """Run the plan on all cores, print the extrapolations, and write ``timestep_study`` as JSON and PNG."""
     plan = QUICK if quick else FULL
-    curves = list(product(plan.packing_fraction, plan.restitution, RULES))
-    tasks = [(*curve, seed) for curve in curves for seed in range(plan.seeds)]
+    flows = list(product(plan.packing_fraction, plan.restitution))
+    tasks = [(*flow, rule, seed) for flow in flows for rule in RULES for seed in range(plan.seeds)]
     dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
     start = time.perf_counter()
     with ProcessPoolExecutor(min(usable_cores(), len(tasks)), multiprocessing.get_context("spawn")) as pool:
         done = dict(zip(dear_first, pool.map(samples, [plan] * len(tasks), dear_first), strict=True))
     results = []
-    for nu, alpha, rule in curves:
-        result = curve(plan, [done[nu, alpha, rule, seed] for seed in range(plan.seeds)])
-        results.append({"packing_fraction": nu, "restitution": alpha, "activation": rule, **result})
-        fit = "dt → 0 gives {:.4g} ± {:.2g}, exponent {:.2f}".format(*result["limit"], result["exponent"])
-        print(f"ν {nu:g}, α {alpha:g}, {rule:8s}: {fit}")
+    for nu, alpha in flows:
+        points = {rule: curve(plan, [done[nu, alpha, rule, seed] for seed in range(plan.seeds)]) for rule in RULES}
+        results.append({"packing_fraction": nu, "restitution": alpha, "points": points, **extrapolated(points)})
+        limit = "dt → 0: {best:.4g}, between {low:.4g} and {high:.4g}".format(**results[-1]["limit"])
+        exponents = ", ".join(f"{rule} {power:.2f}" for rule, power in results[-1]["exponents"].items())
+        print(f"ν {nu:g}, α {alpha:g}: {limit}; exponents: {exponents}")
     output.mkdir(parents=True, exist_ok=True)
     stem = output / ("timestep_study_quick" if quick else "timestep_study")
     head = {"hardware": hardware(), "plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    stem.with_suffix(".json").write_text(json.dumps({**head, "curves": results}, indent=1) + "\n")
+    stem.with_suffix(".json").write_text(json.dumps({**head, "flows": results}, indent=1) + "\n")
     draw(results).savefig(stem.with_suffix(".png"), dpi=150)
 
 
@@ -111,8 +117,8 @@ def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.S
     return found
 
 
-def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> dict:
-    """Force ratio of every time step with its standard error and status, and the limit of vanishing time steps."""
+def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> list[dict]:
+    """Force ratio and pressure with their standard errors, and the status, of every time step, the finest first."""
     points = []
     for timestep in sorted(plan.timesteps):
         value, error = estimates([seed[timestep] for seed in seeds])
@@ -126,67 +132,110 @@ def curve(plan: Plan, seeds: list[dict[float, jg.Sample]]) -> dict:
                 "status": jg.Status(status).name,
             }
         )
-    dt, excess, error = (
-        np.array([of(point) for point in points])
-        for of in (lambda p: p["timestep"], lambda p: p["force_ratio"] - 1, lambda p: p["stderr"])
-    )
-    count = max(FEWEST_FITTED, len(points) // 2 + 1)
-    choices = [n for n in (count - 1, count, count + 1) if FEWEST_FITTED <= n <= len(points)]
-    limits = [fitted(dt[:n], excess[:n], error[:n]) for n in choices]
-    limit, exponent = fitted(dt[:count], excess[:count], error[:count])
-    rng = np.random.default_rng(0)
-    redrawn = [fitted(dt[:count], rng.normal(excess, error)[:count], error[:count])[0] for _ in range(REDRAWN)]
-    uncertain = float(np.hypot(np.std(redrawn), np.std([value for value, _ in limits])))
-    return {"points": points, "limit": [1 + limit, uncertain], "exponent": exponent, "fitted": count}
+    return points
 
 
-def fitted(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """Excess at vanishing time step, at least 0, and exponent of the weighted least-squares fit e₀ + A dt^β."""
-    scale = dt.max()
-
-    def model(x, limit, amplitude, exponent):
-        return limit + amplitude * (x / scale) ** exponent
-
-    start = [max(excess[0], 0) / 2, max(excess[-1] - excess[0], 1e-9), 0.5]
-    ranges = ([0, 0, 0.05], [np.inf, np.inf, 2])
-    sigma = np.maximum(error, 1e-12)
-    values, _ = curve_fit(
-        model, dt, excess, start, sigma, bounds=ranges, max_nfev=20_000, x_scale=np.maximum(start, 1e-6)
-    )
-    return float(values[0]), float(values[2])
+def extrapolated(points: dict[str, list[dict]]) -> dict:
+    """Force ratio at vanishing time step with its interval, and the exponents of both rules."""
+    data = [arrays(points[rule]) for rule in RULES]
+    length = len(data[0][0])
+    usual = min(length, max(FEWEST_FITTED, 2 * length // 3))
+    tried = [n for n in (usual - 1, usual, usual + 1) if FEWEST_FITTED <= n <= length]
+    fits = {n: joint_fit([tuple(values[:n] for values in one) for one in data]) for n in tried}
+    (best, _, _), exponents = fits[usual]
+    low, high = min(limit[1] for limit, _ in fits.values()), max(limit[2] for limit, _ in fits.values())
+    limit = {"best": 1 + best, "low": 1 + low, "high": 1 + high}
+    return {"limit": limit, "exponents": dict(zip(RULES, exponents, strict=True)), "fitted": usual}
 
 
-def draw(curves: list[dict]) -> Figure:
+def arrays(points: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time steps, excess, and its error. Where hardly a cluster was seen the error is a third of that of the next
+    coarser step, as no scatter is no certainty."""
+    dt, ratio, error = (np.array([p[name] for p in points]) for name in ("timestep", "force_ratio", "stderr"))
+    for k in range(len(error) - 2, -1, -1):
+        error[k] = max(error[k], error[k + 1] / 3)
+    return dt, ratio - 1, error
+
+
+def joint_fit(data: list[tuple]) -> tuple[tuple[float, float, float], list[float]]:
+    """Limit of the excess, at least 0, with the ends of its interval, and the exponent of each curve."""
+    highest = min(excess[0] + 2 * error[0] for _, excess, error in data)
+    limits = np.linspace(0, max(highest, 1e-9), TRIED_LIMITS)
+    fits = [[power_law(dt, excess - limit, error) for dt, excess, error in data] for limit in limits]
+    chi2 = np.array([sum(fit[0] for fit in pair) for pair in fits])
+    freedom = max(1, sum(len(one[0]) for one in data) - 5)
+    inside = limits[chi2 <= chi2.min() + max(1.0, chi2.min() / freedom)]
+    best = int(np.argmin(chi2))
+    return (float(limits[best]), float(inside.min()), float(inside.max())), [float(fit[1]) for fit in fits[best]]
+
+
+def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """χ² and exponent β of the weighted least-squares fit A dt^β; A follows from β, which is searched."""
+    x = dt / dt.max()
+
+    def chi2(exponent: float) -> float:
+        shape = x**exponent / error
+        amplitude = np.sum(shape * excess / error) / np.sum(shape**2)
+        return float(np.sum((excess / error - amplitude * shape) ** 2))
+
+    found = minimize_scalar(chi2, bounds=(0.02, 2.0), method="bounded")
+    return found.fun, found.x
+
+
+LEAST = 1e-5  # smallest excess that is drawn
+
+
+def draw(flows: list[dict]) -> Figure:
     """Excess of the force ratio against the time step, a panel for every packing fraction, with the limits."""
-    fractions = sorted({c["packing_fraction"] for c in curves})
-    restitutions = sorted({c["restitution"] for c in curves})
-    figure = Figure(figsize=(1.2 + 4.2 * len(fractions), 4.6), layout="constrained")
+    fractions, restitutions = (sorted({f[name] for f in flows}) for name in ("packing_fraction", "restitution"))
+    figure = Figure(figsize=(1.4 + 4.2 * len(fractions), 4.8), layout="constrained")
     panels = figure.subplots(1, len(fractions), sharey=True, squeeze=False)[0]
     for axes, nu in zip(panels, fractions, strict=True):
-        for one in (c for c in curves if c["packing_fraction"] == nu):
-            k, touching = restitutions.index(one["restitution"]), one["activation"] == "touching"
-            color = ("#1b1b1b", "#2166ac", "#b2182b")[k % 3]
-            dt, value, error = (
-                np.array([p[name] for p in one["points"]]) for name in ("timestep", "force_ratio", "stderr")
-            )
-            style = {"color": color, "marker": "osD"[k % 3], "markersize": 4, "capsize": 2}
-            style |= {"linestyle": "--", "markerfacecolor": "white"} if touching else {"linestyle": "-"}
-            label = f"α {one['restitution']:g}, {one['activation']}"
-            axes.errorbar(dt, value - 1, np.minimum(error, 0.9 * np.abs(value - 1)), label=label, **style)
-            limit, unsure = one["limit"]
-            left = dt.min() / (2.2 if touching else 3.2)
-            low = min(unsure, 0.99 * (limit - 1))
-            axes.errorbar(left, limit - 1, [[low], [unsure]], **{**style, "linestyle": "none", "markersize": 6})
-        axes.axvline(dt.min() / 1.5, color="0.7", linewidth=0.8)
-        axes.text(0.02, 0.02, "dt → 0", transform=axes.transAxes, fontsize="small")
+        here = sorted((f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"])
+        for flow in here:
+            k = restitutions.index(flow["restitution"])
+            style = {"color": ("black", "tab:blue", "tab:red")[k % 3], "marker": "osD"[k % 3], "markersize": 4}
+            for rule, points in flow["points"].items():
+                dt, excess, error = arrays(points)
+                shown = excess > LEAST
+                lower = np.minimum(error, excess - LEAST)
+                touching = {"linestyle": "--", "markerfacecolor": "white"} if rule == "touching" else {}
+                axes.errorbar(
+                    dt[shown],
+                    excess[shown],
+                    [lower[shown], error[shown]],
+                    label=f"α {flow['restitution']:g}, {rule}",
+                    capsize=2,
+                    **{**style, "linestyle": "-", **touching},
+                )
+                bad = np.array([p["status"] != "ok" for p in points]) & shown
+                axes.plot(dt[bad], excess[bad], "x", color="0.4", markersize=9, zorder=4)
+            draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * here.index(flow)), style)
+        axes.axvline(dt.min() / 1.6, color="0.7", linewidth=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.set_ylim(LEAST / 1.6, 20)
+        axes.set_xticks([10.0**k for k in range(round(np.log10(dt.min())), -1)])
+        axes.text(dt.min() / 3, 12, "dt → 0", fontsize="small", ha="center")
         axes.set_title(f"packing fraction {nu:g}", fontsize="medium")
         axes.set_xlabel("time step dt (1/shear rate)")
     panels[0].set_ylabel("excess of the force ratio, ⟨F⟩/⟨F_bc⟩ − 1")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    handles.append(Line2D([], [], marker="x", linestyle="none", color="0.4", markersize=9))
+    figure.legend(
+        handles, [*labels, "status not ok"], loc="outside lower center", ncols=4, fontsize="small", frameon=False
+    )
     return figure
+
+
+def draw_limit(axes: Axes, limit: dict, place: float, style: dict) -> None:
+    """The interval of the limit as a bar, ending in an arrow where it reaches down to no excess; the best as a mark."""
+    low, best, high = (max(limit[name] - 1, LEAST) for name in ("low", "best", "high"))
+    axes.plot([place, place], [low, high], color=style["color"], linewidth=2.5)
+    if low <= LEAST:
+        axes.plot(place, LEAST, "v", color=style["color"], markersize=6)
+    if best > LEAST:
+        axes.plot(place, best, **{**style, "markersize": 6})
 
 
 if __name__ == "__main__":

@@ -40,10 +40,14 @@ def test_front_is_what_nothing_beats_in_cost_and_beyond_noise_in_error() -> None
     assert run_chart.staircase(rows, "pressure") == rows[:2]
 
 
-def test_extrapolation_finds_the_limit_of_a_power_law() -> None:
-    dt = 10.0 ** -(6 - 0.5 * np.arange(6))
-    for limit, exponent in ((0.0, 0.5), (0.7, 0.3), (2.0, 0.8)):
-        excess = limit + 3.0 * dt**exponent
-        found, power = timestep_study.fitted(dt, excess, 1e-4 * excess)
-        assert abs(found - limit) < 0.02 * (1 + limit)
-        assert abs(power - exponent) < 0.05
+def test_extrapolation_finds_the_limit_of_two_power_laws_within_its_interval() -> None:
+    dt, rng = 10.0 ** -(6 - 0.5 * np.arange(7)), np.random.default_rng(0)
+    for limit, exponents in ((0.0, (0.5, 1.0)), (0.7, (0.3, 0.4)), (2.0, (0.8, 0.6))):
+        exact = [limit + amplitude * dt**power for amplitude, power in zip((3.0, 5.0), exponents, strict=True)]
+        data = [(dt, rng.normal(excess, 0.01 * excess), 0.01 * excess) for excess in exact]
+        (best, low, high), powers = timestep_study.joint_fit(data)
+        width = high - low
+        assert low <= best <= high
+        assert low - width <= limit <= high + width
+        if width < 0.1 * (1 + limit):
+            np.testing.assert_allclose(powers, exponents, atol=0.15)

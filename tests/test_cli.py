@@ -245,7 +245,7 @@ def test_map_writes_a_dataset_and_two_figures(small_map) -> None:
 def test_map_prints_the_table_and_the_progress_apart(small_map) -> None:
     folder, (_, out, err) = small_map
     data = read_dataset(folder / "small.nc")
-    assert "dt = 0.01 / shear rate, midpoint activation" in " ".join(out.split())
+    assert "dt = 0.001 / shear rate, midpoint activation" in " ".join(out.split())
     for nu in (0.5, 0.6):
         (row,) = (line for line in out.splitlines() if line.split()[:1] == [str(nu)])
         for alpha in (0.5, 0.9):
