@@ -41,8 +41,8 @@ app = typer.Typer(
 
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {
-        "restitution": "0.1,0.25,0.4,0.6,0.8",
-        "packing_fraction": "0.4,0.5,0.6,0.7,0.75,0.79",
+        "restitution": "0.2,0.35,0.5,0.65,0.8",
+        "packing_fraction": "0.5,0.6,0.65,0.7,0.75,0.79",
         "grains": 256,
         "seeds": 2,
         "timestep": 1e-3,

@@ -44,6 +44,7 @@ _SHORTEST_CHUNK = 0.75  # strain
 _FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
 _SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
 _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P or ln T
+_CLUSTER_STRAIN = 1.0  # in which the clusters of a dissipative flow wander: blocks of a sample that are closer, agree
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call
@@ -124,7 +125,8 @@ def sample_batch(batch: Batch, strain: float, report: Report | None = None) -> t
     side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
     measured = Sample(tally, side**2, shear_rate, batch.flow.grains)
     by_block = _averages(tally, side[:, None] ** 2, batch.flow.grains, shear_rate[:, None])
-    correlation = np.exp(-strain / BLOCKS / _memory(batch, predicted(batch.flow)))
+    memory = np.maximum(_CLUSTER_STRAIN, _memory(batch, predicted(batch.flow)))
+    correlation = np.exp(-strain / BLOCKS / memory)
     series = np.log(np.stack([by_block["pressure"], by_block["granular_temperature"]], axis=1))
     drifting = [any(_drifts(one, rho) for one in pair) for pair, rho in zip(series, correlation, strict=True)]
     status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
