@@ -4,20 +4,13 @@ Every method solves every network of ``networks.collection`` to every tolerance,
 those of the stress moment Σ l n⊗n p and of the force ratio Σ p / Σ p_binary of the solve, against the exact solution.
 A solve that ends with a bad status is a failure; it is counted and drawn, never left out. Times are those of the solve
 in a compiled loop on one core, without compilation; Gauss–Seidel is a loop in numba.
-
-    python benchmarks/method_chart.py            # about three minutes
-    python benchmarks/method_chart.py --quick    # fewer tolerances and networks
 """
 
-import argparse
-import os
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import jax.numpy as jnp
@@ -67,15 +60,6 @@ class Row(NamedTuple):
     stress_error: float
     force_ratio_error: float
     status: int
-
-
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer tolerances and networks, smaller flows")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    chart(chosen.quick, chosen.output)
 
 
 def chart(quick: bool, output: Path) -> None:
@@ -397,7 +381,3 @@ def draw_profile(rows: list[Row]) -> Figure:
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return figure
-
-
-if __name__ == "__main__":
-    main()

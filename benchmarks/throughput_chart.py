@@ -2,19 +2,12 @@
 
 ``lax.map`` works replicas off one after another; ``vmap`` with the named axis "replica" advances them in lockstep. The
 replicas of a batch are different instants of different packings of one flow. On one core of a CPU.
-
-    python benchmarks/throughput_chart.py            # about five minutes
-    python benchmarks/throughput_chart.py --quick    # one size, fewer grains
 """
 
-import argparse
 import json
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import jax.numpy as jnp
@@ -30,15 +23,6 @@ FLOWS = ((0.5, 0.7), (0.5, 0.8))  # restitution, packing fraction
 SIZES, QUICK_SIZES = tuple(2**k for k in range(9)), (8,)
 _SEEDS, _EQUILIBRATION, _APART = 4, 2.0, 0.05  # packings; strains before the first and between two states of one
 _STEPS, _SHORTEST_TIMING = 200, 0.3  # of one call, which builds its lists anew; seconds of all calls together
-
-
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="one size, fewer grains")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    chart(chosen.quick, chosen.output)
 
 
 def chart(quick: bool, output: Path) -> None:
@@ -141,7 +125,3 @@ def draw(points: list[dict]) -> Figure:
         axes.margins(y=0.2)
         axes.legend(fontsize="small", loc="best")
     return figure
-
-
-if __name__ == "__main__":
-    main()
