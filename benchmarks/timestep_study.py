@@ -42,7 +42,7 @@ RULES = ("midpoint", "touching")
 START = 1e-3  # time step of the steady state
 RELAXATION = 0.5
 FEWEST_FITTED = 5
-TRIED_LIMITS = 60
+TRIED_LIMITS, REFINEMENTS = 30, 3
 
 advance = jax.jit(jg.advance)
 
@@ -159,14 +159,17 @@ def arrays(points: list[dict]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def joint_fit(data: list[tuple]) -> tuple[tuple[float, float, float], list[float]]:
     """Limit of the excess, at least 0, with the ends of its interval, and the exponent of each curve."""
-    highest = min(excess[0] + 2 * error[0] for _, excess, error in data)
-    limits = np.linspace(0, max(highest, 1e-9), TRIED_LIMITS)
-    fits = [[power_law(dt, excess - limit, error) for dt, excess, error in data] for limit in limits]
-    chi2 = np.array([sum(fit[0] for fit in pair) for pair in fits])
+    low, high = 0.0, max(min(excess[0] + 2 * error[0] for _, excess, error in data), 1e-9)
     freedom = max(1, sum(len(one[0]) for one in data) - 5)
-    inside = limits[chi2 <= chi2.min() + max(1.0, chi2.min() / freedom)]
+    for _ in range(REFINEMENTS):
+        limits = np.linspace(low, high, TRIED_LIMITS)
+        fits = [[power_law(dt, excess - limit, error) for dt, excess, error in data] for limit in limits]
+        chi2 = np.array([sum(fit[0] for fit in pair) for pair in fits])
+        inside = np.flatnonzero(chi2 <= chi2.min() + max(1.0, chi2.min() / freedom))
+        low, high = limits[max(inside[0] - 1, 0)], limits[min(inside[-1] + 1, TRIED_LIMITS - 1)]
     best = int(np.argmin(chi2))
-    return (float(limits[best]), float(inside.min()), float(inside.max())), [float(fit[1]) for fit in fits[best]]
+    interval = float(limits[best]), float(limits[inside[0]]), float(limits[inside[-1]])
+    return interval, [float(fit[1]) for fit in fits[best]]
 
 
 def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[float, float]:
