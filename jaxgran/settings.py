@@ -101,7 +101,7 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
         chosen["timestep"] = float(two_digits(steps[least], up=False))
         words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
     if chosen.get("tolerance") == "auto":
-        chosen["tolerance"] = automatic_tolerance(target_error)
+        chosen["tolerance"] = float(two_digits(automatic_tolerance(target_error), up=False))
         words.append(f"tolerance {chosen['tolerance']:g}")
     return chosen, f"{'; '.join(words)}: for an error of {target_error:g} in the stresses." if words else ""
 
