@@ -52,7 +52,7 @@ class MapSettings:
                 f"timestep must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)}, or grains "
                 "would overlap deeply; auto chooses one."
             )
-        longest = max(flow.timestep for flow in self.flows())
+        longest = max(self._timesteps)
         if round(self.strain / longest) < _FEWEST_STEPS:
             raise InputError(
                 f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * longest:g}, "
@@ -65,9 +65,12 @@ class MapSettings:
         steps = {"timestep": self.timestep} if isinstance(self.timestep, tuple) else {}
         return {**steps, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
 
+    @property
+    def _timesteps(self) -> tuple[float, ...]:
+        return self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
+
     def flows(self) -> list[ShearFlow]:
         """One flow a point, in the order of ``axes``; raises ValueError where a number is out of range."""
-        timesteps = self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
         return [
             ShearFlow(
                 grains=self.grains,
@@ -78,7 +81,7 @@ class MapSettings:
                 solver=self.solver,
                 activation=self.activation,
             )
-            for dt in timesteps
+            for dt in self._timesteps
             for nu in self.packing_fraction
             for alpha in self.restitution
         ]
@@ -89,14 +92,13 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
 
     Args:
       choices: keyword arguments of ``MapSettings``, in which ``timestep`` and ``tolerance`` may be "auto".
-      target_error: relative error of the stresses and the temperature to stay within.
+      target_error: relative error of pressure and shear stress to stay within.
     """
     require("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
     chosen, words = dict(choices), []
     if chosen.get("timestep") == "auto":
         flows = stack(MapSettings(**{**chosen, "timestep": _SHORT, "tolerance": 1e-4, "strain": 1.0}).flows())
-        activation = flows.activation
-        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, activation, target_error)
+        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, flows.activation, target_error)
         least = int(np.argmin(steps))
         chosen["timestep"] = float(two_digits(steps[least], up=False))
         words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")

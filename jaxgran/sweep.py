@@ -62,7 +62,7 @@ def ratio_map(
       equilibrate: strain before the sample, or None to shear until the flow is steady.
       strain: sampled strain of each seed.
       tolerance: relative residual of a contact solve, or "auto".
-      target_error: relative error of the stresses and the temperature that "auto" aims at.
+      target_error: relative error of pressure and shear stress that "auto" aims at.
       solver: projected method of the contact solve, see ``methods``.
       activation: "midpoint" or "touching".
       batch: replicas that run together, or "auto".
