@@ -1,0 +1,75 @@
+"""Snapshots are the flow itself: their forces are those of the next step, and taking them changes nothing."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.cell import displacement
+from jaxgran.flow import ShearFlow
+from jaxgran.snapshots import collided, flown, snapshot, snapshots
+
+GRAINS = pytest.GRAINS
+
+
+@pytest.fixture(scope="module")
+def flow() -> ShearFlow:
+    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-10)
+
+
+@pytest.fixture(scope="module")
+def series(flow, flowing):
+    return snapshots(flow, flowing(0.78), 0.05, 5)
+
+
+def assert_same_flow(one, other, tolerance: float) -> None:
+    """Velocities agree, and positions up to a lattice vector."""
+    apart = displacement(one.positions, other.positions, one.side, one.tilt)
+    np.testing.assert_allclose(apart, 0, atol=tolerance)
+    np.testing.assert_allclose(one.velocities, other.velocities, atol=tolerance)
+    np.testing.assert_allclose(one.tilt, other.tilt, atol=tolerance)
+
+
+def test_collision_and_flight_are_the_two_halves_of_a_step(flow, flowing, run) -> None:
+    state, loaded = flowing(0.78), 0
+    one_snapshot = jax.jit(snapshot)
+    for _ in range(40):
+        seen = one_snapshot(flow, state)
+        loaded += int(jnp.sum(seen.impulses > 0))
+        by_halves = flown(collided(seen), flow.shear_rate, flow.timestep)
+        state, _ = run(flow, state, 1)
+        assert_same_flow(by_halves, state, 1e-12)
+    assert loaded > 20  # so that there was something to compare
+
+
+def test_taking_snapshots_changes_nothing(flow, flowing, run, series) -> None:
+    end, seen = series
+    state = flowing(0.78)
+    for k in range(5):
+        state, _ = run(flow, state, 10)
+        now = jax.tree.map(lambda x, k=k: x[k], seen)
+        assert_same_flow(now.state, state, 1e-9)
+    assert_same_flow(end, state, 1e-9)
+    assert np.all(np.asarray(seen.status) == 0)
+
+
+def test_forces_push_and_add_nothing_to_the_momentum(series) -> None:
+    _, seen = series
+    assert np.all(np.asarray(seen.impulses) >= 0)
+    masses = np.asarray(seen.state.grains.masses)
+    before = np.sum(masses[..., None] * np.asarray(seen.state.velocities), axis=1)
+    after = np.sum(masses[..., None] * np.asarray(jax.vmap(collided)(seen).velocities), axis=1)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_flight_there_and_back_is_where_it_started(flow, flowing) -> None:
+    state = flowing(0.78)
+    assert_same_flow(flown(flown(state, 1.0, 0.7), 1.0, -0.7), replace(state), 1e-12)
+
+
+@pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), 1e-3])
+def test_a_strain_without_a_step_for_each_snapshot_is_refused(flow, flowing, strain: float) -> None:
+    with pytest.raises(ValueError, match="strain must be"):
+        snapshots(flow, flowing(0.78), strain, 5)
