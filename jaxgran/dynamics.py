@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
-from jaxgran.delassus import grain_impulses
+from jaxgran.delassus import grain_impulses, in_clusters
 from jaxgran.flow import ShearFlow
 from jaxgran.grains import Grains
 from jaxgran.pairs import (
@@ -308,8 +308,10 @@ def _impulses(
     features = jnp.stack(
         [jnp.ones_like(nx), nx * nx * length, nx * ny * length, ny * ny * length, loss, overlaps, slip]
     )
-    flags = jnp.stack([network.used, impulses > 0, network.used & (approach < 0)]).astype(nx.dtype)
-    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags])
+    loaded = impulses > 0
+    clustered = in_clusters(network, impulses, count) if impulses.size > 1 else jnp.zeros_like(loaded)
+    flags = jnp.stack([network.used, loaded, network.used & (approach < 0)]).astype(nx.dtype)
+    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags, jnp.where(clustered, impulses, 0)[None]])
     status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
     status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok

@@ -21,6 +21,10 @@ OBSERVABLES: dict[str, tuple[str, str]] = {
     "binary_shear_stress": ("shear stress of the contact forces if collisions were binary", STRESS_UNIT),
     "kinetic_shear_stress": ("shear stress of the peculiar motion", STRESS_UNIT),
     "granular_temperature": ("granular temperature, sum of m c^2 over 2 N", "m sigma^2 / t^2"),
+    "bagnold_pressure": ("pressure over mass of a mean grain times squared shear rate", "1"),
+    "bagnold_shear_stress": ("shear stress over mass of a mean grain times squared shear rate", "1"),
+    "cluster_pressure_share": ("share of the contact pressure in clusters of three or more grains", "1"),
+    "cluster_shear_share": ("share of the contact shear stress in clusters of three or more grains", "1"),
     "coordination_number": ("contacts per grain that carry an impulse (twice their number over the grains)", "1"),
     "network_size": ("contacts of a solved network, carrying an impulse or not", "1"),
     "macroscopic_friction": ("shear stress over pressure", "1"),
@@ -67,6 +71,7 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
     contact, binary, kinetic = (
         moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
     )
+    clustered, pushed = tally.cluster_moment, tally.contact_moment
     dt = _ratio(tally.duration, tally.steps)
     pressure = {name: (s[..., 0, 0] + s[..., 1, 1]) / 2 for name, s in _named(contact, binary, kinetic)}
     shear = {name: -s[..., 0, 1] for name, s in _named(contact, binary, kinetic)}
@@ -82,6 +87,10 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
         "shear_stress": total_shear,
         **{f"{name}_shear_stress": x for name, x in shear.items()},
         "granular_temperature": pressure["kinetic"] * area / grains,
+        "bagnold_pressure": total_pressure / shear_rate**2,
+        "bagnold_shear_stress": total_shear / shear_rate**2,
+        "cluster_pressure_share": _ratio(*(jnp.trace(x, axis1=-2, axis2=-1) for x in (clustered, pushed))),
+        "cluster_shear_share": _ratio(clustered[..., 0, 1], pushed[..., 0, 1]),
         "coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),
         "network_size": _ratio(tally.contacts, tally.solves),
         "macroscopic_friction": total_shear / total_pressure,

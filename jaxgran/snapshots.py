@@ -62,8 +62,11 @@ def snapshot(flow: ShearFlow, state: State) -> Snapshot:
         flow.solver,
         jnp.any(network.approach < 0),
     )
-    numbers = (jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution))
-    return Snapshot(state, network, (1 + flow.restitution) * solution.impulses, *numbers, solution.status)
+    timestep, shear_rate, restitution = (
+        jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
+    )
+    impulses = (1 + restitution) * solution.impulses
+    return Snapshot(state, network, impulses, timestep, shear_rate, restitution, solution.status)
 
 
 def snapshots(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:

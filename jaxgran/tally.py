@@ -30,6 +30,7 @@ class Tally:
     binary_impulse     ()       mσγ̇     (1+α) μ₁₂ max(0, −u⁻), the impulses if every collision were binary
     contact_moment     (2, 2)   mσ²γ̇    σ ⊗ p n over the contacts, σ the centre-to-centre vector
     binary_moment      (2, 2)   mσ²γ̇    the same with the binary impulses
+    cluster_moment     (2, 2)   mσ²γ̇    the contact moment of clusters of three or more grains that push at once
     kinetic_moment     (2, 2)   mσ²γ̇    ∫ Σ m c ⊗ c dt, exact along the flights
     dissipation        ()       mσ²γ̇²   energy lost in contacts, −½ Σ p (u⁻ + u⁺)
     complementarity    ()       mσ²γ̇²   ½ Σ p (u⁺ + α u⁻), zero where a solve is exact
@@ -55,6 +56,7 @@ class Tally:
     binary_impulse: Float[Array, "*b"]
     contact_moment: Float[Array, "*b 2 2"]
     binary_moment: Float[Array, "*b 2 2"]
+    cluster_moment: Float[Array, "*b 2 2"]
     kinetic_moment: Float[Array, "*b 2 2"]
     dissipation: Float[Array, "*b"]
     complementarity: Float[Array, "*b"]
@@ -95,8 +97,9 @@ class Sums(NamedTuple):
     field            shape    sum of
     ===============  =======  =====================================================================================
     flights          (5,)     time, steps, and the integrals of Σ m c_x c_x, Σ m c_x c_y, Σ m c_y c_y
-    contacts         (7, 5)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
-                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching)
+    contacts         (7, 6)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
+                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching,
+                              p in clusters)
     solves           (67,)    networks solved, iterations, unconverged solves, and the counts by residual
     largest          (2,)     (the largest) overlap of a contact and relative residual of a solve
     status           ()       (the worst) status
@@ -104,7 +107,7 @@ class Sums(NamedTuple):
     """
 
     flights: Float[Array, "5"]
-    contacts: Float[Array, "7 5"]
+    contacts: Float[Array, "7 6"]
     solves: Float[Array, "67"]
     largest: Float[Array, "2"]
     status: Int[Array, ""]
@@ -122,6 +125,7 @@ class Sums(NamedTuple):
             binary_impulse=self.contacts[0, 1],
             contact_moment=tensor(self.contacts[1:4, 0]),
             binary_moment=tensor(self.contacts[1:4, 1]),
+            cluster_moment=tensor(self.contacts[1:4, 5]),
             kinetic_moment=tensor(self.flights[2:]),
             dissipation=self.contacts[4, 0],
             complementarity=self.contacts[6, 0],
@@ -145,7 +149,7 @@ def empty_sums(dtype: jnp.dtype) -> Sums:
     """The sums of no time at all."""
     return Sums(
         flights=jnp.zeros(5, dtype),
-        contacts=jnp.zeros((7, 5), dtype),
+        contacts=jnp.zeros((7, 6), dtype),
         solves=jnp.zeros(3 + RESIDUAL_EDGES.size - 1, dtype),
         largest=jnp.zeros(2, dtype),
         status=jnp.int32(0),

@@ -13,7 +13,8 @@ DATASET_NAMES = """
     force_ratio contact_force binary_force
     pressure contact_pressure binary_pressure kinetic_pressure
     shear_stress contact_shear_stress binary_shear_stress kinetic_shear_stress
-    granular_temperature coordination_number macroscopic_friction inertial_number collision_rate iterations
+    granular_temperature bagnold_pressure bagnold_shear_stress cluster_pressure_share cluster_shear_share
+    coordination_number macroscopic_friction inertial_number collision_rate iterations
     median_residual worst_residual unconverged_share mean_overlap max_overlap
     momentum_drift energy_balance_error complementarity_power
     contact_stress binary_stress kinetic_stress stress_ratio
@@ -55,6 +56,7 @@ def tally(microscopic) -> Tally:
         binary_impulse=binary.sum(),
         contact_moment=moment("impulses"),
         binary_moment=moment("binary"),
+        cluster_moment=0.3 * moment("impulses"),
         kinetic_moment=kinetic,
         dissipation=np.float64(0.3),
         complementarity=np.float64(0.02),
@@ -111,6 +113,16 @@ def test_stresses_are_time_averages_over_the_cell(microscopic, measured) -> None
     assert measured["macroscopic_friction"] == pytest.approx(-total[0, 1] / (np.trace(total) / 2))
     assert measured["inertial_number"] == pytest.approx(SHEAR_RATE / np.sqrt(np.trace(total) / 2))
     np.testing.assert_allclose(measured["stress_ratio"], contact / binary, rtol=1e-12)
+
+
+def test_bagnold_coefficients_are_stresses_in_units_of_the_shear_rate(measured) -> None:
+    for name in ("pressure", "shear_stress"):
+        assert measured[f"bagnold_{name}"] == pytest.approx(measured[name] / SHEAR_RATE**2)
+
+
+def test_share_of_clusters_is_theirs_of_the_contact_stress(measured) -> None:
+    assert measured["cluster_pressure_share"] == pytest.approx(0.3)
+    assert measured["cluster_shear_share"] == pytest.approx(0.3)
 
 
 def test_temperature_is_kinetic_energy_over_2n(microscopic, measured) -> None:
@@ -178,6 +190,7 @@ def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
         "median_residual",
         "mean_overlap",
         "stress_ratio",
+        "cluster_pressure_share",
     ):
         assert np.isnan(found[name]).all(), name
 

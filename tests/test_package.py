@@ -15,7 +15,8 @@ SOURCES = sorted(path for path in Path(jaxgran.__file__).parent.glob("*.py") if 
 # A module imports only modules before it.
 LAYERS = """
     replica status flow grains cell neighbours pairs contacts delassus methods solver tally dynamics snapshots
-    fields structure packing observables statistics measure kinetic_theory protocol accuracy settings dataset sweep figures cli
+    fields structure packing observables statistics measure kinetic_theory protocol accuracy settings dataset
+    sweep figures cli
 """
 
 

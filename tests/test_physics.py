@@ -172,17 +172,19 @@ def test_moments_are_symmetric_and_the_stresses_compress(run, flowing):
         assert np.all(np.linalg.eigvalsh(moment) > 0)
 
 
-def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(run, flowing):
-    """Bagnold's scaling: rigid grains have no time scale but that of the shear."""
-    state, flow = flowing(0.75), flow_of(0.75, tolerance=1e-4)
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.75, 0.82])
+def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit(run, flowing, packing_fraction):
+    """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with its square."""
+    state, flow = flowing(packing_fraction), flow_of(packing_fraction, tolerance=1e-4)
     faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)
     slow, slow_tally = run(flow, state, 500)
     fast, fast_tally = run(faster, replace(state, velocities=2 * state.velocities), 500)
-    assert slow_tally.solves > 50
+    assert slow_tally.solves > (5 if packing_fraction == 0.2 else 50)
     np.testing.assert_array_equal(fast.positions, slow.positions)
     np.testing.assert_array_equal(fast.tilt, slow.tilt)
     np.testing.assert_array_equal(fast.velocities, 2 * slow.velocities)
     powers = {"impulse": 2, "binary_impulse": 2, "contact_moment": 2, "binary_moment": 2, "kinetic_moment": 2}
+    powers |= {"cluster_moment": 2}
     powers |= {"dissipation": 4, "complementarity": 4, "energy_change": 4, "duration": 0.5}
     for name, leaf in vars(slow_tally).items():
         np.testing.assert_array_equal(getattr(fast_tally, name), powers.get(name, 1) * leaf, err_msg=name)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from jaxgran.cell import displacement
 from jaxgran.flow import ShearFlow
@@ -53,6 +55,26 @@ def test_taking_snapshots_changes_nothing(flow, flowing, run, series) -> None:
         assert_same_flow(now.state, state, 1e-9)
     assert_same_flow(end, state, 1e-9)
     assert np.all(np.asarray(seen.status) == 0)
+
+
+def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flowing, run) -> None:
+    """The stress of all contacts, and of those in clusters, which the tally finds without walking through any."""
+    state, steps = flowing(0.78), 40
+    _, tally = run(flow, state, steps)
+    one_snapshot, contact, clustered = jax.jit(snapshot), np.zeros((2, 2)), np.zeros((2, 2))
+    for _ in range(steps):
+        seen = one_snapshot(flow, state)
+        loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
+        i, j = (np.asarray(x)[loaded] for x in (seen.contacts.i, seen.contacts.j))
+        normals, distances = (np.asarray(x)[loaded] for x in (seen.contacts.normals, seen.contacts.distances))
+        moments = (np.asarray(seen.impulses)[loaded] * distances)[:, None, None] * normals[:, :, None] * normals[:, None]
+        _, cluster = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(GRAINS, GRAINS)), directed=False)
+        contact += moments.sum(axis=0)
+        clustered += moments[np.bincount(cluster)[cluster[i]] >= 3].sum(axis=0)
+        state, _ = run(flow, state, 1)
+    assert 0 < np.trace(clustered) < np.trace(contact)
+    np.testing.assert_allclose(tally.contact_moment, contact, rtol=1e-9)
+    np.testing.assert_allclose(tally.cluster_moment, clustered, rtol=1e-9)
 
 
 def test_forces_push_and_add_nothing_to_the_momentum(series) -> None:
