@@ -15,13 +15,17 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.flow import InputError
+from jaxgran.kinetic_theory import gaussian_moments
 from jaxgran.measure import Sample, estimates
 from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.protocol import stack
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
 
+_THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1
 Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
+THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
 _AXES = {
     "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
@@ -49,8 +53,8 @@ def map_dataset(
       run: what else to store as attributes: command, wall time, speed.
 
     Returns:
-      Observables, their standard errors and statuses on (packing_fraction, restitution), and by seed with the dimension
-      ``seed`` behind these. Where the time step of the settings is a list, ``timestep`` is the first dimension of all.
+      Observables, their standard errors and statuses on (packing_fraction, restitution), by seed with the dimension
+      ``seed`` behind these, and what kinetic theory predicts for those in ``THEORY``. Where the time step of the settings is a list, ``timestep`` is the first dimension of all.
     """
     point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
     count, seeds = math.prod(shape), settings.seeds
@@ -81,6 +85,11 @@ def map_dataset(
         variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
         seed_dims = (*point_dims, "seed", *tensor_dims)
         variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
+    predictions = _predictions(settings)
+    for name in THEORY:
+        long_name, units = OBSERVABLES[name]
+        about = {"long_name": f"kinetic theory's prediction of the {long_name}", "units": units, "theory": _THEORY_NAME}
+        variables[f"theory_{name}"] = (point_dims, predictions[name].reshape(shape), about)
     flags = {
         "long_name": "worst status of a point",
         "flag_values": np.array([NOT_RUN, *Status], np.int8),
@@ -154,6 +163,16 @@ def read_dataset(path: Path) -> xr.Dataset:
     if missing:
         raise InputError(f"{str(path)!r} is not a ratio map: it has no {', '.join(sorted(missing))}.")
     return data
+
+
+def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
+    """Kinetic theory's steady shear at every point; NaN where it has none, as at α = 1."""
+    flows = stack(settings.flows())
+    numbers = flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity
+    theory = jax.vmap(gaussian_moments)(*numbers)
+    with np.errstate(invalid="ignore"):
+        values = {name: np.asarray(getattr(theory, name)) for name in THEORY}
+        return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
 
 
 def _umask() -> int:

@@ -7,7 +7,8 @@ import pytest
 import xarray as xr
 from synthetic import one_sentence, random_replica
 
-from jaxgran.dataset import NOT_RUN, Key, Replica, check_output, map_dataset, read_dataset, write_dataset
+from jaxgran.dataset import NOT_RUN, THEORY, Key, Replica, check_output, map_dataset, read_dataset, write_dataset
+from jaxgran.kinetic_theory import gaussian_moments
 from jaxgran.observables import OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
@@ -49,6 +50,22 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
     assert without == {"seed", "axis_a", "axis_b", "status", "status_by_seed"}
     for name, (_, units) in OBSERVABLES.items():
         assert data[name].attrs["units"] == data[f"{name}_stderr"].attrs["units"] == units
+
+
+def test_prediction_stands_beside_what_is_measured(data) -> None:
+    for name in THEORY:
+        assert data[f"theory_{name}"].dims == data[name].dims
+        assert data[f"theory_{name}"].attrs["units"] == data[name].attrs["units"]
+        for there in data[f"theory_{name}"].stack(point=data[name].dims).transpose("point"):
+            theory = gaussian_moments(float(there.restitution), float(there.packing_fraction))
+            assert float(there) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
+
+
+def test_elastic_flow_has_no_prediction() -> None:
+    """Nothing balances the shear at α = 1."""
+    data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5), {}, RUN)
+    for name in THEORY:
+        assert np.isnan(data[f"theory_{name}"].values).tolist() == [[False, True]]
 
 
 def test_values_stand_at_their_point_and_seed(data, results) -> None:

@@ -67,7 +67,8 @@ def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flow
         loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
         i, j = (np.asarray(x)[loaded] for x in (seen.contacts.i, seen.contacts.j))
         normals, distances = (np.asarray(x)[loaded] for x in (seen.contacts.normals, seen.contacts.distances))
-        moments = (np.asarray(seen.impulses)[loaded] * distances)[:, None, None] * normals[:, :, None] * normals[:, None]
+        sizes = (np.asarray(seen.impulses)[loaded] * distances)[:, None, None]
+        moments = sizes * normals[:, :, None] * normals[:, None]
         _, cluster = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(GRAINS, GRAINS)), directed=False)
         contact += moments.sum(axis=0)
         clustered += moments[np.bincount(cluster)[cluster[i]] >= 3].sum(axis=0)
