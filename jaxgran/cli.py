@@ -4,6 +4,7 @@ Exit status: 0 done; 2 a mistake in the input; 3 finished, but a point carries a
 """
 
 import hashlib
+import math
 import os
 import platform
 import shlex
@@ -28,6 +29,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 from jaxgran.flow import Activation, InputError, Solver
 
 INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
+FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
 _PLAIN_PROGRESS_SECONDS = 10
 
 _UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
@@ -109,6 +111,10 @@ def map_command(
     ] = None,
     equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
     strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
+    error: Annotated[
+        float | None,
+        typer.Option(help="Relative standard error of force ratio and stresses to reach, in place of --strain."),
+    ] = None,
     tolerance: Annotated[
         str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
     ] = None,
@@ -137,7 +143,8 @@ def map_command(
         "seeds": seeds,
         "timestep": _numbers_or_auto(timestep, "timestep"),
         "equilibrate": equilibrate,
-        "strain": strain,
+        "strain": _first_strain(strain, error),
+        "error": error,
         "tolerance": _numbers_or_auto(tolerance, "tolerance"),
         "solver": solver,
         "activation": activation,
@@ -176,7 +183,11 @@ def run_command(
     restitution: Annotated[float, typer.Option(help="Restitution, 0 to 1.")],
     packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
     grains: Annotated[int, typer.Option(help="Number of grains.")] = 256,
-    strain: Annotated[float, typer.Option(help="Sampled strain.")] = 5.0,
+    strain: Annotated[float | None, typer.Option(help="Sampled strain. [default: 5]")] = None,
+    error: Annotated[
+        float | None,
+        typer.Option(help="Relative standard error of force ratio and stresses to reach, in place of --strain."),
+    ] = None,
     timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the trajectory (not available yet).")] = None,
     movie: Annotated[Path | None, typer.Option(help="GIF of the flow (not available yet).")] = None,
@@ -195,11 +206,19 @@ def run_command(
         "grains": grains,
         "seeds": 1,
         "timestep": step,
-        "strain": strain,
+        "strain": _first_strain(strain, error) or 5.0,
+        "error": error,
     }
     data, interrupted = _measure(chosen, "auto", 1, output, quiet=False)
     _print_table(_summary_table(data))
     _finish(data, [output] if output else [], interrupted)
+
+
+def _first_strain(strain: float | None, error: float | None) -> float | None:
+    """The strain to begin with: the one given, or a short one where an error is given in its place."""
+    if strain is not None and error is not None:
+        raise InputError("strain and error exclude each other: give one of them.")
+    return strain if error is None else FIRST_STRAIN
 
 
 @app.command("info")
@@ -405,14 +424,21 @@ def _summary_table(data) -> Table:
     from jaxgran.observables import OBSERVABLES, TENSORS
 
     table = Table(box=box.SIMPLE)
-    for name in ("observable", "value ± standard error", "unit"):
+    for name in ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory"):
         table.add_column(name)
     point = data.isel(packing_fraction=0, restitution=0)
+    strain = float(point.strain_by_seed.sum())
     for name in OBSERVABLES:
         if name not in TENSORS:
             unit = OBSERVABLES[name][1]
             cell = _with_error(float(point[name]), float(point[f"{name}_stderr"]))
-            table.add_row(name.replace("_", " "), cell, "" if unit == "1" else unit)
+            correlation = (
+                float(point[f"{name}_correlation_strain"]) if f"{name}_correlation_strain" in point else math.nan
+            )
+            samples = strain / correlation
+            theory = float(point[f"theory_{name}"]) if f"theory_{name}" in point else math.nan
+            numbers = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
+            table.add_row(name.replace("_", " "), cell, "" if unit == "1" else unit, *numbers)
     return table
 
 
@@ -427,11 +453,27 @@ def _say_written(paths: Iterable[Path]) -> None:
         print(f"wrote {path}", file=sys.stderr)
 
 
+def _say_imprecise(data) -> None:
+    """Say where the error that was asked for has not been reached."""
+    from jaxgran.measure import ERROR_OBSERVABLES
+
+    if "error" not in data.attrs:
+        return
+    worst = max(float((data[f"{name}_stderr"] / abs(data[name])).max()) for name in ERROR_OBSERVABLES)
+    strain = data.strain_by_seed
+    print(
+        f"relative standard errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
+        f"{float(strain.min()):g} to {float(strain.max()):g} per seed",
+        file=sys.stderr,
+    )
+
+
 def _finish(data, written: list[Path], interrupted: bool) -> None:
     """Say what was written and what went wrong, and exit with the status that tells it."""
     started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
     written = [path for path in written if started and path.exists()]
     _say_written(written)
+    _say_imprecise(data)
     bad = _bad_points(data)
     if interrupted:
         missing = len(bad.get("not_run", []))

@@ -16,7 +16,7 @@ import xarray as xr
 
 from jaxgran.flow import InputError
 from jaxgran.kinetic_theory import gaussian_moments
-from jaxgran.measure import Sample, estimates
+from jaxgran.measure import Sample, correlation_strains, estimates
 from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.protocol import stack
 from jaxgran.settings import MapSettings
@@ -54,25 +54,34 @@ def map_dataset(
 
     Returns:
       Observables, their standard errors and statuses on (packing_fraction, restitution), by seed with the dimension
-      ``seed`` behind these, and what kinetic theory predicts for those in ``THEORY``. Where the time step of the settings is a list, ``timestep`` is the first dimension of all.
+      ``seed`` behind these, and what kinetic theory predicts for those in ``THEORY``. Beside every average stands the
+      strain that counts as one independent sample of it. Where the time step of the settings is a list, ``timestep`` is
+      the first dimension of all.
     """
     point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
     count, seeds = math.prod(shape), settings.seeds
     values = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
     errors = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
+    correlated = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
+    correlation = {name: np.full(count, np.nan) for name in correlated}
     by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
     status = np.full((count, seeds), NOT_RUN, np.int8)
-    strain = np.full((count, seeds), np.nan)
+    strain, sampled = np.full((2, count, seeds), np.nan)
     for (point, seed), replica in results.items():
         status[point, seed], strain[point, seed] = replica.status, replica.strain
+        sampled[point, seed] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
         for name, value in replica.sample.averages.items():
             by_seed[name][point, seed] = value
     for point in range(count):
         finite = [results[point, s] for s in range(seeds) if NOT_RUN < status[point, s] < Status.nonfinite]
         if finite:
-            value, error = estimates([replica.sample for replica in finite])
+            samples = [replica.sample for replica in finite]
+            value, error = estimates(samples)
             for name in OBSERVABLES:
                 values[name][point], errors[name][point] = value[name], error[name]
+            independent = correlation_strains(samples)
+            for name in correlated:
+                correlation[name][point] = independent[name]
 
     variables = {}
     for name, (long_name, units) in OBSERVABLES.items():
@@ -83,6 +92,9 @@ def map_dataset(
         spread = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
         about = {"long_name": f"{spread} of {long_name}", "units": units}
         variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
+        if name in correlation:
+            about = {"long_name": f"strain of one independent sample of {long_name}", "units": "1"}
+            variables[f"{name}_correlation_strain"] = (dims, correlation[name].reshape(shape), about)
         seed_dims = (*point_dims, "seed", *tensor_dims)
         variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
     predictions = _predictions(settings)
@@ -105,6 +117,11 @@ def map_dataset(
         (*point_dims, "seed"),
         strain.reshape(*shape, seeds),
         {"long_name": "strain sheared before the sample", "units": "1"},
+    )
+    variables["strain_by_seed"] = (
+        (*point_dims, "seed"),
+        sampled.reshape(*shape, seeds),
+        {"long_name": "sampled strain", "units": "1"},
     )
     coordinates = {
         **{name: (name, list(values), _AXES[name]) for name, values in settings.axes.items()},
@@ -194,7 +211,10 @@ def _worst(status: np.ndarray) -> np.ndarray:
 def _attributes(settings: MapSettings) -> dict[str, Any]:
     """Every parameter of the run, in types that NetCDF can hold."""
     parameters = asdict(settings)
-    equilibrate = parameters.pop("equilibrate")
+    equilibrate, error = parameters.pop("equilibrate"), parameters.pop("error")
+    if error is not None:
+        parameters["error"] = error
+        del parameters["strain"]  # every seed has its own
     flow = settings.flows()[0]
     packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numpy", "xarray")
     device = jax.devices()[0]
@@ -204,7 +224,7 @@ def _attributes(settings: MapSettings) -> dict[str, Any]:
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
         "equilibrate": "until steady" if equilibrate is None else equilibrate,
         "timestep_unit": "1 / shear rate",
-        "strain_meaning": "sampled strain of each seed",
+        "strain_meaning": "sampled strain of each seed; where an error is given, see strain_by_seed",
         "shear_rate": flow.shear_rate,
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",

@@ -1,6 +1,6 @@
 """Sample: what is measured of a flow over a strain, in blocks, so that every average has an error."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -14,10 +14,11 @@ from jaxtyping import Array, Float, Int
 from jaxgran.dynamics import State, advance
 from jaxgran.flow import InputError, ShearFlow, require, two_digits
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
-from jaxgran.statistics import Estimates, jackknife
+from jaxgran.statistics import Estimates, correlation_length, jackknife
 from jaxgran.tally import Tally
 
-BLOCKS = 16
+BLOCKS = 32
+ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # those that a relative error is asked for
 _ROUNDING_STEPS = 20  # a grain at shear velocity must move by that many roundings of a position in one step
 
 
@@ -110,15 +111,39 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
 
     Extremes are no averages: the entry of each is the largest of all blocks, and its error their standard deviation.
     """
-    first = seeds[0]
-    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
-    values, errors = jackknife(
-        partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
-    )
+    average, sums = _stacked(seeds)
+    values, errors = jackknife(average, sums)
     extremes = {name: getattr(sums, field) for name, field in EXTREME_OBSERVABLES.items()}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
     spread = {name: np.asarray(x.std()) for name, x in extremes.items()}
     return values | largest, errors | spread
+
+
+def relative_error(measured: Sample) -> float:
+    """The largest relative standard error among ``ERROR_OBSERVABLES`` of one replica; infinite where one is unknown."""
+    values, errors = estimates([measured])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        worst = max(np.nan_to_num(errors[x] / abs(values[x]), nan=np.inf) for x in ERROR_OBSERVABLES)
+    return float(worst)
+
+
+def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
+    """Strain that counts as one independent sample, for every average over some replicas of one flow that are alike.
+
+    The sampled strain of all replicas over this one is the effective sample size. A correlation shorter than a block
+    cannot be seen: the strain of a block is returned for it.
+    """
+    average, sums = _stacked(seeds)
+    lengths = correlation_length(average, sums)
+    block = np.mean(sums.duration) * np.asarray(seeds[0].shear_rate)
+    return {name: length * block for name, length in lengths.items() if name not in EXTREME_OBSERVABLES}
+
+
+def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
+    """The averages as a function of sums, and the sums (seeds, blocks, ...) of some replicas of one flow."""
+    first = seeds[0]
+    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
+    return partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
 
 
 def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = BLOCKS) -> tuple[State, Sample]:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran.dynamics import State, advance
 from jaxgran.flow import InputError, ShearFlow, two_digits
 from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
-from jaxgran.measure import BLOCKS, Sample, check_precision
+from jaxgran.measure import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.observables import averages
 from jaxgran.packing import pack
 from jaxgran.replica import AXIS
@@ -37,6 +37,7 @@ from jaxgran.tally import Tally
 COARSE_TIMESTEP = 1e-3
 SHORTENING = 10**0.5  # factor between successive time steps
 RELAXATION_STRAIN = 0.5  # at the final time step
+LONGEST_STRAIN = 256.0  # of a sample that is made longer until its errors are small
 _SHORTENING_STRAIN = 0.1  # at each time step between
 _CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
 _COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
@@ -45,6 +46,7 @@ _FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
 _SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
 _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P or ln T
 _CLUSTER_STRAIN = 1.0  # in which the clusters of a dissipative flow wander: blocks of a sample that are closer, agree
+_DRIFT_BLOCKS = 16
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call
@@ -115,18 +117,34 @@ def prepare_batch(
     return _shortened(batch, flow, report)
 
 
-def sample_batch(batch: Batch, strain: float, report: Report | None = None) -> tuple[Batch, Sample]:
-    """Sample every replica of a batch in blocks of equal strain; a drift within the sample makes it not steady."""
-    tallies = []
-    for _ in range(BLOCKS):
-        batch, tally = _chunk(batch, np.full(len(batch.status), strain / BLOCKS), report)
-        tallies.append(tally)
-    tally = jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
-    side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
-    measured = Sample(tally, side**2, shear_rate, batch.flow.grains)
-    by_block = _averages(tally, side[:, None] ** 2, batch.flow.grains, shear_rate[:, None])
+def sample_batch(
+    batch: Batch, strain: float, report: Report | None = None, error: float | None = None
+) -> tuple[Batch, Sample]:
+    """Sample every replica of a batch in blocks of equal strain; a drift within the sample makes it not steady.
+
+    Args:
+      batch: prepared replicas.
+      strain: strain to sample.
+      report: told the replica-steps done.
+      error: relative standard error of each of ``ERROR_OBSERVABLES`` until which the strain of a replica is doubled,
+        as long as it stays within ``LONGEST_STRAIN``; None to sample the strain as it is.
+    """
+    strains = np.full(len(batch.status), strain)
+    batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, report)
+    while error is not None:
+        worst = np.array([relative_error(one) for one in _split(_as_sample(batch, tally))])
+        extended = (worst > error) & (2 * strains <= LONGEST_STRAIN) & (batch.status < Status.nonfinite)
+        if not extended.any():
+            break
+        strains = np.where(extended, 2 * strains, strains)
+        batch, more = _blocks(batch, np.where(extended, strains / BLOCKS, 0), BLOCKS // 2, report)
+        tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
+    measured = _as_sample(batch, tally)
+    merged = jax.tree.map(lambda x: x.reshape(x.shape[0], _DRIFT_BLOCKS, -1, *x.shape[2:]), tally).total(axis=2)
+    area, shear_rate = (np.asarray(x)[:, None] for x in (measured.area, measured.shear_rate))
+    by_block = _averages(merged, area, batch.flow.grains, shear_rate)
     memory = np.maximum(_CLUSTER_STRAIN, _memory(batch, predicted(batch.flow)))
-    correlation = np.exp(-strain / BLOCKS / memory)
+    correlation = np.exp(-strains / _DRIFT_BLOCKS / memory)
     series = np.log(np.stack([by_block["pressure"], by_block["granular_temperature"]], axis=1))
     drifting = [any(_drifts(one, rho) for one in pair) for pair, rho in zip(series, correlation, strict=True)]
     status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
@@ -200,6 +218,34 @@ def _chunk(batch: Batch, strain: np.ndarray, report: Report | None) -> tuple[Bat
         report(float(tally.steps.sum()))
     lost = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the rest is for the sample to judge
     return batch._replace(state=state, status=np.maximum(batch.status, lost)), tally
+
+
+def _blocks(batch: Batch, strain: np.ndarray, count: int, report: Report | None) -> tuple[Batch, Tally]:
+    """Advance every replica by its own strain a number of times, and keep the tally of each, (replicas, count)."""
+    tallies = []
+    for _ in range(count):
+        batch, tally = _chunk(batch, strain, report)
+        tallies.append(tally)
+    return batch, jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
+
+
+def _doubled(tally: Tally, more: Tally) -> Tally:
+    """As many blocks of twice the strain: those of a tally joined in pairs, and half as many new ones."""
+    pairs = jax.tree.map(lambda x: x.reshape(x.shape[0], -1, 2, *x.shape[2:]), tally).total(axis=2)
+    return jax.tree.map(lambda old, new: np.concatenate([old, new], axis=1), pairs, more)
+
+
+def _where_replica(chosen: np.ndarray, new: Array, old: Array) -> np.ndarray:
+    return np.where(chosen.reshape(-1, *(1,) * (np.ndim(old) - 1)), new, old)
+
+
+def _as_sample(batch: Batch, tally: Tally) -> Sample:
+    side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
+    return Sample(tally, side**2, shear_rate, batch.flow.grains)
+
+
+def _split(measured: Sample) -> list[Sample]:
+    return [jax.tree.map(lambda x, k=k: x[k], measured) for k in range(len(measured.area))]
 
 
 def _sheared(batch: Batch, strain: np.ndarray, report: Report | None, longest: float = 1.0) -> Batch:

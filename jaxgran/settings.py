@@ -10,7 +10,7 @@ from jaxgran.accuracy import automatic_timestep, automatic_tolerance, expected_t
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver, require, two_digits
 from jaxgran.protocol import predicted, stack
 
-_FEWEST_STEPS = 160  # ten time steps in each block of a sample
+_FEWEST_STEPS = 160  # five time steps in each block of a sample
 _SHORT = 1e-6  # a time step that all flows accept
 
 
@@ -25,6 +25,7 @@ class MapSettings:
     timestep: float | tuple[float, ...] = 1e-3
     equilibrate: float | None = None
     strain: float = 10.0
+    error: float | None = None
     tolerance: float = 1e-4
     solver: Solver = "barzilai-borwein"
     activation: Activation = "midpoint"
@@ -41,6 +42,8 @@ class MapSettings:
         if isinstance(self.seeds, bool) or not isinstance(self.seeds, (int, np.integer)) or self.seeds < 1:
             raise InputError(f"seeds must be a whole number of at least 1, not {self.seeds!r}.")
         require("strain", self.strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+        if self.error is not None:
+            require("error", self.error, lambda x: (x >= 1e-3) & (x <= 0.5), "between 1e-3 and 0.5")
         if self.equilibrate is not None:
             require("equilibrate", self.equilibrate, lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0")
         flows = stack(self.flows())

@@ -1,4 +1,4 @@
-"""Standard errors of sums over blocks by the jackknife, and the drift of a series."""
+"""Standard errors of sums over blocks by the jackknife, their correlation, and the drift of a series."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-BLOCK_MERGES = (1, 2, 4, 8, 16)  # with 16 blocks a seed, the last compares whole seeds
+BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # with 32 blocks a seed, the last compares whole seeds
 _FEWEST_GROUPS = 4  # a spread over fewer says little, unless there is nothing better
 Estimates = dict[str, np.ndarray]
 
@@ -15,7 +15,7 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
     Every estimate is a function of sums (a ratio of sums, as a rule), so its error comes from leaving out one block at
-    a time. Blocks that follow each other are correlated; merged in groups of up to 16 they are less so, and the
+    a time. Blocks that follow each other are correlated; merged in groups of up to 32 they are less so, and the
     largest of the errors is taken, as far as there are four groups (the blocking method: Flyvbjerg and Petersen,
     J. Chem. Phys. 91, 461, 1989).
 
@@ -35,6 +35,26 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
         if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)
     ]
     return value, {name: np.fmax.reduce([error[name] for error in [unknown, *errors]]) for name in value}
+
+
+def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> Estimates:
+    """Number of successive blocks that count as one independent sample, for every estimate; at least one.
+
+    It is the statistical inefficiency g = 1 + 2 Σ (1 − k/B) ρ_k, with ρ_k the autocorrelation at a distance of k of the
+    B blocks of a seed, averaged over the seeds, so that n blocks are worth n/g samples. What is correlated is the
+    influence of each block on the estimate, from the jackknife. The sum ends before the first pair ρ_2k + ρ_2k+1 that
+    is not positive (C. J. Geyer, Stat. Sci. 7, 473, 1992), beyond which there is only noise. A series that is not many
+    times longer than g shows it too short: one of 32 blocks finds 3 for 4, and 4.6 for 9.
+
+    Args:
+      estimate, sums: as in ``jackknife``.
+
+    Returns:
+      Lengths in blocks, NaN with fewer than four blocks a seed.
+    """
+    seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
+    without = _leave_one_out(estimate, jax.tree.map(lambda x: _merged(x, 1), sums))
+    return {name: _inefficiency(x.reshape(seeds, blocks, *x.shape[1:])) for name, x in without.items()}
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
@@ -65,8 +85,29 @@ def _merged(x: np.ndarray, merge: int) -> np.ndarray:
 
 def _jackknife_error(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) -> Estimates:
     count = len(jax.tree.leaves(groups)[0])
-    without = _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=0) - x, groups)))
+    without = _leave_one_out(estimate, groups)
     return {name: np.sqrt((count - 1) * np.mean((x - x.mean(axis=0)) ** 2, axis=0)) for name, x in without.items()}
+
+
+def _leave_one_out(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) -> Estimates:
+    """Estimates from all groups but one, (groups, ...)."""
+    return _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=0) - x, groups)))
+
+
+def _inefficiency(series: np.ndarray) -> np.ndarray:
+    """Statistical inefficiency of series (seeds, blocks, ...), without the axes of seeds and blocks."""
+    blocks = series.shape[1]
+    if blocks < 4:
+        return np.full(series.shape[2:], np.nan)
+    away = series - series.mean(axis=(0, 1))
+    products = [np.mean(away[:, : blocks - k] * away[:, k:], axis=(0, 1)) for k in range(blocks // 2)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = np.stack(products) / products[0]
+    weighted = correlation * (1 - np.arange(len(products)) / blocks).reshape(-1, *(1,) * (series.ndim - 2))
+    pairs = weighted[: len(weighted) // 2 * 2].reshape(-1, 2, *weighted.shape[1:]).sum(axis=1)
+    counted = np.logical_and.accumulate(pairs > 0, axis=0)
+    length = 2 * np.sum(np.where(counted, pairs, 0), axis=0) - 1
+    return np.where(np.isfinite(products[0]) & (products[0] > 0), np.maximum(length, 1), np.nan)
 
 
 def _to_numpy(estimates: Mapping[str, Any]) -> Estimates:

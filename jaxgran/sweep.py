@@ -42,6 +42,7 @@ def ratio_map(
     timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
     equilibrate: float | None = None,
     strain: float = 10.0,
+    error: float | None = None,
     tolerance: float | Literal["auto"] = 1e-4,
     target_error: float = 0.02,
     solver: Solver = "barzilai-borwein",
@@ -61,6 +62,8 @@ def ratio_map(
         longest whose stresses are within the target error at every point.
       equilibrate: strain before the sample, or None to shear until the flow is steady.
       strain: sampled strain of each seed.
+      error: relative standard error of force ratio, pressure and shear stress to reach at every point: the strain of a
+        seed is doubled until its share of the error is reached, or the strain would exceed 256. None keeps the strain.
       tolerance: relative residual of a contact solve, or "auto".
       target_error: relative error of pressure and shear stress that "auto" aims at.
       solver: projected method of the contact solve, see ``methods``.
@@ -87,6 +90,7 @@ def ratio_map(
         "timestep": tuple(dt) if isinstance(dt, list) else dt,
         "equilibrate": equilibrate,
         "strain": strain,
+        "error": error,
         "tolerance": tolerance,
         "solver": solver,
         "activation": activation,
@@ -232,7 +236,8 @@ def _run_task(settings: MapSettings, task: Sequence[Key], report: Report | None 
     keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
     batch = prepare_batch(flow, keys, settings.equilibrate, report)
     prepared = batch.strain
-    batch, sample = sample_batch(batch, settings.strain, report)
+    error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
+    batch, sample = sample_batch(batch, settings.strain, report, error)
     return [
         (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(prepared[k])))
         for k, key in enumerate(task)

@@ -145,6 +145,10 @@ MISTAKES = {
     "map --tolerance 1": "tolerance must be between",
     "map --tolerance 1e-3,1e-4": "tolerance must be between",
     "map --tolerance loose": "tolerance must be a number",
+    "map --error 0": "error must be between 1e-3 and 0.5",
+    "map --error small": "--error",
+    "map --error 0.02 --strain 5": "strain and error exclude each other",
+    "run --restitution 0.5 --packing-fraction 0.6 --strain 5 --error 0.02": "strain and error exclude each other",
     "map --timestep auto --target-error 1": "target_error must be between 1e-4 and 0.1",
     "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
@@ -297,7 +301,20 @@ def test_run_prints_every_average_with_its_error_and_unit(tmp_path: Path) -> Non
         (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
         assert f"{float(data[name]):.4g} ± {float(data[f'{name}_stderr']):.2g}" in row
     (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("pressure"))
-    assert row.strip().endswith("m / t^2")
+    samples = data.strain_by_seed.sum().item() / data.pressure_correlation_strain.item()
+    assert row.split()[4:] == ["m", "/", "t^2", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
+
+
+def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
+    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --error 0.1 --output flow.nc"
+    outcome = jaxgran(tmp_path, *words.split())
+    data = read_dataset(tmp_path / "flow.nc")
+    assert data.attrs["error"] == 0.1
+    for name in ("force_ratio", "pressure", "shear_stress"):
+        assert np.all(data[f"{name}_stderr"] <= 0.1 * data[name])
+    strain = data.strain_by_seed.item()
+    assert np.log2(strain / cli.FIRST_STRAIN) == pytest.approx(round(np.log2(strain / cli.FIRST_STRAIN)), abs=1e-3)
+    assert "relative standard errors: 0.1 asked for" in outcome.err
 
 
 def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:

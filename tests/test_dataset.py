@@ -1,5 +1,6 @@
 """The dataset holds every promised name, survives the disc, and is never left half written."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from synthetic import one_sentence, random_replica
 
 from jaxgran.dataset import NOT_RUN, THEORY, Key, Replica, check_output, map_dataset, read_dataset, write_dataset
 from jaxgran.kinetic_theory import gaussian_moments
-from jaxgran.observables import OBSERVABLES, TENSORS
+from jaxgran.measure import BLOCKS
+from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
 
@@ -50,6 +52,20 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
     assert without == {"seed", "axis_a", "axis_b", "status", "status_by_seed"}
     for name, (_, units) in OBSERVABLES.items():
         assert data[name].attrs["units"] == data[f"{name}_stderr"].attrs["units"] == units
+
+
+def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
+    for name in set(OBSERVABLES) - set(TENSORS) - set(EXTREME_OBSERVABLES):
+        assert data[f"{name}_correlation_strain"].dims == data[name].dims
+    block = data.strain_by_seed.mean("seed") / BLOCKS  # made-up blocks are independent, and no less can be seen
+    lengths = (data.force_ratio_correlation_strain / block).values[0]
+    assert np.all((lengths > 0.8) & (lengths < 4))
+
+
+def test_settings_that_ask_for_an_error_store_it_in_place_of_the_strain(settings, results) -> None:
+    asked = map_dataset(replace(settings, error=0.02), results, RUN)
+    assert asked.attrs["error"] == 0.02 and "strain" not in asked.attrs
+    np.testing.assert_array_equal(asked.strain_by_seed.shape, (2, 2, SEEDS))
 
 
 def test_prediction_stands_beside_what_is_measured(data) -> None:

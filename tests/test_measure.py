@@ -20,7 +20,7 @@ from jaxgran.protocol import Batch, prepare_batch, sample_batch, stack
 from jaxgran.status import Status
 from jaxgran.tally import EXTREMES
 
-GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.32
+GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
 
 
@@ -56,8 +56,8 @@ def test_strain_is_rounded_to_whole_steps_and_shared_among_the_blocks(state, mea
     steps = np.asarray(measured[1].tally.steps)
     assert steps.shape == (BLOCKS,)
     np.testing.assert_array_equal(steps, 2)
-    uneven = np.asarray(sample(FLOWS[0], state, 0.374)[1].tally.steps)  # 37 steps
-    assert uneven.sum() == 37
+    uneven = np.asarray(sample(FLOWS[0], state, 0.753)[1].tally.steps)  # 75 steps
+    assert uneven.sum() == 75
     assert uneven.max() - uneven.min() == 1
 
 
@@ -100,7 +100,7 @@ def test_lax_map_applies_with_a_traced_strain(batch, measured) -> None:
 
 def test_a_change_of_numbers_compiles_nothing_anew(state, measured) -> None:
     compiled = _sample._cache_size()
-    sample(replace(FLOWS[0], restitution=0.6, packing_fraction=0.61, timestep=9e-3, tolerance=1e-5), state, 0.2)
+    sample(replace(FLOWS[0], restitution=0.6, packing_fraction=0.61, timestep=9e-3, tolerance=1e-5), state, 0.4)
     assert _sample._cache_size() == compiled
 
 

@@ -13,6 +13,7 @@ from synthetic import one_sentence
 
 from jaxgran import protocol
 from jaxgran.flow import InputError, ShearFlow
+from jaxgran.measure import relative_error
 from jaxgran.protocol import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch, stack
 from jaxgran.status import Status
 
@@ -217,6 +218,31 @@ def test_sample_that_drifts_is_not_steady() -> None:
     assert all(protocol._drifts(one) for one in noise + 0.5 * (np.arange(16) > 7))
     assert not any(protocol._drifts(one) for one in 0.1 * noise + 0.15 * (np.arange(16) > 7))  # too little to matter
     assert protocol._drifts(np.full(16, np.nan))
+
+
+def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch, monkeypatch) -> None:
+    """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
+    monkeypatch.setattr(protocol, "LONGEST_STRAIN", 2.56)
+    _, short = sample_batch(batch, 0.64)
+    errors = [relative_error(replica(short, k)) for k in (0, 1)]
+    target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
+    _, grown = sample_batch(batch, 0.64, error=float(target))
+    strains = np.asarray(grown.tally.duration).sum(axis=1)
+    for k in (0, 1):
+        reached = relative_error(replica(grown, k)) <= target
+        assert np.isclose(strains[k], 0.64) == (errors[k] <= target)
+        assert reached or np.isclose(strains[k], 2.56)
+        _, alone = sample_batch(jax.tree.map(lambda x, k=k: x[k : k + 1], batch), 0.64, error=float(target))
+        assert_same_bits(replica(alone, 0), replica(grown, k))
+
+
+def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -> None:
+    monkeypatch.setattr(protocol, "LONGEST_STRAIN", 0.64)
+    _, grown = sample_batch(batch, 0.32, error=1e-9)
+    _, whole = sample_batch(batch, 0.64)
+    np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)
+    for name in ("duration", "impulse", "contact_moment", "kinetic_moment", "largest_overlap"):
+        np.testing.assert_allclose(getattr(grown.tally, name), getattr(whole.tally, name), rtol=1e-6, atol=1e-12)
 
 
 def test_report_is_told_every_replica_step(batch) -> None:

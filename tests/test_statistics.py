@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxgran import statistics
-from jaxgran.statistics import drift, jackknife
+from jaxgran.statistics import correlation_length, drift, jackknife
 
 TRIALS = 400
 
@@ -45,7 +45,7 @@ def test_error_of_a_mean_is_the_textbook_one(monkeypatch: pytest.MonkeyPatch) ->
 def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # Var R = Var(x − R y) / (n ⟨y⟩²); here x − R y has the standard deviation 2, and ⟨y⟩ = 10.
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
-    rng, seeds, blocks = np.random.default_rng(1), 4, 16
+    rng, seeds, blocks = np.random.default_rng(1), 4, 32
     variances = np.array([error_of_ratio(correlated_blocks(rng, seeds, blocks)) ** 2 for _ in range(TRIALS)])
     expected = 2.0**2 / (seeds * blocks * 10.0**2)
     assert abs(variances.mean() - expected) < 4 * variances.std() / np.sqrt(TRIALS) + 0.01 * expected
@@ -110,6 +110,38 @@ def test_tensors_have_an_error_for_every_component() -> None:
     assert value["moment"].shape == error["moment"].shape == (2, 2)
     assert value["moment"][0, 1] == pytest.approx(one["moment"])
     assert error["moment"][0, 1] == pytest.approx(error_of_one["moment"])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8])
+def test_correlation_length_is_that_of_the_process(correlation: float) -> None:
+    """An AR(1) series of n values is worth n (1 − φ)/(1 + φ) samples. Long series: a short one shows less."""
+    rng, lengths = np.random.default_rng(6), []
+    for _ in range(60):
+        sums = {"over": ar1(rng, (4, 256), correlation), "under": np.ones((4, 256))}
+        lengths.append(correlation_length(ratio, sums)["ratio"])
+    expected = (1 + correlation) / (1 - correlation)
+    error = np.std(lengths) / np.sqrt(len(lengths))
+    # never below one, and what it leaves out in the end of the sum: within a tenth
+    assert abs(np.mean(lengths) - expected) < 4 * error + 0.1 * expected
+
+
+def test_errors_follow_from_correlation_lengths() -> None:
+    """The variance of a mean is that of one value over the number of independent samples."""
+    rng, means, predicted = np.random.default_rng(7), [], []
+    for _ in range(TRIALS):
+        over = ar1(rng, (2, 128), 0.7)
+        length = correlation_length(ratio, {"over": over, "under": np.ones_like(over)})["ratio"]
+        means.append(over.mean())
+        predicted.append(over.var() * length / over.size)
+    spread = np.var(means) * np.sqrt(2 / TRIALS)
+    assert abs(np.mean(predicted) - np.var(means)) < 4 * spread
+
+
+def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
+    ones = np.ones((2, 8))
+    assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
+    few = np.random.default_rng(8).normal(size=(2, 3))
+    assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])
 
 
 def test_drift_of_a_step_is_its_height() -> None:
