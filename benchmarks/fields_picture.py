@@ -1,0 +1,150 @@
+"""Picture of the coarse-grained fields of a dense flow at one instant, and the time that they take on one core.
+
+A flow of 1000 grains is prepared and its next step solved. Density, velocity fluctuation, contact pressure with the
+contacts that push, and dissipation are drawn on a grid of 128 × 128 points; the times are printed and written as JSON.
+
+    python benchmarks/fields_picture.py            # about 1½ minutes
+    python benchmarks/fields_picture.py --quick    # half a minute: 256 grains, 48 × 48 points
+"""
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hardware import hardware
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+import jaxgran as jg
+from jaxgran.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
+from jaxgran.fields import Fields, fields_at, grid
+from jaxgran.snapshots import Snapshot, snapshot
+
+RESTITUTION, PACKING_FRACTION, TIMESTEP = 0.2, 0.78, 1e-3
+WIDTH = 0.6
+KERNELS = {"gaussian": gaussian(WIDTH), "lucy": lucy(3 * WIDTH), "heaviside": heaviside(2 * WIDTH)}
+_WIDEST_LINE = 4.0  # points
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="fewer grains and points, a shorter preparation")
+    arguments.add_argument("--repeats", type=int, default=7, help="timed evaluations of each function")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    grains, count, equilibrate = (256, 48, 0.1) if chosen.quick else (1000, 128, 1.0)
+
+    flow = jg.ShearFlow(grains, RESTITUTION, PACKING_FRACTION, TIMESTEP)
+    state = jg.prepare(flow, jax.random.key(0), equilibrate=equilibrate)
+    seen = jax.jit(snapshot)(flow, state)
+    points = grid(state.side, count)
+    loaded = int(jnp.sum(seen.impulses > 0))
+    print(f"{grains} grains, {loaded} contacts that push, {count} × {count} points, one core")
+    timings = {name: timed(seen, points, graining, chosen.repeats) for name, graining in KERNELS.items()}
+    for name, found in timings.items():
+        print(f"{name:10s} compilation {found['compile_seconds']:.1f} s, then {found['seconds']:.3f} s")
+
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    stem = chosen.output / ("fields_quick" if chosen.quick else "fields")
+    result = {
+        "hardware": hardware(),
+        "precision": str(state.positions.dtype),
+        "grains": grains,
+        "alpha": RESTITUTION,
+        "nu": PACKING_FRACTION,
+        "dt": TIMESTEP,
+        "contacts": int(jnp.sum(seen.contacts.used)),
+        "loaded_contacts": loaded,
+        "points": count**2,
+        "gaussian_width": WIDTH,
+        "repeats": chosen.repeats,
+        "timings": timings,
+    }
+    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(seen, fields_at(seen, points, KERNELS["gaussian"]), count).savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def timed(seen: Snapshot, points: jax.Array, graining: CoarseGraining, repeats: int) -> dict:
+    """Seconds of compilation, median and range of the evaluations after it, and what they took of the processor."""
+    seconds, busy = [], []
+    for _ in range(repeats + 1):
+        start, start_busy = time.perf_counter(), time.process_time()
+        jax.block_until_ready(fields_at(seen, points, graining))
+        seconds.append(time.perf_counter() - start)
+        busy.append(time.process_time() - start_busy)
+    first, *later = seconds
+    median = float(np.median(later))
+    return {
+        "compile_seconds": first - median,
+        "seconds": median,
+        "range": [min(later), max(later)],
+        "processor_seconds": float(np.median(busy[1:])),
+    }
+
+
+def draw(seen: Snapshot, fields: Fields, count: int) -> Figure:
+    """Four fields in the cell; the lines join the centres of grains that push, as wide as the force is large."""
+    agitation = np.sqrt(np.trace(fields.kinetic_stress, axis1=1, axis2=2) / fields.density)
+    pressure = np.trace(fields.contact_stress, axis1=1, axis2=2) / 2
+    pale = LinearSegmentedColormap.from_list("pale", ["#ffffff", "#fdd49e", "#ef8a4c"])  # black lines stay visible
+    panels = [
+        ("density", r"$\rho$  ($m/\sigma^2$)", fields.density, "cividis", Normalize()),
+        (
+            "velocity fluctuation",
+            r"$(\mathrm{tr}\,\Sigma_k/\rho)^{1/2}$  ($\sigma\dot\gamma$)",
+            agitation,
+            "cividis",
+            Normalize(0),
+        ),
+        (
+            "contact pressure, and contacts that push",
+            r"$\mathrm{tr}\,\Sigma_s/2$  ($m\dot\gamma^2$)",
+            pressure,
+            pale,
+            PowerNorm(0.5, 0),
+        ),
+        ("dissipation", r"$\zeta$  ($m\dot\gamma^3$)", fields.dissipation, "cividis", PowerNorm(0.5, 0, clip=True)),
+    ]
+    figure = Figure(figsize=(10.6, 9.4), layout="constrained")
+    side = float(seen.state.side)
+    for axes, (title, unit, values, colours, norm) in zip(figure.subplots(2, 2).ravel(), panels, strict=True):
+        image = axes.imshow(
+            np.asarray(values).reshape(count, count), origin="lower", extent=(0, side, 0, side), cmap=colours, norm=norm
+        )
+        figure.colorbar(image, ax=axes, label=unit, shrink=0.9, ticks=MaxNLocator(5))
+        axes.set(title=title, xlabel=r"$x/\sigma$", ylabel=r"$y/\sigma$")
+        if values is pressure:
+            draw_forces(axes, seen)
+    figure.suptitle(
+        rf"$\alpha={RESTITUTION:g}$, $\nu={PACKING_FRACTION:g}$, $N={seen.state.grains.radii.size}$, "
+        rf"$\mathrm{{d}}t={TIMESTEP:g}/\dot\gamma$, Gaussian of width {WIDTH:g}$\,\sigma$"
+    )
+    return figure
+
+
+def draw_forces(axes: Axes, seen: Snapshot) -> None:
+    """Branches of the loaded contacts and their images, in widths proportional to the forces."""
+    loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
+    start = np.asarray(seen.state.positions)[np.asarray(seen.contacts.j)[loaded]]
+    branch = (np.asarray(seen.contacts.normals) * np.asarray(seen.contacts.distances)[:, None])[loaded]
+    force = np.asarray(seen.impulses)[loaded]
+    side, tilt = float(seen.state.side), float(seen.state.tilt)
+    lattice = [((a + tilt * b) * side, b * side) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    lines = [np.stack([start, start + branch], axis=1) + np.array(shift) for shift in lattice]
+    widths = np.tile(_WIDEST_LINE * force / force.max(), len(lattice))
+    axes.add_collection(LineCollection(np.concatenate(lines), linewidths=widths, colors="black"), autolim=False)
+
+
+if __name__ == "__main__":
+    main()
