@@ -22,8 +22,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxgran as jg
+from jaxgran.batch import stack
 from jaxgran.measure import estimates
-from jaxgran.protocol import prepare_batch, stack
+from jaxgran.protocol import prepare_batch
 from jaxgran.sweep import usable_cores
 
 OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "force_ratio")

@@ -27,9 +27,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from jaxgran.batch import stack
 from jaxgran.flow import InputError
 from jaxgran.observables import averages
-from jaxgran.protocol import predicted, stack
+from jaxgran.protocol import predicted
 from jaxgran.settings import MapSettings
 
 RESTITUTIONS = (0.0, 0.5, 0.9)

@@ -1,6 +1,7 @@
 """Command line: ``jaxgran map``, ``plot``, ``run`` and ``info``.
 
-Exit status: 0 done; 2 a mistake in the input; 3 finished, but a point carries a bad status; 130 interrupted.
+Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finished, but a point carries a bad status;
+130 interrupted.
 """
 
 import hashlib
@@ -10,8 +11,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
@@ -20,17 +20,16 @@ import platformdirs
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 # XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from jaxgran.flow import Activation, InputError, Solver
+from jaxgran.progress import progress
 
-INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 2, 3, 130
+NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
 FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
-_PLAIN_PROGRESS_SECONDS = 10
 
 _UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
 
@@ -129,13 +128,12 @@ def map_command(
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a cluster scheduler (not available yet).")] = None,
     output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted map (not available yet).")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
     """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
-    for name, wanted in (("--scheduler", scheduler is not None), ("--resume", resume)):
-        if wanted:
-            raise InputError(f"{name} is not available yet: run the map here, from the start.")
+    if scheduler is not None:
+        raise InputError("--scheduler is not available yet: run the map here.")
     given = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,
@@ -152,14 +150,14 @@ def map_command(
     chosen = PRESETS[preset] | {name: value for name, value in given.items() if value is not None}
     for name in ("restitution", "packing_fraction"):
         chosen[name] = number_list(chosen[name], name)
-    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error)
+    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error, resume)
 
     from jaxgran.figures import save_figures
 
     pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
     for one in _by_timestep(data):
         _print_table(_ratio_table(one))
-    _finish(data, [output, *pictures], interrupted)
+    _finish(data, [output, *pictures], interrupted, can_resume=True)
 
 
 @app.command("plot")
@@ -277,9 +275,14 @@ def _measure(
     output: Path | None,
     quiet: bool,
     target_error: float = 0.02,
+    resume: bool | None = None,
 ):
-    """Run a map with progress, write its dataset, and return it and whether it was interrupted."""
+    """Run a map with progress, write its dataset, and return it and whether it was interrupted.
+
+    Where ``resume`` is not None a checkpoint is kept beside the output, and continued if ``resume`` is True.
+    """
     jax = _configured_jax()
+    from jaxgran.checkpoint import Checkpoint
     from jaxgran.dataset import check_output, map_dataset, write_dataset
     from jaxgran.settings import MapSettings, automatic
     from jaxgran.sweep import check_batches, predicted_cost, replicas, usable_cores
@@ -289,22 +292,30 @@ def _measure(
     numbers, automatic_choice = automatic(chosen, target_error)
     settings = MapSettings(**numbers)
     if automatic_choice:
-        print(f"chosen: {automatic_choice}", file=sys.stderr)
+        _say(f"chosen: {automatic_choice}")
     on_cpu = jax.default_backend() == "cpu"
     check_batches(batch, 1 if workers is None else workers)
     count = len(settings.flows()) * settings.seeds
     workers = min(count, workers or (usable_cores() if on_cpu else 1))
     costs = [predicted_cost(flow) for flow in settings.flows()]
+    checkpoint = None if output is None or resume is None else Checkpoint(output, settings, resume)
+    results = {} if checkpoint is None else dict(checkpoint.done)
+    resumed = len(results)
+    if resume:
+        _say_resumed(checkpoint, count)
 
-    results, start, interrupted = {}, time.perf_counter(), False
-    with _progress(costs, settings.seeds, quiet) as meter:
-        running = replicas(settings, batch, workers, meter.steps)
+    start, interrupted, trouble = time.perf_counter(), False, None
+    with progress(costs, settings.seeds, quiet) as meter:
+        meter.resumed(point for point, _ in results)
+        running = replicas(settings, batch, workers, meter.steps, checkpoint, _say)
         try:
             for key, replica in running:
                 results[key] = replica
                 meter.replica(key[0])
         except KeyboardInterrupt:
             interrupted = True
+        except OSError as error:
+            trouble = error
         finally:
             running.close()
     seconds = time.perf_counter() - start
@@ -314,67 +325,33 @@ def _measure(
         "wall_time_seconds": seconds,
         "replica_steps_per_second": meter.done_steps / seconds,
         "workers": workers,
+        "resumed_replicas": resumed,
     }
-    data = map_dataset(settings, results, run)
-    if output is not None and results:
-        write_dataset(data, output)
+    data, written = map_dataset(settings, results, run), False
+    try:
+        if trouble is not None:
+            raise trouble
+        if output is not None and results:
+            write_dataset(data, output)
+        written = True
+    except OSError as error:
+        kept = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
+        _stop(f"stopped by the file system, {error.strerror or error}{kept}.", NO_FILE)
+    finally:
+        if checkpoint is not None:
+            checkpoint.close(finished=written and len(results) == count)
     return data, interrupted
 
 
-class _Meter:
-    """Counts what is done and says so on standard error: a bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, costs: list[float], seeds: int, quiet: bool):
-        self.costs, self.seeds, self.quiet = costs, seeds, quiet
-        self.left = [seeds] * len(costs)
-        self.done_steps, self.done_cost = 0.0, 0.0
-        self.start = self.last_line = time.perf_counter()
-        self.console = Console(stderr=True, quiet=quiet)
-        self.bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self.console, transient=False
-        )
-        self.task = self.bar.add_task("compiling", total=sum(costs) * seeds)
-
-    def steps(self, steps: float) -> None:
-        self.done_steps += steps
-        self._show()
-
-    def replica(self, point: int) -> None:
-        self.left[point] -= 1
-        self.done_cost += self.costs[point]
-        self._show()
-
-    def _show(self) -> None:
-        if self.console.is_terminal:
-            self.bar.update(self.task, completed=self.done_cost, description=self._line())
-        elif time.perf_counter() - self.last_line > _PLAIN_PROGRESS_SECONDS:
-            self.last_line = time.perf_counter()
-            self.console.print(self._line(), highlight=False)
-
-    def _line(self) -> str:
-        seconds = time.perf_counter() - self.start
-        points = sum(left == 0 for left in self.left)
-        share = self.done_cost / (sum(self.costs) * self.seeds)
-        left = f"{_duration(seconds / share - seconds)} left" if share > 0 else "estimating the time left"
-        return f"{points}/{len(self.costs)} points, {self.done_steps / seconds:.3g} replica-steps/s, {left}"
+def _say_resumed(checkpoint, count: int) -> None:
+    journals = len(list(checkpoint.folder.glob("journal-*.nc")))
+    _say(f"continued: {len(checkpoint.done)} of {count} replicas are done, {journals} batches are under way.")
+    if checkpoint.damaged:
+        _say(f"damaged and computed anew: {', '.join(checkpoint.damaged)}.")
 
 
-@contextmanager
-def _progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[_Meter]:
-    meter = _Meter(costs, seeds, quiet)
-    if meter.console.is_terminal and not quiet:
-        with meter.bar:
-            yield meter
-    else:
-        meter.console.print(f"0/{len(costs)} points, compiling", highlight=False)
-        yield meter
-        meter.console.print(meter._line(), highlight=False)
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds:02d}"
+def _say(sentence: str) -> None:
+    print(sentence, file=sys.stderr)
 
 
 def _with_error(value: float, error: float) -> str:
@@ -468,7 +445,7 @@ def _say_imprecise(data) -> None:
     )
 
 
-def _finish(data, written: list[Path], interrupted: bool) -> None:
+def _finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
     """Say what was written and what went wrong, and exit with the status that tells it."""
     started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
     written = [path for path in written if started and path.exists()]
@@ -478,7 +455,10 @@ def _finish(data, written: list[Path], interrupted: bool) -> None:
     if interrupted:
         missing = len(bad.get("not_run", []))
         saved = "; what is done is saved" if written else ""
-        _stop(f"interrupted with {missing} points missing{saved}. Repeat: {data.attrs['command']}", INTERRUPTED)
+        resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
+        _stop(
+            f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}", INTERRUPTED
+        )
     if bad:
         words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
         _stop(f"finished, but points marked * have a bad status. {words}.", BAD_STATUS)

@@ -14,19 +14,21 @@ import jax
 import numpy as np
 import xarray as xr
 
+from jaxgran.batch import stack
 from jaxgran.flow import InputError
 from jaxgran.kinetic_theory import gaussian_moments
 from jaxgran.measure import Sample, correlation_strains, estimates
 from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
-from jaxgran.protocol import stack
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
+from jaxgran.store import replaced
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1
 Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
+_PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
 _AXES = {
     "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
     "packing_fraction": {"long_name": "packing fraction", "units": "1"},
@@ -136,7 +138,7 @@ def check_output(path: Path) -> None:
     """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
     if path.suffix != ".nc":
         raise InputError(f"output must be a file name that ends in .nc, not {str(path)!r}.")
-    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in ("curves", "contours", "timestep"))):
+    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in _PICTURES)):
         if file.is_dir():
             raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
     if not path.parent.is_dir():
@@ -155,17 +157,9 @@ def check_output(path: Path) -> None:
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".nc")
-    os.close(handle)
-    try:
+    path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
+    with replaced(path) as temporary:
         data.to_netcdf(temporary, engine="h5netcdf")
-        with open(temporary, "rb") as written:
-            os.fsync(written.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def read_dataset(path: Path) -> xr.Dataset:
@@ -190,12 +184,6 @@ def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
     with np.errstate(invalid="ignore"):
         values = {name: np.asarray(getattr(theory, name)) for name in THEORY}
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _tail(name: str) -> tuple[int, ...]:

@@ -11,7 +11,6 @@ if both hold for both, the flow is steady. The error counts chunks as correlated
 flow says.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
@@ -20,16 +19,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.dynamics import State, advance
+from jaxgran.batch import Drive, advance_batch, replicated, stack
+from jaxgran.dynamics import State
 from jaxgran.flow import InputError, ShearFlow, two_digits
 from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
 from jaxgran.measure import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.observables import averages
 from jaxgran.packing import pack
-from jaxgran.replica import AXIS
 from jaxgran.statistics import drift
 from jaxgran.status import Status
 from jaxgran.tally import Tally
@@ -48,8 +46,6 @@ _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds bo
 _CLUSTER_STRAIN = 1.0  # in which the clusters of a dissipative flow wander: blocks of a sample that are closer, agree
 _DRIFT_BLOCKS = 16
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
-
-Report = Callable[[float], None]  # told the replica-steps done since the last call
 
 
 class Batch(NamedTuple):
@@ -85,20 +81,8 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
     return jax.tree.map(lambda x: x[0], batch.state)
 
 
-def stack(flows: list[ShearFlow]) -> ShearFlow:
-    """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
-
-    def joined(path, *values) -> Array:
-        numbers = np.stack([np.asarray(value) for value in values])
-        if path[-1].name == "max_iterations":
-            return jnp.asarray(numbers, jnp.int32)
-        return jnp.asarray(numbers, None if numbers.dtype.kind == "f" else float)
-
-    return jax.tree_util.tree_map_with_path(joined, *flows)
-
-
 def prepare_batch(
-    flow: ShearFlow, keys: Array, equilibrate: float | None = None, report: Report | None = None
+    flow: ShearFlow, keys: Array, equilibrate: float | None = None, drive: Drive = advance_batch
 ) -> Batch:
     """``prepare`` for a batch of flows: problems are statuses of single replicas, never exceptions."""
     theory = predicted(flow)
@@ -109,35 +93,35 @@ def prepare_batch(
     coarse = replace(flow, timestep=_coarse_timestep(flow, theory))
     batch = Batch(coarse, state, status, np.zeros(len(status)))
     if equilibrate is None:
-        batch = _until_steady(batch, theory, report)
+        batch = _until_steady(batch, theory, drive)
     else:
         too_short = equilibrate < _memory(batch, theory)
-        batch = _sheared(batch, np.full(len(status), equilibrate), report) if equilibrate > 0 else batch
+        batch = _sheared(batch, np.full(len(status), equilibrate), drive) if equilibrate > 0 else batch
         batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
-    return _shortened(batch, flow, report)
+    return _shortened(batch, flow, drive)
 
 
 def sample_batch(
-    batch: Batch, strain: float, report: Report | None = None, error: float | None = None
+    batch: Batch, strain: float, drive: Drive = advance_batch, error: float | None = None
 ) -> tuple[Batch, Sample]:
     """Sample every replica of a batch in blocks of equal strain; a drift within the sample makes it not steady.
 
     Args:
       batch: prepared replicas.
       strain: strain to sample.
-      report: told the replica-steps done.
+      drive: advances the batch; what it does is all that changes the state.
       error: relative standard error of each of ``ERROR_OBSERVABLES`` until which the strain of a replica is doubled,
         as long as it stays within ``LONGEST_STRAIN``; None to sample the strain as it is.
     """
     strains = np.full(len(batch.status), strain)
-    batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, report)
+    batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, drive)
     while error is not None:
         worst = np.array([relative_error(one) for one in _split(_as_sample(batch, tally))])
         extended = (worst > error) & (2 * strains <= LONGEST_STRAIN) & (batch.status < Status.nonfinite)
         if not extended.any():
             break
         strains = np.where(extended, 2 * strains, strains)
-        batch, more = _blocks(batch, np.where(extended, strains / BLOCKS, 0), BLOCKS // 2, report)
+        batch, more = _blocks(batch, np.where(extended, strains / BLOCKS, 0), BLOCKS // 2, drive)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     measured = _as_sample(batch, tally)
     merged = jax.tree.map(lambda x: x.reshape(x.shape[0], _DRIFT_BLOCKS, -1, *x.shape[2:]), tally).total(axis=2)
@@ -180,13 +164,6 @@ def _coarse_timestep(flow: ShearFlow, theory: SteadyShear) -> Array:
     return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 
-def replicated(function: Callable) -> Callable:
-    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere."""
-    if jax.default_backend() == "cpu":
-        return lambda *arguments: lax.map(lambda one: function(*one), arguments)
-    return jax.vmap(function, axis_name=AXIS)
-
-
 @jax.jit
 def _start(flow: ShearFlow, keys: Array, temperature: Array) -> tuple[State, Bool[Array, " replicas"]]:
     """Packings with Gaussian velocities of the given temperature and no total momentum."""
@@ -203,28 +180,21 @@ def _start(flow: ShearFlow, keys: Array, temperature: Array) -> tuple[State, Boo
     return replicated(one)(flow, keys, temperature)
 
 
-@jax.jit
-def _advance(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
-    return replicated(advance)(flow, state, steps)
-
-
-def _chunk(batch: Batch, strain: np.ndarray, report: Report | None) -> tuple[Batch, Tally]:
+def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain; replicas that are no longer finite stay where they are."""
     alive = batch.status < Status.nonfinite
     steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
-    state, tally = _advance(batch.flow, batch.state, jnp.asarray(np.where(alive, steps, 0), jnp.int32))
+    state, tally = drive(batch.flow, batch.state, jnp.asarray(np.where(alive, steps, 0), jnp.int32))
     tally = jax.tree.map(np.asarray, tally)
-    if report is not None:
-        report(float(tally.steps.sum()))
     lost = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the rest is for the sample to judge
     return batch._replace(state=state, status=np.maximum(batch.status, lost)), tally
 
 
-def _blocks(batch: Batch, strain: np.ndarray, count: int, report: Report | None) -> tuple[Batch, Tally]:
+def _blocks(batch: Batch, strain: np.ndarray, count: int, drive: Drive) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain a number of times, and keep the tally of each, (replicas, count)."""
     tallies = []
     for _ in range(count):
-        batch, tally = _chunk(batch, strain, report)
+        batch, tally = _chunk(batch, strain, drive)
         tallies.append(tally)
     return batch, jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
 
@@ -248,11 +218,11 @@ def _split(measured: Sample) -> list[Sample]:
     return [jax.tree.map(lambda x, k=k: x[k], measured) for k in range(len(measured.area))]
 
 
-def _sheared(batch: Batch, strain: np.ndarray, report: Report | None, longest: float = 1.0) -> Batch:
+def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, longest: float = 1.0) -> Batch:
     """Shear every replica by its own strain, in chunks short enough to report progress."""
     chunks = max(1, int(np.ceil(np.max(strain) / longest)))
     for _ in range(chunks):
-        batch, _ = _chunk(batch, strain / chunks, report)
+        batch, _ = _chunk(batch, strain / chunks, drive)
     return batch._replace(strain=batch.strain + strain)
 
 
@@ -263,7 +233,7 @@ def _memory(batch: Batch, theory: SteadyShear) -> np.ndarray:
     return np.maximum(RELAXATION_STRAIN, heating)
 
 
-def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> Batch:
+def _until_steady(batch: Batch, theory: SteadyShear, drive: Drive) -> Batch:
     """Shear in chunks until every replica is steady or has used up its chunks; steady ones wait."""
     memory = _memory(batch, theory)
     chunk = np.maximum(_SHORTEST_CHUNK, memory / 2)
@@ -275,7 +245,7 @@ def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> B
         waiting = steady | (batch.status == Status.nonfinite)
         if waiting.all():
             break
-        batch, tally = _chunk(batch, np.where(waiting, 0, chunk), report)
+        batch, tally = _chunk(batch, np.where(waiting, 0, chunk), drive)
         batch = batch._replace(strain=batch.strain + np.where(waiting, 0, chunk))
         now = _averages(tally, area, batch.flow.grains, shear_rate)
         record.append(np.log(np.stack([now["granular_temperature"], now["pressure"]])))
@@ -287,7 +257,7 @@ def _until_steady(batch: Batch, theory: SteadyShear, report: Report | None) -> B
     return batch._replace(status=np.maximum(batch.status, bad))
 
 
-def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
+def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one.
 
     Every replica goes down a ladder of its own, computed alone, whatever the others of its batch do; those that are at
@@ -299,10 +269,10 @@ def _shortened(batch: Batch, flow: ShearFlow, report: Report | None) -> Batch:
         going = np.isfinite(rungs)
         between = jnp.asarray(np.where(going, rungs, final), batch.state.side.dtype)
         batch = batch._replace(flow=replace(flow, timestep=between))
-        batch = _sheared(batch, np.where(going, _SHORTENING_STRAIN, 0.0), report)
+        batch = _sheared(batch, np.where(going, _SHORTENING_STRAIN, 0.0), drive)
     batch = batch._replace(flow=flow)
     relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
-    return _sheared(batch, relaxation, report) if relaxation.any() else batch
+    return _sheared(batch, relaxation, drive) if relaxation.any() else batch
 
 
 def _ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:

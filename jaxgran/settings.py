@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from jaxgran.accuracy import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
+from jaxgran.batch import stack
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver, require, two_digits
-from jaxgran.protocol import predicted, stack
+from jaxgran.protocol import predicted
 
 _FEWEST_STEPS = 160  # five time steps in each block of a sample
 _SHORT = 1e-6  # a time step that all flows accept

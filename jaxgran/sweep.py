@@ -7,12 +7,11 @@ of workers.
 """
 
 import math
-import multiprocessing
 import os
-import signal
-import threading
-from collections.abc import Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import warnings
+from collections.abc import Callable, Container, Generator, Sequence
+from contextlib import closing
+from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
@@ -21,10 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from jaxgran.batch import Drive, Report, advance_batch, reporting, stack
+from jaxgran.checkpoint import Checkpoint
 from jaxgran.dataset import Key, Replica, map_dataset
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver
-from jaxgran.protocol import Report, prepare_batch, sample_batch, stack
+from jaxgran.journal import Journal
+from jaxgran.pool import Died, run_tasks, send
+from jaxgran.protocol import prepare_batch, sample_batch
 from jaxgran.settings import MapSettings, automatic
+from jaxgran.store import Damaged
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
@@ -129,7 +133,12 @@ def check_batches(batch: int | Literal["auto"], workers: int) -> None:
 
 
 def replicas(
-    settings: MapSettings, batch: int | Literal["auto"] = "auto", workers: int = 1, report: Report | None = None
+    settings: MapSettings,
+    batch: int | Literal["auto"] = "auto",
+    workers: int = 1,
+    report: Report | None = None,
+    checkpoint: Checkpoint | None = None,
+    warn: Callable[[str], None] = warnings.warn,
 ) -> Generator[tuple[Key, Replica]]:
     """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
 
@@ -138,29 +147,25 @@ def replicas(
       batch: replicas that run together, or "auto": a few on a CPU, what the memory holds on an accelerator.
       workers: processes; more than one only on a CPU. They end when the iterator is closed.
       report: told the replica-steps done since the last call.
+      checkpoint: where to keep what is done; replicas that are done there are not run and not yielded again.
+      warn: told in one sentence what went wrong with a batch that is given up.
     """
-    tasks = _tasks(settings, batch, workers)
-    if workers == 1:
-        for task in tasks:
-            yield from _run_task(settings, task, report)
-        return
-    context = multiprocessing.get_context("spawn")
-    queue = context.SimpleQueue()
+    tasks = _remaining(settings, batch, workers, checkpoint)
+    calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
     configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
-    pool = ProcessPoolExecutor(min(workers, len(tasks)), context, _start_worker, (queue, *configuration))
-    ended = threading.Event()
-    listener = threading.Thread(target=_listen, args=(queue, report, ended), daemon=True)
-    listener.start()
-    try:
-        for done in as_completed([pool.submit(_run_task, settings, task) for task in tasks]):
-            yield from done.result()
-    finally:
-        processes = list(pool._processes.values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        ended.set()
-        listener.join(timeout=1)  # a worker that was ended while it reported may have left half a message
+    outcomes = (
+        ((number, _run_task(*call, report)) for number, call in enumerate(calls))
+        if workers == 1
+        else run_tasks(_run_task, calls, workers, _configure, configuration, report or (lambda _: None))
+    )
+    with closing(outcomes):
+        for number, outcome in outcomes:
+            if isinstance(outcome, Died):
+                warn(f"{outcome}: {_points(settings, tasks[number])} not measured.")
+                continue
+            if checkpoint is not None:
+                checkpoint.add(dict(outcome))
+            yield from outcome
 
 
 def usable_cores() -> int:
@@ -178,12 +183,24 @@ def predicted_cost(flow: ShearFlow) -> float:
     return (20 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
 
 
-def _tasks(settings: MapSettings, batch: int | Literal["auto"], workers: int) -> list[list[Key]]:
+def _remaining(
+    settings: MapSettings, batch: int | Literal["auto"], workers: int, checkpoint: Checkpoint | None
+) -> list[list[Key]]:
+    """The batches that are still to be run, those that are under way first."""
+    if checkpoint is None:
+        return _tasks(settings, batch, workers)
+    begun = checkpoint.journals()
+    return begun + _tasks(settings, batch, workers, {*checkpoint.done, *(key for task in begun for key in task)})
+
+
+def _tasks(
+    settings: MapSettings, batch: int | Literal["auto"], workers: int, without: Container[Key] = ()
+) -> list[list[Key]]:
     """The replicas in batches of like cost, the most expensive first."""
     costs = [predicted_cost(flow) for flow in settings.flows()]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
-    keys = [(point, seed) for point in order for seed in range(settings.seeds)]
-    size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" else batch
+    keys = [(point, seed) for point in order for seed in range(settings.seeds) if (point, seed) not in without]
+    size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" and keys else batch
     lockstep = jax.default_backend() != "cpu"
     tasks: list[list[Key]] = []
     for key in keys:
@@ -204,40 +221,47 @@ def _batch_size(grains: int, count: int, workers: int) -> int:
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory / per_replica)))
 
 
-_worker_report: Report | None = None
-
-
-def _start_worker(queue, x64: bool, cache: str | None) -> None:
-    """Set up a worker process: the precision of the parent, and Ctrl-C left to the parent.
+def _configure(x64: bool, cache: str | None) -> None:
+    """Set up a worker with the precision of its parent.
 
     XLA keeps its flags: with others, small matrix products would be summed in another order than in the parent.
     """
-    global _worker_report
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     jax.config.update("jax_enable_x64", x64)
     jax.config.update("jax_compilation_cache_dir", cache)
-    _worker_report = queue.put
 
 
-def _listen(queue, report: Report | None, ended: threading.Event) -> None:
-    """Pass on what the workers report, until they have ended."""
-    while not ended.wait(0.05):
-        while not queue.empty():
-            steps = queue.get()
-            if report is not None:
-                report(steps)
+def _points(settings: MapSettings, task: Sequence[Key]) -> str:
+    flows = settings.flows()
+    places = {(float(flows[p].restitution), float(flows[p].packing_fraction)): None for p, _ in task}
+    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g})" for alpha, nu in places)
 
 
-def _run_task(settings: MapSettings, task: Sequence[Key], report: Report | None = None) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of one batch."""
-    report = report or _worker_report
+def _run_task(
+    settings: MapSettings, task: Sequence[Key], journal: Path | None = None, report: Report | None = None
+) -> list[tuple[Key, Replica]]:
+    """Prepare and sample the replicas of one batch; one that does not fit into the memory is halved."""
+    drive = reporting(advance_batch, report or send)
+    try:
+        return _measured(settings, task, drive if journal is None else Journal(journal, task, drive))
+    except Damaged:
+        assert journal is not None
+        journal.unlink(missing_ok=True)
+        return _run_task(settings, task, journal, report)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error) or len(task) == 1:
+            raise
+        middle = len(task) // 2  # without a journal, which is that of the whole batch
+        return [done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report)]
+
+
+def _measured(settings: MapSettings, task: Sequence[Key], drive: Drive) -> list[tuple[Key, Replica]]:
     flows = settings.flows()
     flow = stack([flows[point] for point, _ in task])
     keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
-    batch = prepare_batch(flow, keys, settings.equilibrate, report)
+    batch = prepare_batch(flow, keys, settings.equilibrate, drive)
     prepared = batch.strain
     error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
-    batch, sample = sample_batch(batch, settings.strain, report, error)
+    batch, sample = sample_batch(batch, settings.strain, drive, error)
     return [
         (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(prepared[k])))
         for k, key in enumerate(task)

@@ -90,6 +90,21 @@ def empty_tally(dtype: jnp.dtype) -> Tally:
     return empty_sums(dtype).tally(zero, zero)
 
 
+def flat_tally(tally: Tally, shape: tuple[int, ...]) -> np.ndarray:
+    """All numbers of a tally with leading axes of the given shape, (*shape, numbers) in double precision."""
+    leaves = [np.asarray(leaf, np.float64).reshape(*shape, -1) for leaf in jax.tree.leaves(tally)]
+    return np.concatenate(leaves, axis=-1)
+
+
+def tally_from_flat(numbers: np.ndarray, dtype: jnp.dtype) -> Tally:
+    """The tally whose numbers ``flat_tally`` has put together, bit for bit."""
+    leaves, structure = jax.tree.flatten(empty_tally(dtype))
+    edges = np.cumsum([leaf.size for leaf in leaves])[:-1]
+    parts = zip(np.split(numbers, edges, axis=-1), leaves, strict=True)
+    shape = numbers.shape[:-1]
+    return jax.tree.unflatten(structure, [x.reshape(*shape, *leaf.shape).astype(leaf.dtype) for x, leaf in parts])
+
+
 class Sums(NamedTuple):
     """A tally in the making.
 

@@ -14,9 +14,10 @@ from jaxgran.accuracy import (
     longest_timestep,
     stress_error,
 )
+from jaxgran.batch import stack
 from jaxgran.dynamics import DEEP_OVERLAP
 from jaxgran.flow import ShearFlow
-from jaxgran.protocol import predicted, stack
+from jaxgran.protocol import predicted
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 # (packing fraction, restitution): temperature of event-driven hard discs, and of soft ones in the stiff limit

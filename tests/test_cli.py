@@ -26,6 +26,7 @@ SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
 
 
@@ -62,11 +63,14 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
 def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
     """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
 
-    def replicas(settings, batch, workers, report) -> Iterator:
+    def replicas(settings, batch, workers, report, checkpoint, warn) -> Iterator:
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
             report(100.0)
-            yield key, random_replica(rng, settings, status)
+            replica = random_replica(rng, settings, status)
+            if checkpoint is not None:
+                checkpoint.add({key: replica})
+            yield key, replica
         if end is not None:
             raise end
 
@@ -161,7 +165,6 @@ MISTAKES = {
     "map --output none/map.nc": "a folder that exists",
     "map --output folder.nc": "is a folder",
     "map --output picture.nc": "picture_timestep.png' is a folder",
-    "map --resume": "--resume is not available yet",
     "map --scheduler tcp://localhost": "--scheduler is not available yet",
     "map --wrong": "--wrong",
     "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
@@ -232,10 +235,10 @@ def small_map(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     return folder, jaxgran(folder, *SMALL_MAP.split())
 
 
-def test_map_writes_a_dataset_and_two_figures(small_map) -> None:
+def test_map_writes_a_dataset_and_its_figures(small_map) -> None:
     folder, _ = small_map
-    assert files(folder) == {"small.nc", "small_curves.png", "small_contours.png"}
-    for name in ("small_curves.png", "small_contours.png"):
+    assert files(folder) == {"small.nc", *PICTURES}
+    for name in PICTURES:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
     data = read_dataset(folder / "small.nc")
     np.testing.assert_array_equal(data.restitution, [0.5, 0.9])
@@ -257,7 +260,7 @@ def test_map_prints_the_table_and_the_progress_apart(small_map) -> None:
             assert f"{float(value):.4g} ±" in row
     assert "points" not in out
     assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
-    for name in ("small.nc", "small_curves.png", "small_contours.png"):
+    for name in ("small.nc", *PICTURES):
         assert f"wrote {name}" in err
 
 
@@ -278,7 +281,7 @@ def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path) -> None:
     folder, _ = small_map
     outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
     assert (outcome.status, outcome.out) == (0, "")
-    assert files(tmp_path) == {"small_curves.png", "small_contours.png"}
+    assert files(tmp_path) == PICTURES
     for name in files(tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes()
 
@@ -362,7 +365,7 @@ def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_
     assert outcome.status == 3
     assert "deep overlap: (restitution 0.9, packing fraction 0.6, time step 0.0001)." in outcome.err
     assert "6/6 points" in outcome.err
-    assert files(tmp_path) == {"jaxgran_map.nc", "jaxgran_map_curves.png", "jaxgran_map_timestep.png"}
+    assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", "_curves.png", "_timestep.png", "_clusters.png")}
     assert "wrote jaxgran_map_timestep.png" in outcome.err
     data = read_dataset(tmp_path / "jaxgran_map.nc")
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
@@ -390,13 +393,13 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130
-    assert files(tmp_path) == {"half.nc"}
+    assert files(tmp_path) == {"half.nc", "half.nc.unfinished"}
     data = read_dataset(tmp_path / "half.nc")
     np.testing.assert_array_equal(data.status, [[NOT_RUN, Status.ok]])
     assert np.isnan(data.force_ratio[0, 0]) and np.isfinite(data.force_ratio[0, 1])
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
     assert "1 points missing; what is done is saved" in outcome.err
-    assert outcome.err.rstrip().endswith(command)
+    assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
 def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
@@ -407,4 +410,5 @@ def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc")
     assert outcome.status == 130
     assert (tmp_path / "old.nc").read_bytes() == b"old"
+    assert files(tmp_path) == {"old.nc"}
     assert "saved" not in outcome.err and "wrote" not in outcome.err

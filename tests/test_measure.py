@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from synthetic import one_sentence, random_tally
 
-from jaxgran import protocol
+from jaxgran.batch import advance_batch, stack
 from jaxgran.dynamics import State
 from jaxgran.flow import InputError, ShearFlow
 from jaxgran.measure import BLOCKS, Sample, _sample, check_precision, sample
 from jaxgran.observables import OBSERVABLES
-from jaxgran.protocol import Batch, prepare_batch, sample_batch, stack
+from jaxgran.protocol import Batch, prepare_batch, sample_batch
 from jaxgran.status import Status
 from jaxgran.tally import EXTREMES
 
@@ -63,7 +63,7 @@ def test_strain_is_rounded_to_whole_steps_and_shared_among_the_blocks(state, mea
 
 def test_blocks_add_up_to_the_whole(batch, measured) -> None:
     steps = jnp.asarray([round(STRAIN / TIMESTEP)] * 2, jnp.int32)
-    end, whole = protocol._advance(batch.flow, batch.state, steps)
+    end, whole = advance_batch(batch.flow, batch.state, steps)
     tally, whole = measured[1].tally, replica(whole, 0)
     for name in vars(tally):
         if name not in (*EXTREMES, "residual_counts"):

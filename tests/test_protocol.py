@@ -12,9 +12,10 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran import protocol
+from jaxgran.batch import advance_batch, reporting, stack
 from jaxgran.flow import InputError, ShearFlow
 from jaxgran.measure import relative_error
-from jaxgran.protocol import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch, stack
+from jaxgran.protocol import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch
 from jaxgran.status import Status
 
 GRAINS, TIMESTEP = 64, 1e-2
@@ -98,7 +99,7 @@ def test_noise_that_hides_any_drift_is_refused() -> None:
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
-    def chunk(batch: Batch, strain: np.ndarray, report):
+    def chunk(batch: Batch, strain: np.ndarray, drive):
         sheared.append(strain)
         return batch, None
 
@@ -129,7 +130,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
 def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     record = []
 
-    def sheared(batch: Batch, strain: np.ndarray, report):
+    def sheared(batch: Batch, strain: np.ndarray, drive):
         record.append((np.asarray(batch.flow.timestep), strain))
         return batch
 
@@ -247,5 +248,5 @@ def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -
 
 def test_report_is_told_every_replica_step(batch) -> None:
     told = []
-    sample_batch(batch, 1.6, told.append)
+    sample_batch(batch, 1.6, reporting(advance_batch, told.append))
     assert sum(told) == 2 * round(1.6 / TIMESTEP)

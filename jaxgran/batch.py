@@ -1,0 +1,59 @@
+"""Batches of replicas: flows stacked into one, and what advances them together.
+
+A batch carries a leading (replicas,) axis on everything. All that changes its states is a ``Drive``; what is wrapped
+around the plain one tells of its progress or keeps a journal.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from jaxgran.dynamics import State, advance
+from jaxgran.flow import ShearFlow
+from jaxgran.replica import AXIS
+from jaxgran.tally import Tally
+
+Report = Callable[[float], None]  # told the replica-steps done since the last call
+Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances a batch, each replica by its own steps
+
+
+def stack(flows: list[ShearFlow]) -> ShearFlow:
+    """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
+
+    def joined(path, *values) -> Array:
+        numbers = np.stack([np.asarray(value) for value in values])
+        if path[-1].name == "max_iterations":
+            return jnp.asarray(numbers, jnp.int32)
+        return jnp.asarray(numbers, None if numbers.dtype.kind == "f" else float)
+
+    return jax.tree_util.tree_map_with_path(joined, *flows)
+
+
+def replicated(function: Callable) -> Callable:
+    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere."""
+    if jax.default_backend() == "cpu":
+        return lambda *arguments: lax.map(lambda one: function(*one), arguments)
+    return jax.vmap(function, axis_name=AXIS)
+
+
+@jax.jit
+def advance_batch(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
+    """Advance every replica of a batch by its own number of steps: the plain ``Drive`` of the protocol."""
+    return replicated(advance)(flow, state, steps)
+
+
+def reporting(drive: Drive, report: Report | None) -> Drive:
+    """A drive that tells how many replica-steps it has done."""
+    if report is None:
+        return drive
+
+    def driven(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+        state, tally = drive(flow, state, steps)
+        report(float(np.sum(tally.steps)))
+        return state, tally
+
+    return driven

@@ -1,0 +1,408 @@
+"""Errors of the theory, shares of the clusters and laws of dense flow are drawn as numbers at their places."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.colors import same_color
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from test_figures import caption, excess_of, legend_texts, ratio_dataset, with_timesteps
+from test_rheology import dense_map
+
+from jaxgran.contours import EXCESS_LEVELS
+from jaxgran.figures import save_figures
+from jaxgran.rheology import friction_law
+from jaxgran.rheology_figures import friction_figure, parameters_text
+from jaxgran.theory_figures import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
+
+DIMS = ("packing_fraction", "restitution")
+STDERR = 0.02  # of every stress, relative
+
+
+def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the synthetic ln(binary/measured), linear in x = 1 − α and ν."""
+    return -0.5 * x - 0.8 * (nu - 0.3)
+
+
+def closure_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the synthetic ln(theory/binary), of both signs."""
+    return 1.5 * (x - 0.5) + 0.6 * (nu - 0.547)
+
+
+def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    return 0.08 + 0.6 * x + 0.6 * (nu - 0.4)
+
+
+def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
+    """Return a synthetic map with stresses, what a theory predicts of them, and shares of clusters."""
+    data = ratio_dataset(alphas, nus)
+    x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
+    added = {}
+    for scale, name in ((3.0, "pressure"), (1.0, "shear_stress")):
+        measured = scale * np.exp(2.0 * nu) * np.ones_like(x)
+        binary = measured * np.exp(assumption_of(x, nu))
+        parts = {name: measured, f"kinetic_{name}": 0.3 * measured, f"binary_{name}": binary - 0.3 * measured}
+        added |= {key: (DIMS, value) for key, value in parts.items()}
+        added |= {f"{key}_stderr": (DIMS, STDERR * value) for key, value in parts.items()}
+        added[f"theory_{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
+    ratio = np.ones((*data.force_ratio.shape, 2, 2))
+    added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
+    added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
+    for name in ("cluster_pressure_share", "cluster_shear_share"):
+        added |= {name: (DIMS, share_of(x, nu)), f"{name}_stderr": (DIMS, np.full((nus, alphas), 0.03))}
+    return data.assign(added)
+
+
+def contours(axes: Axes, colour: str) -> dict[float, QuadContourSet]:
+    """Return the contour lines of a colour, by their level."""
+    sets = [artist for artist in axes.collections if isinstance(artist, QuadContourSet) and not artist.filled]
+    return {float(s.levels[0]): s for s in sets if same_color(s.get_edgecolor()[0][:3], colour)}
+
+
+def panel(figure: Figure, name: str) -> Axes:
+    """Return the axes of the shares of pressure "p" or shear stress "s", or those of the map "m"."""
+    return {axes.get_label(): axes for axes in figure.axes}[name]
+
+
+def vertices(line: QuadContourSet) -> tuple[np.ndarray, np.ndarray]:
+    x, nu = line.get_paths()[0].vertices.T
+    return x, nu
+
+
+def noise(axes: Axes) -> list[np.ndarray]:
+    """Return the vertices of the dotted areas."""
+    sets = [artist for artist in axes.collections if isinstance(artist, QuadContourSet) and artist.filled]
+    return [np.concatenate([p.vertices for p in s.get_paths()]) for s in sets if s.hatches == ["...."]]
+
+
+def rings(axes: Axes) -> np.ndarray:
+    marks = [line.get_xydata() for line in axes.lines if line.get_markersize() > 8]
+    return np.concatenate([np.empty((0, 2)), *marks])
+
+
+def assert_nothing_overlaps(figure: Figure) -> None:
+    """Fail where axes, legends and caption overlap or leave the page, or labels of contours overlap."""
+    figure.canvas.draw()
+    boxes = [axes.get_tightbbox() for axes in figure.axes] + [figure._supxlabel.get_window_extent()]
+    boxes += [legend.get_window_extent() for legend in figure.legends]
+    for k, box in enumerate(boxes):
+        assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
+        assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
+    for axes in figure.axes:
+        places = [
+            (text.get_window_extent().get_points().mean(axis=0), text.get_fontsize() * figure.dpi / 72.0)
+            for artist in axes.collections
+            if isinstance(artist, QuadContourSet)
+            for text in getattr(artist, "labelTexts", [])
+        ]
+        for k, (place, size) in enumerate(places):
+            assert all(np.linalg.norm(place - other) > 2.5 * size for other, _ in places[:k])
+
+
+# ---------------------------------------------------------------------------------------------- theory
+
+
+@pytest.mark.parametrize("quantity", ["pressure", "shear_stress"])
+def test_error_is_that_of_the_assumption_plus_that_of_the_closure(quantity: str) -> None:
+    data = theory_dataset()
+    parts = {name: value for name, (value, _) in error_parts(data, quantity).items()}
+    x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
+    np.testing.assert_allclose(parts["total"], parts["assumption"] + parts["closure"], atol=1e-14)
+    np.testing.assert_allclose(parts["assumption"], assumption_of(x, nu), atol=1e-14)
+    np.testing.assert_allclose(parts["closure"], closure_of(x, nu), atol=1e-14)
+
+
+def test_standard_error_of_the_assumption_is_that_of_the_stress_ratio() -> None:
+    data = theory_dataset()
+    data["stress_ratio"][..., 0, 1] = -2.0  # the other component, and its sign, do not matter
+    value, error = error_parts(data, "pressure")["assumption"]
+    contact = data.pressure - data.kinetic_pressure
+    changed = data.assign(binary_pressure=contact / (contact / data.binary_pressure * (1.0 + 1e-4)))
+    slope = (error_parts(changed, "pressure")["assumption"][0] - value) / 1e-4
+    np.testing.assert_allclose(error, np.abs(slope) * STDERR, rtol=1e-3)
+    _, shear_error = error_parts(data, "shear_stress")["assumption"]
+    np.testing.assert_allclose(shear_error, error / 2.0)
+
+
+def test_errors_lie_on_their_isolines_with_their_labels() -> None:
+    grid = np.reshape(theory_errors(theory_dataset()).axes, (2, 3))
+    laws = (lambda x, nu: assumption_of(x, nu) + closure_of(x, nu)), assumption_of, closure_of
+    texts = {value: label for label, value in ERROR_LEVELS.items()}
+    labelled = 0
+    for row in grid:
+        for axes, law in zip(row, laws, strict=True):
+            lines = contours(axes, "black")
+            corners = law(*np.meshgrid([0.1, 0.9], [0.3, 0.8]))
+            reached = {level for level in texts if corners.min() < level < corners.max()}
+            assert set(lines) == reached and len(reached) >= 4
+            for level, line in lines.items():
+                np.testing.assert_allclose(law(*vertices(line)), level, atol=1e-9)
+                dashed = line.get_linestyle()[0][1] is not None
+                assert dashed == (level < 0.0)
+                assert [t.get_text() for t in line.labelTexts] in ([], [texts[level]])
+                labelled += len(line.labelTexts)
+    assert labelled >= 24
+
+
+def test_percentages_and_factors_name_quotients() -> None:
+    for label, level in ERROR_LEVELS.items():
+        number = float(label.strip("÷×%−+ \u2009"))
+        quotient = {"÷": 1.0 / number, "×": number, "−": 1.0 - number / 100.0, "+": 1.0 + number / 100.0}[label[0]]
+        assert np.exp(level) == pytest.approx(quotient)
+    assert list(ERROR_LEVELS.values()) == sorted(ERROR_LEVELS.values())
+
+
+def test_contours_of_the_excess_lie_on_top_of_every_panel() -> None:
+    figure = theory_errors(theory_dataset(10, 12))
+    for axes in figure.axes:
+        lines = list(contours(axes, "#00803c").values())
+        widths = [line.get_linewidth()[0] for line in lines]
+        assert len(lines) == len(EXCESS_LEVELS) and widths == sorted(set(widths))
+        for level, line in zip(EXCESS_LEVELS, lines, strict=True):
+            x, nu = vertices(line)
+            np.testing.assert_allclose(excess_of(1.0 - x, nu), level, rtol=0.15)
+    assert [text for text in legend_texts(figure) if text[-4:].replace(".", "").isdigit()] == [
+        "excess 0.05",
+        "0.10",
+        "0.25",
+        "0.50",
+        "1.00",
+    ]
+
+
+def test_error_within_its_noise_is_dotted() -> None:
+    data = theory_dataset()
+    figure = theory_errors(data)
+    (dotted,) = noise(figure.axes[2])
+    error = np.abs(closure_of(*dotted.T))
+    assert error.max() == pytest.approx(STDERR)  # kinetic and binary stress vary together
+    assert "within ± std. error" in legend_texts(figure)
+    exact = data.assign({name: 0.0 * data[name] for name in data if str(name).endswith("_stderr")})
+    figure = theory_errors(exact)
+    assert not any(noise(axes) for axes in figure.axes)
+    assert "within ± std. error" not in legend_texts(figure)
+
+
+def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> None:
+    data = theory_dataset()
+    elastic = data.restitution == data.restitution[-1]
+    data = data.assign({name: data[name].where(~elastic) for name in ("theory_pressure", "theory_shear_stress")})
+    figure = theory_errors(data)
+    edge = 1.0 - data.restitution.values[-2]
+    for axes, bounded in zip(figure.axes, [True, False, True] * 2, strict=True):
+        least = min(vertices(line)[0].min() for line in contours(axes, "black").values())
+        assert (least >= edge - 1e-9) == bounded
+    assert "6 of 30 points without a value (hatched)" in caption(figure)
+    assert "no value" in legend_texts(figure)
+
+
+def test_caption_names_the_run_and_the_theory() -> None:
+    text = caption(theory_errors(theory_dataset()))
+    for words in ("N=256", "2 seeds", r"3\times 10^{-4}", "midpoint activation", "Gaussian", "Enskog"):
+        assert words in text
+
+
+@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+def test_bad_status_is_ringed_in_every_plane(draw) -> None:
+    data = theory_dataset()
+    data.status[2, 3] = 2
+    figure = draw(data)
+    planes = figure.axes if draw is theory_errors else [panel(figure, "m")]
+    for axes in planes:
+        np.testing.assert_allclose(rings(axes), [[1.0 - data.restitution[3], data.packing_fraction[2]]])
+    assert "status not ok" in legend_texts(figure)
+    assert "Status not ok: not steady (1)" in caption(figure)
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1)])
+def test_theory_needs_a_plane(alphas: int, nus: int) -> None:
+    with pytest.raises(ValueError, match="at least two restitutions"):
+        theory_errors(theory_dataset(alphas, nus))
+
+
+# -------------------------------------------------------------------------------------------- clusters
+
+
+def test_shares_stand_at_their_excess_with_errors_in_both_directions() -> None:
+    data = theory_dataset()
+    data["cluster_shear_share"] = 0.9 * data.cluster_shear_share
+    figure = cluster_shares(data)
+    for axes, name in ((panel(figure, "p"), "cluster_pressure_share"), (panel(figure, "s"), "cluster_shear_share")):
+        bars = axes.containers
+        assert len(bars) == data.sizes["restitution"] and axes.get_xscale() == "log"
+        drawn = np.array([c.lines[0].get_xydata() for c in bars])
+        np.testing.assert_allclose(drawn[..., 0], (data.force_ratio - 1.0).T)
+        np.testing.assert_allclose(drawn[..., 1], data[name].T)
+        across, along = (np.array([c.lines[2][k].get_segments() for c in bars]) for k in (0, 1))
+        np.testing.assert_allclose(np.ptp(across[..., 0], axis=-1), 2.0 * data.force_ratio_stderr.T)
+        np.testing.assert_allclose(np.ptp(along[..., 1], axis=-1), 0.06)
+        left, right = axes.get_xlim()
+        assert left < drawn[..., 0].min() and drawn[..., 0].max() < right
+
+
+def test_restitutions_have_lines_and_packing_fractions_symbols() -> None:
+    data = theory_dataset()
+    figure = cluster_shares(data)
+    axes = panel(figure, "p")
+    symbols = [artist for artist in axes.collections if isinstance(artist, PathCollection)]
+    assert len({artist.get_paths()[0].vertices.tobytes() for artist in symbols}) == 6
+    for artist, excess in zip(symbols, data.force_ratio.values - 1.0, strict=True):
+        np.testing.assert_allclose(artist.get_offsets()[:, 0], excess)
+    alphas, nus = ([f"{x:.4g}" for x in data[name].values] for name in ("restitution", "packing_fraction"))
+    texts = [text.get_text() for text in figure.legends[-1].get_texts()]
+    assert texts[:5] == alphas and "packing" in texts[5] and texts[6:] == nus[::-1]
+    lines = [container.lines[0] for container in axes.containers]
+    assert len({str(line._dash_pattern) for line in lines}) == len({str(line.get_color()) for line in lines}) == 5
+
+
+def test_share_of_the_pressure_lies_on_its_isolines() -> None:
+    figure = cluster_shares(theory_dataset())
+    lines = contours(panel(figure, "m"), "black")
+    assert set(lines) == set(SHARE_LEVELS[1:-1])  # the corners are 0.08 and 0.86
+    for level, line in lines.items():
+        np.testing.assert_allclose(share_of(*vertices(line)), level, atol=1e-9)
+        assert [text.get_text() for text in line.labelTexts] == [f"{level:.2f}"]
+    assert len(contours(panel(figure, "m"), "#00803c")) == len(EXCESS_LEVELS)
+
+
+def test_excess_too_small_for_the_axis_is_counted() -> None:
+    data = theory_dataset()
+    data.force_ratio[0, :2] = [1.0, 0.999]
+    assert "2 of 30 points have an excess too small" in caption(cluster_shares(data))
+    assert "too small" not in caption(cluster_shares(theory_dataset()))
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
+def test_line_of_points_has_shares_without_a_plane(alphas: int, nus: int) -> None:
+    data = theory_dataset(alphas, nus)
+    data.status[0, 0] = 1
+    figure = cluster_shares(data)
+    assert len(figure.axes) == 2
+    assert "status not ok" in legend_texts(figure)
+    assert_nothing_overlaps(figure)
+
+
+# -------------------------------------------------------------------------------------------- rheology
+
+
+def dense_dataset(**options) -> xr.Dataset:
+    """Return a synthetic map of dense flow with everything that a figure needs."""
+    data = dense_map(**options)
+    dims, shape = data.inertial_number.dims, data.inertial_number.shape
+    data["status"].attrs = {"flag_values": np.arange(7), "flag_meanings": "ok a not_steady c d e f"}
+    ratio = {"force_ratio": (dims, np.full(shape, 2.0)), "force_ratio_stderr": (dims, np.full(shape, 0.1))}
+    return data.assign(ratio).assign_attrs(ratio_dataset().attrs)
+
+
+def test_laws_are_drawn_over_the_points_they_are_fitted_to() -> None:
+    data = dense_dataset()
+    law = friction_law(data)
+    figure = friction_figure(data)
+    for axes, name in zip(figure.axes, ("friction", "packing_fraction"), strict=True):
+        assert axes.get_xscale() == "log"
+        curves = [line for line in axes.lines if len(line.get_xdata()) == 100]
+        assert len(curves) == 3
+        for curve, one in zip(curves, (*law.by_restitution.values(), law), strict=True):
+            part = getattr(one, name)
+            number = np.asarray(curve.get_xdata())
+            np.testing.assert_allclose((number[0], number[-1]), part.span)
+            np.testing.assert_allclose(curve.get_ydata(), part(number))
+        texts = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert [text.split(":")[0] for text in texts] == ["0.2", "0.5", "all"]
+
+
+def test_points_that_no_law_is_fitted_to_are_open() -> None:
+    data = dense_dataset()
+    data.status[-1, 0] = 2
+    figure = friction_figure(data)
+    filled = (data.inertial_number <= 0.3) & (data.status == 0)
+    for axes, y in zip(figure.axes, (data.macroscopic_friction, data.packing_fraction), strict=True):
+        points = [c.lines[0] for c in axes.containers]
+        shown = [np.c_[p.get_xdata(), p.get_ydata()] for p in points if p.get_markerfacecolor() != "white"]
+        expected = xr.broadcast(data.inertial_number, y)
+        chosen = [np.stack([v.values[filled.values[:, k], k] for v in expected], axis=-1) for k in range(2)]
+        for drawn, wanted in zip(shown, chosen, strict=True):
+            np.testing.assert_allclose(drawn, wanted)
+        np.testing.assert_allclose(rings(axes), [[float(v[-1, 0]) for v in expected]])
+    assert "status not ok" in legend_texts(figure)
+
+
+def test_legend_gives_parameters_with_their_errors() -> None:
+    law = friction_law(dense_dataset()).packing_fraction
+    offset, coefficient, exponent = law.parameters
+    text, chi_squared = parameters_text(law).rstrip(")").split(" (")
+    assert float(chi_squared) == pytest.approx(law.chi_squared, rel=0.05)
+    numbers = [part.split(" ± ") for part in text.split(", ")]
+    expected = zip((offset, -coefficient, exponent), law.standard_errors, strict=True)
+    for (value, error), (true, stderr) in zip(numbers, expected, strict=True):
+        assert float(value) == pytest.approx(true, abs=stderr / 2.0)
+        assert float(error) == pytest.approx(stderr, rel=0.35)
+
+
+def test_restitution_with_too_few_points_says_so() -> None:
+    data = dense_dataset(alphas=(0.2, 0.5, 0.8))
+    data.macroscopic_friction[2:, 1] = np.nan
+    texts = [text.get_text() for text in friction_figure(data).axes[0].get_legend().get_texts()]
+    assert [text.endswith("too few points") for text in texts] == [False, True, False, False]
+
+
+# --------------------------------------------------------------------------------------------- together
+
+
+@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+@pytest.mark.parametrize(("alphas", "nus"), [(2, 2), (5, 6), (10, 12)])
+def test_nothing_overlaps_on_the_page(draw, alphas: int, nus: int) -> None:
+    data = theory_dataset(alphas, nus)
+    data.status[1, 1] = 1
+    data = data.assign(force_ratio=data.force_ratio.where(data.restitution > 0.1))
+    assert_nothing_overlaps(draw(data))
+
+
+@pytest.mark.parametrize("alphas", [(0.5,), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98)])
+def test_laws_do_not_overlap_on_the_page(alphas: tuple[float, ...]) -> None:
+    data = dense_dataset(alphas=alphas, nus=10)
+    data.status[0, 0] = 2
+    assert_nothing_overlaps(friction_figure(data))
+
+
+@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+def test_map_without_any_value_is_drawn(draw) -> None:
+    data = theory_dataset()
+    empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
+    figure = draw(empty)
+    figure.canvas.draw()
+    assert all("no measured values" in [text.get_text() for text in axes.texts] for axes in figure.axes)
+
+
+@pytest.mark.parametrize("draw", [theory_errors, cluster_shares, friction_figure])
+def test_shortest_time_step_is_drawn(draw) -> None:
+    data = dense_dataset() if draw is friction_figure else theory_dataset()
+    several = with_timesteps(data, 3e-4, 1e-2)
+    if draw is theory_errors:  # what a theory predicts has no time step
+        several = several.assign({name: data[name] for name in ("theory_pressure", "theory_shear_stress")})
+    figure, expected = draw(several), draw(data)
+    assert caption(figure) == caption(expected) and r"3\times 10^{-4}" in caption(figure)
+    for axes, other in zip(figure.axes, expected.axes, strict=True):
+        for line, same in zip(axes.lines, other.lines, strict=True):
+            np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
+
+
+@pytest.mark.parametrize(
+    ("data", "names"),
+    [
+        (theory_dataset(3, 3), ["curves", "contours", "theory", "clusters"]),
+        (theory_dataset(1, 3), ["curves", "clusters"]),
+        (theory_dataset(3, 3).drop_vars("theory_pressure"), ["curves", "contours", "clusters"]),
+        (dense_dataset(), ["curves", "contours", "rheology"]),
+        (dense_dataset(nus=3, alphas=(0.5,)), ["curves"]),
+    ],
+    ids=["all", "line", "no theory", "dense", "few"],
+)
+def test_figures_are_written_where_the_map_has_their_data(data: xr.Dataset, names: list[str], tmp_path: Path) -> None:
+    written = save_figures(data, tmp_path / "map")
+    assert [path.name for path in written] == [f"map_{name}.png" for name in names]
+    assert sorted(tmp_path.iterdir()) == sorted(written)
