@@ -1,12 +1,19 @@
-"""Made-up tallies and replicas, for tests of what happens to the numbers after the flow."""
+"""Made-up tallies, replicas and snapshots, for tests of what happens to the numbers after the flow."""
 
 import numpy as np
 
+from jaxgran.contacts import Contacts
 from jaxgran.dataset import Replica
+from jaxgran.dynamics import State
+from jaxgran.grains import Grains
 from jaxgran.measure import BLOCKS, Sample
+from jaxgran.series import minimum_image
 from jaxgran.settings import MapSettings
+from jaxgran.snapshots import Snapshot
 from jaxgran.status import Status
 from jaxgran.tally import Tally
+
+SNAPSHOTS = 1000  # a static choice, the same wherever snapshots of a flow are taken: one compilation
 
 
 def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tally:
@@ -30,3 +37,37 @@ def random_replica(rng: np.random.Generator, settings: MapSettings, status: int 
 def one_sentence(message: str) -> bool:
     """Whether a message is one line that starts with a word and ends with a full stop."""
     return message.count("\n") == 0 and message.endswith(".") and not message.endswith("..")
+
+
+def snapshot_of(positions, contacts=None, velocities=None, radii=0.5, side=40.0, tilt=0.0, shear_rate=1.0) -> Snapshot:
+    """Snapshots of grains at (times, grains, 2), with contacts (i, j, impulse) of each time, at unit time step."""
+    positions = np.asarray(positions, float)
+    times, grains = positions.shape[:2]
+    radii = np.broadcast_to(np.asarray(radii, float), (times, grains))
+    contacts = [[]] * times if contacts is None else contacts
+    slots = max(1, *(len(c) for c in contacts))
+    i, j = np.zeros((2, times, slots), int)
+    impulses, used = np.zeros((times, slots)), np.zeros((times, slots), bool)
+    for t, here in enumerate(contacts):
+        for k, (a, b, p) in enumerate(here):
+            i[t, k], j[t, k], impulses[t, k], used[t, k] = a, b, p, True
+    time = np.arange(times)[:, None]
+    branch = (
+        np.stack([minimum_image(r[a] - r[b], side, tilt) for r, a, b in zip(positions, i, j, strict=True)])
+        + np.where(used, 0, 1)[..., None]
+    )
+    distances = np.linalg.norm(branch, axis=-1)
+    every = np.ones(times)
+    masses = 4 * radii**2
+    network = Contacts(
+        i, j, branch / distances[..., None], distances, -impulses, 1 / masses[time, i], 1 / masses[time, j], used
+    )
+    velocities = np.zeros_like(positions) if velocities is None else velocities
+    state = State(Grains(radii, masses), positions, velocities, side * every, tilt * every)
+    return Snapshot(state, network, impulses, every, shear_rate * every, 0.5 * every, 0 * time[:, 0])
+
+
+def assert_within_errors(measured, expected, least: float = 0.0, errors: float = 4.0) -> None:
+    """Every value is the expected one within four standard errors, or within ``least``."""
+    value, error = measured[-2:]
+    np.testing.assert_array_less(np.abs(value - expected), np.maximum(errors * error, least) + 1e-12)
