@@ -1,0 +1,102 @@
+"""Kinetic theory against measured stresses where it should hold: nearly elastic flows that are not dense.
+
+Maps α from 0.8 to 0.95 and ν from 0.1 to 0.6 until force ratio and stresses have a relative standard error of 1 %, and
+prints what each theory predicts over what is measured.
+
+    python benchmarks/theory_check.py           # about 10 minutes on two cores
+    python benchmarks/theory_check.py --quick   # four points to 5 %, about a minute
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+from hardware import hardware, json_with_rows
+from matplotlib.figure import Figure
+
+import jaxgran as jg
+from jaxgran.kinetic_theory import garzo_dufty, gaussian_moments, jenkins_richman
+from jaxgran.sweep import usable_cores
+
+THEORIES = {"moments": gaussian_moments, "Garzó–Dufty": garzo_dufty, "Jenkins–Richman": jenkins_richman}
+NAMES = ("pressure", "shear_stress", "granular_temperature", "collision_rate")
+PROMISED = 5.0  # percent of the pressure, for the moments
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="four points, larger errors")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    data = jg.ratio_map(
+        [0.8, 0.9] if chosen.quick else [0.8, 0.9, 0.95],
+        [0.2, 0.6] if chosen.quick else [0.1, 0.2, 0.4, 0.6],
+        grains=128 if chosen.quick else 400,
+        seeds=2,
+        timestep="auto",
+        strain=8.0,
+        error=0.05 if chosen.quick else 0.01,
+        workers=usable_cores(),
+    )
+    rows = [
+        row(data, float(nu), float(alpha), name)
+        for nu in data.packing_fraction
+        for alpha in data.restitution
+        for name in NAMES
+    ]
+    print("    ν     α  observable                 measured        theory over measured: " + ", ".join(THEORIES))
+    for one in rows:
+        theories = "".join(f"{one[name]:9.3f}" for name in THEORIES)
+        measured = f"{one['value']:9.4g} ± {one['error']:7.2g}"
+        print(f"{one['nu']:5.2f}{one['alpha']:6.2f}  {one['observable']:22s}{measured}{theories}")
+    worst = max(abs(one["moments"] - 1) for one in rows if one["observable"] == "pressure")
+    print(f"largest error of the moments in pressure: {100 * worst:.1f} % (promised {PROMISED:g} %)")
+    stem = chosen.output / ("theory_check_quick" if chosen.quick else "theory_check")
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    head = {"hardware": hardware(), "run": {k: str(v) for k, v in data.attrs.items()}}
+    stem.with_suffix(".json").write_text(json_with_rows(head, "rows", rows))
+    draw(rows).savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def row(data, nu: float, alpha: float, name: str) -> dict:
+    """One observable of one point, and each theory's prediction over it."""
+    here = data.sel(packing_fraction=nu, restitution=alpha)
+    value, error = float(here[name]), float(here[f"{name}_stderr"])
+    predictions = {key: float(getattr(theory(alpha, nu), name)) / value for key, theory in THEORIES.items()}
+    return {"nu": nu, "alpha": alpha, "observable": name, "value": value, "error": error, **predictions}
+
+
+def draw(rows: list[dict]) -> Figure:
+    """Theory over measured against packing fraction, a panel for each observable and a symbol for each theory and α."""
+    alphas = sorted({row["alpha"] for row in rows})
+    figure = Figure(figsize=(8.0, 6.4), layout="constrained")
+    for axes, name in zip(figure.subplots(2, 2, sharex=True).flat, NAMES, strict=True):
+        axes.axhline(1, color="0.6")
+        axes.axhspan(1 - PROMISED / 100, 1 + PROMISED / 100, color="0.92", zorder=0)
+        for k, alpha in enumerate(alphas):
+            for (key, line), grey in zip(
+                zip(THEORIES, ("-", "--", ":"), strict=True), ("0", "0.35", "0.6"), strict=True
+            ):
+                some = [row for row in rows if row["observable"] == name and row["alpha"] == alpha]
+                axes.errorbar(
+                    [row["nu"] for row in some],
+                    [row[key] for row in some],
+                    [row[key] * row["error"] / row["value"] for row in some],
+                    color=grey,
+                    linestyle=line,
+                    marker="os^"[k],
+                    markersize=4,
+                    capsize=2,
+                    label=f"{key}, α = {alpha:g}",
+                )
+        axes.set_ylabel(f"{name.replace('_', ' ')}, theory over measured")
+        axes.set_xlabel("packing fraction ν")
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(alphas), fontsize="small"
+    )
+    return figure
+
+
+if __name__ == "__main__":
+    main()
