@@ -126,14 +126,16 @@ def map_command(
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a cluster scheduler (not available yet).")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running Dask cluster, such as tcp://127.0.0.1:8786.")
+    ] = None,
     output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
     resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
     """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
-    if scheduler is not None:
-        raise InputError("--scheduler is not available yet: run the map here.")
+    if scheduler is not None and workers is not None:
+        raise InputError("scheduler and workers exclude each other: give one of them.")
     given = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,
@@ -150,7 +152,7 @@ def map_command(
     chosen = PRESETS[preset] | {name: value for name, value in given.items() if value is not None}
     for name in ("restitution", "packing_fraction"):
         chosen[name] = number_list(chosen[name], name)
-    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error, resume)
+    data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error, resume, scheduler)
 
     from jaxgran.figures import save_figures
 
@@ -276,6 +278,7 @@ def _measure(
     quiet: bool,
     target_error: float = 0.02,
     resume: bool | None = None,
+    scheduler: str | None = None,
 ):
     """Run a map with progress, write its dataset, and return it and whether it was interrupted.
 
@@ -300,46 +303,40 @@ def _measure(
     costs = [predicted_cost(flow) for flow in settings.flows()]
     checkpoint = None if output is None or resume is None else Checkpoint(output, settings, resume)
     results = {} if checkpoint is None else dict(checkpoint.done)
-    resumed = len(results)
+    run: dict[str, Any] = {
+        "automatic_choice": automatic_choice,
+        "command": shlex.join(["jaxgran", *sys.argv[1:]]),
+        "workers": workers,
+        "resumed_replicas": len(results),
+    }
     if resume:
         _say_resumed(checkpoint, count)
 
-    start, interrupted, trouble = time.perf_counter(), False, None
-    with progress(costs, settings.seeds, quiet) as meter:
-        meter.resumed(point for point, _ in results)
-        running = replicas(settings, batch, workers, meter.steps, checkpoint, _say)
-        try:
-            for key, replica in running:
-                results[key] = replica
-                meter.replica(key[0])
-        except KeyboardInterrupt:
-            interrupted = True
-        except OSError as error:
-            trouble = error
-        finally:
-            running.close()
-    seconds = time.perf_counter() - start
-    run = {
-        "automatic_choice": automatic_choice,
-        "command": shlex.join(["jaxgran", *sys.argv[1:]]),
-        "wall_time_seconds": seconds,
-        "replica_steps_per_second": meter.done_steps / seconds,
-        "workers": workers,
-        "resumed_replicas": resumed,
-    }
-    data, written = map_dataset(settings, results, run), False
+    start, interrupted, finished = time.perf_counter(), False, False
     try:
-        if trouble is not None:
-            raise trouble
+        with progress(costs, settings.seeds, quiet) as meter:
+            meter.resumed(point for point, _ in results)
+            running = replicas(settings, batch, workers, meter.steps, checkpoint, _say, scheduler)
+            try:
+                for key, replica in running:
+                    results[key] = replica
+                    meter.replica(key[0])
+            except KeyboardInterrupt:
+                interrupted = True
+            finally:
+                running.close()
+        seconds = time.perf_counter() - start
+        speed = {"wall_time_seconds": seconds, "replica_steps_per_second": meter.done_steps / seconds}
+        data = map_dataset(settings, results, run | speed)
         if output is not None and results:
             write_dataset(data, output)
-        written = True
+        finished = len(results) == count
     except OSError as error:
         kept = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
         _stop(f"stopped by the file system, {error.strerror or error}{kept}.", NO_FILE)
     finally:
         if checkpoint is not None:
-            checkpoint.close(finished=written and len(results) == count)
+            checkpoint.close(finished)
     return data, interrupted
 
 

@@ -22,6 +22,7 @@ import xarray as xr
 
 from jaxgran.batch import Drive, Report, advance_batch, reporting, stack
 from jaxgran.checkpoint import Checkpoint
+from jaxgran.cluster import run_on_cluster
 from jaxgran.dataset import Key, Replica, map_dataset
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver
 from jaxgran.journal import Journal
@@ -139,6 +140,7 @@ def replicas(
     report: Report | None = None,
     checkpoint: Checkpoint | None = None,
     warn: Callable[[str], None] = warnings.warn,
+    scheduler: str | None = None,
 ) -> Generator[tuple[Key, Replica]]:
     """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
 
@@ -149,15 +151,19 @@ def replicas(
       report: told the replica-steps done since the last call.
       checkpoint: where to keep what is done; replicas that are done there are not run and not yielded again.
       warn: told in one sentence what went wrong with a batch that is given up.
+      scheduler: address of a Dask cluster whose workers run the batches, in place of processes of this machine. A
+        journal is kept where they see the folder of the checkpoint; the report follows whole batches.
     """
     tasks = _remaining(settings, batch, workers, checkpoint)
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
     configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
-    outcomes = (
-        ((number, _run_task(*call, report)) for number, call in enumerate(calls))
-        if workers == 1
-        else run_tasks(_run_task, calls, workers, _configure, configuration, report or (lambda _: None))
-    )
+    hear = report or (lambda _: None)
+    if scheduler is not None:
+        outcomes = run_on_cluster(scheduler, _run_task, calls, _configure, (configuration[0], None))
+    elif workers > 1:
+        outcomes = run_tasks(_run_task, calls, workers, _configure, configuration, hear)
+    else:
+        outcomes = ((number, _run_task(*call, report)) for number, call in enumerate(calls))
     with closing(outcomes):
         for number, outcome in outcomes:
             if isinstance(outcome, Died):
@@ -165,6 +171,8 @@ def replicas(
                 continue
             if checkpoint is not None:
                 checkpoint.add(dict(outcome))
+            if scheduler is not None:
+                hear(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
             yield from outcome
 
 
@@ -227,7 +235,8 @@ def _configure(x64: bool, cache: str | None) -> None:
     XLA keeps its flags: with others, small matrix products would be summed in another order than in the parent.
     """
     jax.config.update("jax_enable_x64", x64)
-    jax.config.update("jax_compilation_cache_dir", cache)
+    if cache is not None:
+        jax.config.update("jax_compilation_cache_dir", cache)
 
 
 def _points(settings: MapSettings, task: Sequence[Key]) -> str:

@@ -63,7 +63,7 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
 def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
     """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
 
-    def replicas(settings, batch, workers, report, checkpoint, warn) -> Iterator:
+    def replicas(settings, batch, workers, report, checkpoint, warn, scheduler) -> Iterator:
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
             report(100.0)
@@ -165,7 +165,7 @@ MISTAKES = {
     "map --output none/map.nc": "a folder that exists",
     "map --output folder.nc": "is a folder",
     "map --output picture.nc": "picture_timestep.png' is a folder",
-    "map --scheduler tcp://localhost": "--scheduler is not available yet",
+    "map --scheduler tcp://127.0.0.1:9 --workers 2": "scheduler and workers exclude each other",
     "map --wrong": "--wrong",
     "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
     "run --restitution 0.5 --packing-fraction 0.9": "packing_fraction must be above 0 and at most 0.83",

@@ -16,8 +16,8 @@ SOURCES = sorted(path for path in Path(jaxgran.__file__).parent.glob("*.py") if 
 LAYERS = """
     replica status flow grains cell neighbours pairs contacts delassus methods solver tally dynamics snapshots
     coarse_graining fields packing observables statistics series force_chains structure measure kinetic_theory
-    kinetics batch protocol accuracy settings store dataset journal checkpoint pool sweep rheology drawing contours
-    theory_figures rheology_figures figures progress cli
+    kinetics batch protocol accuracy settings store dataset journal checkpoint pool cluster sweep rheology drawing
+    contours theory_figures rheology_figures figures progress cli
 """
 
 
