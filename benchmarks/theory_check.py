@@ -90,8 +90,9 @@ def draw(rows: list[dict]) -> Figure:
                     capsize=2,
                     label=f"{key}, α = {alpha:g}",
                 )
-        axes.set_ylabel(f"{name.replace('_', ' ')}, theory over measured")
-        axes.set_xlabel("packing fraction ν")
+        axes.set_title(name.replace("_", " "))
+    figure.supxlabel("packing fraction ν (grey: within 5 %)")
+    figure.supylabel("theory over measured")
     figure.legend(
         *figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(alphas), fontsize="small"
     )

@@ -1,6 +1,10 @@
 """Observables: the averages that follow from a tally, with their names and units."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
@@ -66,7 +70,12 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
       them. Stress Σ^{ab} follows the sign of the paper: positive diagonal, and the shear stress is −Σ^{xy}.
       A quotient of nothing by nothing (no contact was seen) is NaN.
     """
-    area, shear_rate = jnp.asarray(area), jnp.asarray(shear_rate)
+    with np.errstate(divide="ignore", invalid="ignore"):  # JAX never warns
+        return _averages(tally, area, grains, shear_rate, _namespace(*vars(tally).values(), area, shear_rate))
+
+
+def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike, xp: Any) -> dict[str, Array]:
+    area, shear_rate = xp.asarray(area), xp.asarray(shear_rate)
     volume = area * tally.duration
     contact, binary, kinetic = (
         moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
@@ -89,12 +98,12 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
         "granular_temperature": pressure["kinetic"] * area / grains,
         "bagnold_pressure": total_pressure / shear_rate**2,
         "bagnold_shear_stress": total_shear / shear_rate**2,
-        "cluster_pressure_share": _ratio(*(jnp.trace(x, axis1=-2, axis2=-1) for x in (clustered, pushed))),
+        "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (clustered, pushed))),
         "cluster_shear_share": _ratio(clustered[..., 0, 1], pushed[..., 0, 1]),
         "coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),
         "network_size": _ratio(tally.contacts, tally.solves),
         "macroscopic_friction": total_shear / total_pressure,
-        "inertial_number": shear_rate / jnp.sqrt(total_pressure),
+        "inertial_number": shear_rate / xp.sqrt(total_pressure),
         "collision_rate": 2 * tally.collisions / (grains * tally.duration * shear_rate),
         "iterations": _ratio(tally.iterations, tally.solves),
         "median_residual": _median_residual(tally.residual_counts),
@@ -103,8 +112,8 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
         "mean_overlap": _ratio(tally.overlap, tally.contacts),
         "max_overlap": tally.largest_overlap,
         "momentum_drift": tally.momentum_drift,
-        "energy_balance_error": _ratio(work - tally.dissipation - tally.energy_change, jnp.abs(work)),
-        "complementarity_power": _ratio(tally.complementarity, jnp.abs(work)),
+        "energy_balance_error": _ratio(work - tally.dissipation - tally.energy_change, xp.abs(work)),
+        "complementarity_power": _ratio(tally.complementarity, xp.abs(work)),
         "contact_stress": contact,
         "binary_stress": binary,
         "kinetic_stress": kinetic,
@@ -114,15 +123,21 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
 
 def _median_residual(counts: Array) -> Array:
     """Median of counts by residual (..., bins), interpolated within its bin; zero where that is the lowest bin."""
-    below = jnp.cumsum(counts, axis=-1)
+    xp = _namespace(counts)
+    below = xp.cumsum(counts, axis=-1)
     half = below[..., -1:] / 2
-    bin = jnp.argmax(below >= half, axis=-1, keepdims=True)
-    inside, upto = (jnp.take_along_axis(x, bin, axis=-1)[..., 0] for x in (counts, below))
+    bin = xp.argmax(below >= half, axis=-1, keepdims=True)
+    inside, upto = (xp.take_along_axis(x, bin, axis=-1)[..., 0] for x in (counts, below))
     bin, half = bin[..., 0], half[..., 0]
-    share = 1 - (upto - half) / jnp.where(inside > 0, inside, 1)
-    edges = jnp.log10(jnp.asarray(RESIDUAL_EDGES, counts.dtype))
+    share = 1 - (upto - half) / xp.where(inside > 0, inside, 1)
+    edges = xp.log10(xp.asarray(RESIDUAL_EDGES, counts.dtype))
     median = 10 ** (edges[bin] + share * (edges[bin + 1] - edges[bin]))
-    return jnp.where(half > 0, jnp.where(bin == 0, 0, median), jnp.nan)
+    return xp.where(half > 0, xp.where(bin == 0, 0, median), xp.nan)
+
+
+def _namespace(*values: Any) -> Any:
+    """JAX's functions for its arrays and NumPy's for all else, a hundred times faster on the few numbers of a point."""
+    return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
 def _named(contact: Array, binary: Array, kinetic: Array):
@@ -131,4 +146,5 @@ def _named(contact: Array, binary: Array, kinetic: Array):
 
 def _ratio(over: Array, under: Array) -> Array:
     """A quotient that is NaN, without a warning, where nothing was counted."""
-    return jnp.where(under == 0, jnp.nan, over / jnp.where(under == 0, 1, under))
+    xp = _namespace(over, under)
+    return xp.where(under == 0, xp.nan, over / xp.where(under == 0, 1, under))

@@ -54,7 +54,9 @@ def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) 
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     without = _leave_one_out(estimate, jax.tree.map(lambda x: _merged(x, 1), sums))
-    return {name: _inefficiency(x.reshape(seeds, blocks, *x.shape[1:])) for name, x in without.items()}
+    flat = np.concatenate([x.reshape(seeds, blocks, -1) for x in without.values()], axis=2)
+    lengths = np.split(_inefficiency(flat), np.cumsum([x[0].size for x in without.values()])[:-1])
+    return {name: one.reshape(x.shape[1:]) for (name, x), one in zip(without.items(), lengths, strict=True)}
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
@@ -95,15 +97,15 @@ def _leave_one_out(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) ->
 
 
 def _inefficiency(series: np.ndarray) -> np.ndarray:
-    """Statistical inefficiency of series (seeds, blocks, ...), without the axes of seeds and blocks."""
+    """Statistical inefficiency (n,) of n series (seeds, blocks, n)."""
     blocks = series.shape[1]
     if blocks < 4:
-        return np.full(series.shape[2:], np.nan)
+        return np.full(series.shape[2], np.nan)
     away = series - series.mean(axis=(0, 1))
     products = [np.mean(away[:, : blocks - k] * away[:, k:], axis=(0, 1)) for k in range(blocks // 2)]
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.stack(products) / products[0]
-    weighted = correlation * (1 - np.arange(len(products)) / blocks).reshape(-1, *(1,) * (series.ndim - 2))
+    weighted = correlation * (1 - np.arange(len(products)) / blocks)[:, None]
     pairs = weighted[: len(weighted) // 2 * 2].reshape(-1, 2, *weighted.shape[1:]).sum(axis=1)
     counted = np.logical_and.accumulate(pairs > 0, axis=0)
     length = 2 * np.sum(np.where(counted, pairs, 0), axis=0) - 1

@@ -79,9 +79,7 @@ class Tally:
 
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
         """The tally of all that stands along leading axes: sums, and the larger of each of ``EXTREMES``."""
-        return Tally(
-            **{name: jnp.max(x, axis) if name in EXTREMES else jnp.sum(x, axis) for name, x in vars(self).items()}
-        )
+        return Tally(**{name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in vars(self).items()})
 
 
 def empty_tally(dtype: jnp.dtype) -> Tally:
