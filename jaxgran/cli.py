@@ -130,6 +130,9 @@ def map_command(
         str | None, typer.Option(help="Address of a running Dask cluster, such as tcp://127.0.0.1:8786.")
     ] = None,
     output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
+    like: Annotated[
+        Path | None, typer.Option(help="Dataset whose map is repeated; other options override its choices.")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
@@ -149,9 +152,12 @@ def map_command(
         "solver": solver,
         "activation": activation,
     }
-    chosen = PRESETS[preset] | {name: value for name, value in given.items() if value is not None}
+    chosen = (PRESETS[preset] if like is None else _like(like)) | {
+        name: value for name, value in given.items() if value is not None
+    }
     for name in ("restitution", "packing_fraction"):
-        chosen[name] = number_list(chosen[name], name)
+        if isinstance(chosen[name], str):
+            chosen[name] = number_list(chosen[name], name)
     data, interrupted = _measure(chosen, _batch(batch), workers, output, quiet, target_error, resume, scheduler)
 
     from jaxgran.figures import save_figures
@@ -212,6 +218,20 @@ def run_command(
     data, interrupted = _measure(chosen, "auto", 1, output, quiet=False)
     _print_table(_summary_table(data))
     _finish(data, [output] if output else [], interrupted)
+
+
+def _like(file: Path) -> dict[str, Any]:
+    """The choices of the map in a file; what else could change its numbers is said on standard error."""
+    _configured_jax()
+    from jaxgran.dataset import choices_of, differences, read_dataset
+    from jaxgran.settings import MapSettings
+
+    data = read_dataset(file)
+    chosen = choices_of(data)
+    others = differences(data, MapSettings(**chosen))
+    if others:
+        _say(f"not as in {file}: {'; '.join(others)}.")
+    return chosen
 
 
 def _first_strain(strain: float | None, error: float | None) -> float | None:

@@ -3,9 +3,11 @@
 import math
 import os
 import platform
+import subprocess
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -176,6 +178,34 @@ def read_dataset(path: Path) -> xr.Dataset:
     return data
 
 
+def choices_of(data: xr.Dataset) -> dict[str, Any]:
+    """The choices of the map in a dataset, as keyword arguments of ``MapSettings``; ValueError if it cannot tell them."""
+    chosen: dict[str, Any] = {}
+    try:
+        for field in fields(MapSettings):
+            if field.name in data.dims:
+                chosen[field.name] = tuple(data[field.name].values.tolist())
+            elif field.name in data.attrs:
+                chosen[field.name] = np.asarray(data.attrs[field.name]).tolist()
+        chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
+        return chosen | {
+            name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")
+        }
+    except KeyError as missing:
+        raise InputError(f"this dataset does not tell the {missing.args[0]} of its map.") from None
+
+
+def differences(data: xr.Dataset, settings: MapSettings) -> list[str]:
+    """What of the versions, the device and the precision of a dataset is other than here, in words."""
+    here = _attributes(settings)
+    names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
+    return [
+        f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"
+        for name in names
+        if name in data.attrs and data.attrs[name] != here[name]
+    ]
+
+
 def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
     """Kinetic theory's steady shear at every point; NaN where it has none, as at α = 1."""
     flows = stack(settings.flows())
@@ -184,6 +214,17 @@ def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
     with np.errstate(invalid="ignore"):
         values = {name: np.asarray(getattr(theory, name)) for name in THEORY}
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
+
+
+def _commit() -> str:
+    """The commit of the checkout that this package runs from, empty where it is none."""
+    folder = Path(__file__).parents[1]
+    if not (folder / ".git").exists():
+        return ""
+    with suppress(OSError):
+        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    return ""
 
 
 def _tail(name: str) -> tuple[int, ...]:
@@ -221,5 +262,6 @@ def _attributes(settings: MapSettings) -> dict[str, Any]:
         "device": f"{device.platform}: {device.device_kind}",
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
+        "commit": _commit(),
         **{f"version_{name.replace('-', '_')}": version(name) for name in packages},
     }

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from synthetic import random_replica
 
 from jaxgran import cli, sweep
-from jaxgran.dataset import NOT_RUN, read_dataset
+from jaxgran.dataset import NOT_RUN, read_dataset, write_dataset
 from jaxgran.flow import InputError
 from jaxgran.status import Status
 
@@ -26,6 +26,7 @@ SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
+SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "solver", "activation", "precision")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
 
@@ -166,6 +167,8 @@ MISTAKES = {
     "map --output folder.nc": "is a folder",
     "map --output picture.nc": "picture_timestep.png' is a folder",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "scheduler and workers exclude each other",
+    "map --like none.nc": "there is no file",
+    "map --like text.nc": "not a NetCDF file",
     "map --wrong": "--wrong",
     "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
     "run --restitution 0.5 --packing-fraction 0.9": "packing_fraction must be above 0 and at most 0.83",
@@ -275,6 +278,18 @@ def test_status_of_the_exit_tells_whether_every_point_is_good(small_map) -> None
     ]
     assert status == (3 if bad else 0)
     assert all(point in err for point in bad)
+
+
+def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(small_map, tmp_path: Path) -> None:
+    folder, _ = small_map
+    data = read_dataset(folder / "small.nc")
+    other = tmp_path / "other.nc"
+    write_dataset(data.assign_attrs(version_jax="0.1.0"), other)
+    outcome = jaxgran(tmp_path, "map", "--like", "other.nc", "--workers", "1", "--output", "again.nc")
+    again = read_dataset(tmp_path / "again.nc")
+    assert again.equals(data)
+    assert f"version jax 0.1.0 there, {data.attrs['version_jax']} here" in outcome.err.splitlines()[0]
+    assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
 
 
 def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path) -> None:
