@@ -29,7 +29,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 import jaxgran as jg
 from jaxgran import force_chains, kinetics, structure
 from jaxgran.series import Curve, Measured, ratio, series, with_errors
-from jaxgran.snapshots import Snapshot, snapshots
+from jaxgran.snapshots import Snapshot, snapshot_series
 from jaxgran.status import Status
 
 SHELLS = (1.0, 0.25)  # over ``contact_shell``
@@ -98,8 +98,8 @@ def measured(plan: Plan, nu: float, alpha: float) -> dict:
     """Everything about one flow: ``numbers`` (value and standard error) and ``curves``."""
     flow = jg.ShearFlow(plan.grains, alpha, nu, plan.timestep)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=max(5.0, 2 / (nu * (1 - alpha**2))))
-    state, apart = snapshots(flow, state, plan.snapshots * plan.interval, plan.snapshots)
-    state, successive = snapshots(flow, state, plan.snapshots * plan.timestep, plan.snapshots)
+    state, apart = snapshot_series(flow, state, plan.snapshots * plan.interval, plan.snapshots)
+    state, successive = snapshot_series(flow, state, plan.snapshots * plan.timestep, plan.snapshots)
     seen, successive = series(apart), series(successive)
     few = jax.tree.map(lambda x: x[::4], seen)  # for what changes slowly
 

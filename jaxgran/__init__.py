@@ -19,16 +19,22 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jaxgran.coarse_graining import gaussian, heaviside, lucy
     from jaxgran.dynamics import State, advance
+    from jaxgran.fields import Fields, fields_at
     from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
     from jaxgran.grains import Grains, polydisperse
     from jaxgran.measure import Sample, sample
     from jaxgran.packing import pack
     from jaxgran.protocol import prepare
+    from jaxgran.rheology import friction_law
+    from jaxgran.rheology_figures import friction_figure
+    from jaxgran.snapshots import Snapshot, snapshot_series
     from jaxgran.status import Status
     from jaxgran.sweep import ratio_map
     from jaxgran.tally import Tally
+    from jaxgran.theory_figures import cluster_shares, theory_errors
 
 __version__ = version("jaxgran")
 
@@ -45,19 +51,39 @@ _HOME = {
     "sample": "measure",
     "prepare": "protocol",
     "ratio_map": "sweep",
+    "Snapshot": "snapshots",
+    "snapshot_series": "snapshots",
+    "Fields": "fields",
+    "fields_at": "fields",
+    "gaussian": "coarse_graining",
+    "heaviside": "coarse_graining",
+    "lucy": "coarse_graining",
+    "friction_law": "rheology",
+    "friction_figure": "rheology_figures",
+    "theory_errors": "theory_figures",
+    "cluster_shares": "theory_figures",
     "ratio_against_timestep": "figures",
     "ratio_curves": "figures",
     "ratio_contours": "figures",
     "save_figures": "figures",
 }
 __all__ = [
+    "Fields",
     "Grains",
     "Sample",
     "ShearFlow",
+    "Snapshot",
     "State",
     "Status",
     "Tally",
     "advance",
+    "cluster_shares",
+    "fields_at",
+    "friction_figure",
+    "friction_law",
+    "gaussian",
+    "heaviside",
+    "lucy",
     "pack",
     "polydisperse",
     "prepare",
@@ -67,6 +93,8 @@ __all__ = [
     "ratio_map",
     "sample",
     "save_figures",
+    "snapshot_series",
+    "theory_errors",
 ]
 
 

@@ -462,12 +462,21 @@ def _say_imprecise(data) -> None:
     )
 
 
+def _say_retried(data) -> None:
+    """Say how many replicas have shorter time steps than asked for, because they had come to nothing."""
+    asked = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
+    retried = int((data.timestep_by_seed < 0.75 * asked).sum())
+    if retried:
+        _say(f"retried with half the time step: {retried} replicas, see timestep_by_seed.")
+
+
 def _finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
     """Say what was written and what went wrong, and exit with the status that tells it."""
     started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
     written = [path for path in written if started and path.exists()]
     _say_written(written)
     _say_imprecise(data)
+    _say_retried(data)
     bad = _bad_points(data)
     if interrupted:
         missing = len(bad.get("not_run", []))

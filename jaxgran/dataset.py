@@ -70,10 +70,12 @@ def map_dataset(
     correlation = {name: np.full(count, np.nan) for name in correlated}
     by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
     status = np.full((count, seeds), NOT_RUN, np.int8)
-    strain, sampled = np.full((2, count, seeds), np.nan)
+    strain, sampled, used = np.full((3, count, seeds), np.nan)
     for (point, seed), replica in results.items():
         status[point, seed], strain[point, seed] = replica.status, replica.strain
-        sampled[point, seed] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
+        tally = replica.sample.tally
+        sampled[point, seed] = tally.duration.sum() * replica.sample.shear_rate
+        used[point, seed] = sampled[point, seed] / max(tally.steps.sum(), 1)
         for name, value in replica.sample.averages.items():
             by_seed[name][point, seed] = value
     for point in range(count):
@@ -121,6 +123,14 @@ def map_dataset(
         (*point_dims, "seed"),
         strain.reshape(*shape, seeds),
         {"long_name": "strain sheared before the sample", "units": "1"},
+    )
+    variables["timestep_by_seed"] = (
+        (*point_dims, "seed"),
+        used.reshape(*shape, seeds),
+        {
+            "long_name": "time step of the sample, shorter than asked for where a replica was retried",
+            "units": "1 / shear rate",
+        },
     )
     variables["strain_by_seed"] = (
         (*point_dims, "seed"),
@@ -179,7 +189,7 @@ def read_dataset(path: Path) -> xr.Dataset:
 
 
 def choices_of(data: xr.Dataset) -> dict[str, Any]:
-    """The choices of the map in a dataset, as keyword arguments of ``MapSettings``; ValueError if it cannot tell them."""
+    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them."""
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):

@@ -82,7 +82,11 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
 
 
 def prepare_batch(
-    flow: ShearFlow, keys: Array, equilibrate: float | None = None, drive: Drive = advance_batch
+    flow: ShearFlow,
+    keys: Array,
+    equilibrate: float | None = None,
+    drive: Drive = advance_batch,
+    coarse_timestep: float = COARSE_TIMESTEP,
 ) -> Batch:
     """``prepare`` for a batch of flows: problems are statuses of single replicas, never exceptions."""
     theory = predicted(flow)
@@ -90,7 +94,7 @@ def prepare_batch(
     state, packed = _start(flow, keys, theory.granular_temperature)
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
-    coarse = replace(flow, timestep=_coarse_timestep(flow, theory))
+    coarse = replace(flow, timestep=_coarse_timestep(flow, theory, coarse_timestep))
     batch = Batch(coarse, state, status, np.zeros(len(status)))
     if equilibrate is None:
         batch = _until_steady(batch, theory, drive)
@@ -159,8 +163,8 @@ def _thermal_speed(theory: SteadyShear) -> np.ndarray:
     return np.sqrt(2 * np.asarray(theory.granular_temperature))
 
 
-def _coarse_timestep(flow: ShearFlow, theory: SteadyShear) -> Array:
-    coarse = np.minimum(COARSE_TIMESTEP / np.asarray(flow.shear_rate), _COARSE_CROSSING / _thermal_speed(theory))
+def _coarse_timestep(flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP) -> Array:
+    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _thermal_speed(theory))
     return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 

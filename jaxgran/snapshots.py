@@ -69,7 +69,7 @@ def snapshot(flow: ShearFlow, state: State) -> Snapshot:
     return Snapshot(state, network, impulses, timestep, shear_rate, restitution, solution.status)
 
 
-def snapshots(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:
+def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:
     """Shear a flow and take snapshots at equal distances of strain; ``jit``, ``vmap`` and ``lax.map`` apply.
 
     Args:
@@ -89,11 +89,11 @@ def snapshots(flow: ShearFlow, state: State, strain: float | Array, count: int) 
     if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
         least = count * np.max(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         require("strain", strain, lambda x: x >= 0.99 * least, f"at least {count} time steps, {least:g}")
-    return _snapshots(flow, state, strain, count)
+    return _snapshot_series(flow, state, strain, count)
 
 
 @partial(jax.jit, static_argnames="count")
-def _snapshots(flow: ShearFlow, state: State, strain: Array, count: int) -> tuple[State, Snapshot]:
+def _snapshot_series(flow: ShearFlow, state: State, strain: Array, count: int) -> tuple[State, Snapshot]:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
 

@@ -11,6 +11,7 @@ import os
 import warnings
 from collections.abc import Callable, Container, Generator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Literal
@@ -27,8 +28,9 @@ from jaxgran.dataset import Key, Replica, map_dataset
 from jaxgran.flow import Activation, InputError, ShearFlow, Solver
 from jaxgran.journal import Journal
 from jaxgran.pool import Died, run_tasks, send
-from jaxgran.protocol import prepare_batch, sample_batch
+from jaxgran.protocol import COARSE_TIMESTEP, prepare_batch, sample_batch
 from jaxgran.settings import MapSettings, automatic
+from jaxgran.status import Status
 from jaxgran.store import Damaged
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
@@ -251,7 +253,8 @@ def _run_task(
     """Prepare and sample the replicas of one batch; one that does not fit into the memory is halved."""
     drive = reporting(advance_batch, report or send)
     try:
-        return _measured(settings, task, drive if journal is None else Journal(journal, task, drive))
+        done = _measured(settings, task, drive if journal is None else Journal(journal, task, drive))
+        return _retried(settings, done, drive)
     except Damaged:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -263,11 +266,22 @@ def _run_task(
         return [done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report)]
 
 
-def _measured(settings: MapSettings, task: Sequence[Key], drive: Drive) -> list[tuple[Key, Replica]]:
+def _retried(settings: MapSettings, done: list[tuple[Key, Replica]], drive: Drive) -> list[tuple[Key, Replica]]:
+    """The replicas of a batch, those that came to nothing once more from another start and with half the time steps."""
+    failed = [key for key, replica in done if replica.status >= Status.infeasible]
+    again = dict(_measured(settings, failed, drive, refinement=2)) if failed else {}
+    return [(key, again[key] if key in again and again[key].status < one.status else one) for key, one in done]
+
+
+def _measured(
+    settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1
+) -> list[tuple[Key, Replica]]:
     flows = settings.flows()
-    flow = stack([flows[point] for point, _ in task])
+    flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
     keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
-    batch = prepare_batch(flow, keys, settings.equilibrate, drive)
+    if refinement > 1:
+        keys = jax.vmap(jax.random.fold_in, (0, None))(keys, refinement)
+    batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     prepared = batch.strain
     error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
     batch, sample = sample_batch(batch, settings.strain, drive, error)

@@ -9,6 +9,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
+from jaxgran import dynamics
 from jaxgran.cell import displacement, remap_tilt
 from jaxgran.dynamics import advance, contact_capacities, contacts_now
 from jaxgran.flow import ShearFlow
@@ -161,6 +162,14 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(run, flowing):
     heap = replace(state, positions=2 + 0.1 * state.positions)
     assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * pytest.GRAINS
     _, tally = run(flow_of(), heap, 3)
+    assert tally.status == Status.capacity
+
+
+def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
+    """A ladder of buffers that ends too early drops contacts, and says so."""
+    state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
+    monkeypatch.setattr(dynamics, "contact_capacities", lambda grains: (1, 2))
+    _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 
 

@@ -9,7 +9,7 @@ from jaxgran.flow import ShearFlow
 from jaxgran.kinetic_theory import contact_value, gaussian_moments
 from jaxgran.kinetics import mixture_contact_value, near_contact, velocity_distribution
 from jaxgran.observables import averages
-from jaxgran.snapshots import snapshots
+from jaxgran.snapshots import snapshot_series
 
 GRAINS = pytest.GRAINS
 STRAIN = 40.0
@@ -136,7 +136,7 @@ def test_binary_stress_and_collision_rate_of_a_flow_follow_from_its_pairs(flowin
     """Where collisions are binary, what pairs are about to do is what contacts then do."""
     flow = ShearFlow(GRAINS, 0.9, 0.6, 1e-3)
     state = flowing(0.6)
-    seen = snapshots(flow, state, STRAIN, SNAPSHOTS)[1]
+    seen = snapshot_series(flow, state, STRAIN, SNAPSHOTS)[1]
     _, tally = run(flow, state, round(STRAIN / flow.timestep))
     by_contacts = averages(tally, state.side**2, GRAINS, 1.0)
     np.testing.assert_allclose(by_contacts["force_ratio"], 1, atol=0.02)

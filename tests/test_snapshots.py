@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxgran.cell import displacement
 from jaxgran.flow import ShearFlow
-from jaxgran.snapshots import collided, flown, snapshot, snapshots
+from jaxgran.snapshots import collided, flown, snapshot, snapshot_series
 
 GRAINS = pytest.GRAINS
 
@@ -23,7 +23,7 @@ def flow() -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def series(flow, flowing):
-    return snapshots(flow, flowing(0.78), 0.05, 5)
+    return snapshot_series(flow, flowing(0.78), 0.05, 5)
 
 
 def assert_same_flow(one, other, tolerance: float) -> None:
@@ -95,4 +95,4 @@ def test_flight_there_and_back_is_where_it_started(flow, flowing) -> None:
 @pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), 1e-3])
 def test_a_strain_without_a_step_for_each_snapshot_is_refused(flow, flowing, strain: float) -> None:
     with pytest.raises(ValueError, match="strain must be"):
-        snapshots(flow, flowing(0.78), strain, 5)
+        snapshot_series(flow, flowing(0.78), strain, 5)

@@ -21,7 +21,7 @@ from jaxgran.force_chains import (
 )
 from jaxgran.kinetics import near_contact
 from jaxgran.series import minimum_image, series
-from jaxgran.snapshots import Snapshot, snapshots
+from jaxgran.snapshots import Snapshot, snapshot_series
 from jaxgran.structure import coordination, hexatic_order, pair_correlation, profiles
 
 GRAINS = pytest.GRAINS
@@ -34,7 +34,7 @@ def flow() -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def seen(flow, flowing) -> Snapshot:
-    return series(snapshots(flow, flowing(0.75), 50.0, SNAPSHOTS)[1])
+    return series(snapshot_series(flow, flowing(0.75), 50.0, SNAPSHOTS)[1])
 
 
 CHAIN_AND_PAIR = [(0, 1, 2.0), (2, 1, 1.0), (3, 4, 1.0), (4, 5, 0.0)]

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from synthetic import random_replica
 
 from jaxgran import sweep
 from jaxgran.dataset import Key, Replica, map_dataset
@@ -94,6 +95,34 @@ def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> No
     assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
     steps = round(SETTINGS["strain"] / 1e-3) + round(SETTINGS["equilibrate"] / 1e-3)
     assert sum(told) == pytest.approx(4 * steps)
+
+
+@pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
+def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_steps(
+    settings, second: Status, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others of its batch keep their numbers, and the worse of two failures is not taken."""
+    rng, calls = np.random.default_rng(0), []
+    task = [(0, 0), (0, 1), (1, 0)]
+
+    def measured(_, keys, drive, refinement: int = 1):
+        calls.append((list(keys), refinement))
+        statuses = {(0, 1): Status.capacity if refinement == 1 else second}
+        return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
+
+    monkeypatch.setattr(sweep, "_measured", measured)
+    done = dict(sweep._run_task(settings, task))
+    assert calls == [(task, 1), ([(0, 1)], 2)]
+    assert list(done) == task
+    assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0]
+
+
+def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
+    (key, refined), *_ = sweep._measured(settings, [(0, 0)], sweep.advance_batch, refinement=2)
+    assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
+    assert refined.sample.pressure != results[key].sample.pressure
+    data = map_dataset(settings, {**results, key: refined}, {})
+    np.testing.assert_allclose(data.timestep_by_seed.values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
 
 
 def test_replicas_of_a_point_differ(results) -> None:
