@@ -17,7 +17,7 @@ LAYERS = """
     replica status flow grains cell neighbours pairs contacts delassus methods solver tally dynamics snapshots
     coarse_graining fields packing observables statistics series force_chains structure measure kinetic_theory
     kinetics batch protocol accuracy settings store dataset journal checkpoint pool cluster sweep rheology drawing
-    contours theory_figures rheology_figures figures progress cli
+    contours theory_figures rheology_figures figures progress cli __main__
 """
 
 
