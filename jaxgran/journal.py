@@ -30,11 +30,11 @@ class Journal:
       path: file of the journal. Its folder may vanish; the journal is then not written, and nothing else suffers.
       keys: what tells the replicas of the batch, in their order; the journal of others is not repeated.
       drive: what advances the batch beyond the journal.
-      seconds: time between two writings.
+      seconds: time between two writings, or None for ``SECONDS``.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: Drive, seconds: float = SECONDS):
-        self.path, self.drive, self.seconds = path, drive, seconds
+    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: Drive, seconds: float | None = None):
+        self.path, self.drive, self.seconds = path, drive, SECONDS if seconds is None else seconds
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
         self.tallies: list[np.ndarray] = []

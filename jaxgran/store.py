@@ -10,6 +10,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import h5netcdf
@@ -41,7 +42,8 @@ def replaced(path: Path) -> Iterator[Path]:
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
     """Write named arrays, and what JSON can hold about them, as a NetCDF file with a checksum of it all."""
     text = json.dumps(about, sort_keys=True)
-    with replaced(path) as temporary, h5netcdf.File(temporary, "w") as file:
+    content = BytesIO()  # HDF5 says more than a sentence when a disc is full
+    with h5netcdf.File(content, "w") as file:
         for name, array in arrays.items():
             dimensions = tuple(f"{name}_{axis}" for axis in range(array.ndim))
             file.dimensions.update(zip(dimensions, array.shape, strict=True))
@@ -49,6 +51,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
         file.attrs["names"] = json.dumps(list(arrays))
         file.attrs["about"] = text
         file.attrs["checksum"] = _checksum(arrays, text)
+    with replaced(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:

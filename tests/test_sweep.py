@@ -125,6 +125,25 @@ def test_refined_replica_has_half_the_time_step_and_another_start(settings, resu
     np.testing.assert_allclose(data.timestep_by_seed.values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
 
 
+def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
+    settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its numbers stay the same; a single replica that does not fit is an error."""
+    measured, largest = sweep._measured, 2
+
+    def bounded(settings, task, drive, refinement: int = 1):
+        if len(task) > largest:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
+        return measured(settings, task, drive, refinement)
+
+    monkeypatch.setattr(sweep, "_measured", bounded)
+    tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert_same_bits(dict(sweep._run_task(settings, tasks, tmp_path / "journal.nc")), results)
+    largest = 0
+    with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
+        sweep._run_task(settings, tasks)
+
+
 def test_replicas_of_a_point_differ(results) -> None:
     ratios = {float(replica.sample.pressure) for replica in results.values()}
     assert len(ratios) == 4

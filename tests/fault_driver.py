@@ -1,0 +1,34 @@
+"""The command line with a fault built in, chosen by the environment variable FAULT; its workers have it too."""
+
+import os
+import random
+import resource
+import signal
+import time
+
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
+
+from jaxgran import journal, sweep
+
+journal.SECONDS = 0.3  # so that batches of a second have journals
+FAULT = os.environ.get("FAULT", "")
+
+if FAULT == "clock":
+    time.time = lambda: random.uniform(0, 4e9)
+elif FAULT == "disc full":
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
+elif FAULT == "deadly batch":
+    measured = sweep._measured
+
+    def deadly(settings, task, drive, refinement=1):
+        if (0, 0) in task:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return measured(settings, task, drive, refinement)
+
+    sweep._measured = deadly
+
+if __name__ == "__main__":
+    from jaxgran.cli import main
+
+    main()

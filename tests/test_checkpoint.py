@@ -1,0 +1,147 @@
+"""A checkpoint gives back what was kept, tells what is damaged or foreign, and has one writer."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from synthetic import one_sentence, random_replica
+
+from jaxgran import checkpoint
+from jaxgran.checkpoint import Checkpoint
+from jaxgran.dataset import Key, Replica
+from jaxgran.flow import InputError
+from jaxgran.settings import MapSettings
+from jaxgran.status import Status
+
+SETTINGS = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0)
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Path:
+    return tmp_path / "map.nc"
+
+
+def batches() -> list[dict[Key, Replica]]:
+    rng = np.random.default_rng(0)
+    return [
+        {(point, seed): random_replica(rng, SETTINGS, Status.not_steady if point == 1 else 0) for seed in range(2)}
+        for point in range(3)
+    ]
+
+
+def cut_off(output: Path) -> dict[Key, Replica]:
+    """A run that keeps three batches and ends without having finished."""
+    run = Checkpoint(output, SETTINGS, resume=False)
+    for batch in batches():
+        run.add(batch)
+    run.close(finished=False)
+    return run.done
+
+
+def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
+    assert set(one) == set(other)
+    for key in one:
+        jax.tree.map(np.testing.assert_array_equal, one[key], other[key])
+
+
+def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
+    kept = cut_off(output)
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert_same_bits(resumed.done, kept)
+    assert resumed.damaged == []
+    resumed.close(finished=True)
+    assert list(output.parent.iterdir()) == []
+
+
+def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
+    cut_off(output)
+    with pytest.raises(InputError, match="continue it with --resume") as refused:
+        Checkpoint(output, SETTINGS, resume=False)
+    assert one_sentence(str(refused.value))
+    Checkpoint(output, SETTINGS, resume=True).close(finished=False)
+
+
+@pytest.mark.parametrize("change", [{"tolerance": 1e-3}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}])
+def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
+    cut_off(output)
+    with pytest.raises(InputError, match=f"has {next(iter(change))} ") as refused:
+        Checkpoint(output, replace(SETTINGS, **change), resume=True)
+    assert one_sentence(str(refused.value))
+
+
+def test_another_version_is_refused_and_named(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut_off(output)
+    monkeypatch.setattr(checkpoint, "version", lambda name: "0.0.1")
+    with pytest.raises(InputError, match=r"version of jaxgran .* and not '0.0.1'"):
+        Checkpoint(output, SETTINGS, resume=True)
+
+
+@pytest.mark.parametrize("how", ["torn", "flipped", "empty"])
+def test_a_damaged_file_costs_its_own_batch_alone(output: Path, how: str) -> None:
+    kept = cut_off(output)
+    folder = output.with_name("map.nc.unfinished")
+    lost = sorted(folder.glob("done-*.nc"))[1]
+    whole = bytearray(lost.read_bytes())
+    middle = len(whole) // 2
+    whole[middle : middle + 64] = bytes(255 - x for x in whole[middle : middle + 64])
+    lost.write_bytes({"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how])
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert resumed.damaged == [lost.name] and not lost.exists()
+    assert len(resumed.done) == 4
+    assert_same_bits(resumed.done, {key: kept[key] for key in resumed.done})
+    resumed.close(finished=False)
+
+
+def test_damaged_parameters_are_one_sentence(output: Path) -> None:
+    cut_off(output)
+    (output.with_name("map.nc.unfinished") / "map.nc").write_bytes(b"half")
+    with pytest.raises(InputError, match="damaged: remove the folder"):
+        Checkpoint(output, SETTINGS, resume=True)
+
+
+def test_a_folder_that_is_removed_is_made_again_with_all_that_was_known(output: Path) -> None:
+    run = Checkpoint(output, SETTINGS, resume=False)
+    first, second, third = batches()
+    run.add(first)
+    run.add(second)
+    for path in run.folder.iterdir():
+        path.unlink()
+    run.folder.rmdir()
+    run.add(third)
+    run.close(finished=False)
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert_same_bits(resumed.done, first | second | third)
+    resumed.close(finished=True)
+
+
+def test_a_map_that_had_hardly_begun_leaves_nothing(output: Path) -> None:
+    Checkpoint(output, SETTINGS, resume=False).close(finished=False)
+    assert list(output.parent.iterdir()) == []
+
+
+def test_a_second_writer_is_refused_until_the_first_has_ended_however_it_did(output: Path) -> None:
+    script = f"""
+import time
+from pathlib import Path
+from jaxgran.checkpoint import Checkpoint
+from jaxgran.settings import MapSettings
+import jax
+jax.config.update("jax_enable_x64", True)
+Checkpoint(Path({str(output)!r}), {SETTINGS!r}, resume=False)
+print("locked", flush=True)
+time.sleep(60)
+"""
+    first = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None and first.stdout.readline() == "locked\n"
+    with pytest.raises(InputError, match="another process is writing") as refused:
+        Checkpoint(output, SETTINGS, resume=True)
+    assert one_sentence(str(refused.value))
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    first.stdout.close()
+    Checkpoint(output, SETTINGS, resume=True).close(finished=True)

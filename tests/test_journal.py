@@ -1,0 +1,122 @@
+"""A batch that was cut off anywhere goes on from its journal with the bits that it would have had."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import random_tally
+
+from jaxgran.batch import advance_batch, stack
+from jaxgran.dynamics import State
+from jaxgran.flow import ShearFlow
+from jaxgran.grains import Grains
+from jaxgran.journal import Journal
+from jaxgran.protocol import prepare_batch, sample_batch
+from jaxgran.store import Damaged, read_arrays
+
+KEYS = [(0, 0), (1, 0)]
+GRAINS = 64  # as in the tests of the protocol: compiled once
+
+
+class CutOff(Exception):
+    pass
+
+
+def cut_after(drive, calls: int):
+    """A drive that dies after a number of calls."""
+
+    def driven(*arguments):
+        nonlocal calls
+        if calls == 0:
+            raise CutOff
+        calls -= 1
+        return drive(*arguments)
+
+    return driven
+
+
+def measured(drive) -> Any:
+    flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-2) for alpha in (0.5, 0.9)])
+    batch = prepare_batch(flow, jax.random.split(jax.random.key(0), 2), 0.5, drive)
+    return sample_batch(batch, 0.64, drive)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Any:
+    return measured(advance_batch)
+
+
+@pytest.mark.parametrize("cuts", [(1,), (5, 20), (33,), (3, 3, 3, 40)])
+def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path: Path) -> None:
+    for calls in cuts:
+        try:
+            measured(Journal(tmp_path / "batch.nc", KEYS, cut_after(advance_batch, calls), seconds=0))
+        except CutOff:
+            continue
+    resumed = measured(Journal(tmp_path / "batch.nc", KEYS, advance_batch, seconds=0))
+    jax.tree.map(np.testing.assert_array_equal, resumed, whole)
+
+
+def fake_drive(flow, state: State, steps):
+    """Random numbers that depend on the state alone."""
+    seed = int(np.asarray(state.positions).sum() * 1e6) % 2**31
+    tally = random_tally(np.random.default_rng(seed), len(steps))
+    return jax.tree.map(lambda x: x + 1, state), tally
+
+
+def small_state() -> State:
+    ones = jnp.ones((2, 4))
+    return State(Grains(ones, ones), jnp.zeros((2, 4, 2)), jnp.zeros((2, 4, 2)), jnp.ones(2), jnp.zeros(2))
+
+
+def walk(drive, calls: int) -> list:
+    state, seen = small_state(), []
+    for k in range(calls):
+        state, tally = drive(None, state, np.array([k, k]))
+        seen.append(jax.tree.map(np.asarray, tally))
+    return [seen, jax.tree.map(np.asarray, state)]
+
+
+def test_nothing_is_done_twice(tmp_path: Path) -> None:
+    path, done = tmp_path / "batch.nc", []
+
+    def counted(*arguments):
+        done.append(arguments)
+        return fake_drive(*arguments)
+
+    walk(Journal(path, KEYS, counted, seconds=0), 7)
+    again = walk(Journal(path, KEYS, counted, seconds=0), 10)
+    assert len(done) == 10
+    jax.tree.map(np.testing.assert_array_equal, again, walk(fake_drive, 10))
+
+
+def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "batch.nc"
+    walk(Journal(path, KEYS, fake_drive, seconds=0), 3)
+    with pytest.raises(Damaged, match="another batch"):
+        Journal(path, [(0, 0), (2, 0)], fake_drive)
+    journal = Journal(path, KEYS, fake_drive)
+    with pytest.raises(Damaged, match="another run"):
+        journal(None, small_state(), np.array([5, 5]))
+
+
+def test_a_folder_that_vanishes_does_no_harm(tmp_path: Path) -> None:
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        walk(Journal(tmp_path / "gone" / "batch.nc", KEYS, fake_drive, seconds=0), 4),
+        walk(fake_drive, 4),
+    )
+
+
+def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "time", lambda: 0.0)
+    path = tmp_path / "batch.nc"
+    journal = Journal(path, KEYS, fake_drive, seconds=0.01)
+    for k in range(3):
+        time.sleep(0.02)
+        journal(None, small_state(), np.array([k, k]))
+    assert len(read_arrays(path)[0]["tallies"]) == 3

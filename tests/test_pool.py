@@ -1,0 +1,88 @@
+"""Every task is done once whatever happens to its worker, and no worker outlives its parent."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pool_tasks
+import pytest
+
+from jaxgran.pool import ATTEMPTS, Died, run_tasks
+
+
+def run(function, tasks, workers: int = 2, hear=lambda _: None) -> dict:
+    """Results by task, each of which is yielded once."""
+    yielded = list(run_tasks(function, tasks, workers, pool_tasks.prepare, (), hear))
+    assert len({number for number, _ in yielded}) == len(yielded)
+    return dict(yielded)
+
+
+def is_alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().split(") ")[1][0] != "Z"
+    except OSError:
+        return False
+
+
+def gone(processes: list[int], patience: float = 10.0) -> bool:
+    """Whether the processes end within some seconds."""
+    end = time.monotonic() + patience
+    while time.monotonic() < end and any(map(is_alive, processes)):
+        time.sleep(0.05)
+    return not any(map(is_alive, processes))
+
+
+def test_every_task_is_done_and_every_message_heard() -> None:
+    heard: list[int] = []
+    assert run(pool_tasks.square, [(k,) for k in range(20)], hear=heard.append) == {k: k * k for k in range(20)}
+    assert sorted(heard) == list(range(20))
+
+
+def test_a_dead_worker_is_replaced_and_its_task_repeated(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), k, ATTEMPTS - 1 if k in (1, 4) else 0) for k in range(6)]
+    assert run(pool_tasks.die_at_first, tasks) == {k: k for k in range(6)}
+
+
+def test_a_task_that_keeps_killing_its_worker_is_given_up_and_the_others_are_done(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), k, 99 if k == 1 else 0) for k in range(6)]
+    results = run(pool_tasks.die_at_first, tasks)
+    assert isinstance(results.pop(1), Died)
+    assert results == {k: k for k in (0, 2, 3, 4, 5)}
+    assert len(list(tmp_path.iterdir())) == ATTEMPTS
+
+
+def test_a_mistake_in_a_task_is_raised() -> None:
+    with pytest.raises(ValueError, match="task 0 is wrong"):
+        run(pool_tasks.fail, [(0,)])
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_workers_end_with_the_iterator() -> None:
+    running = run_tasks(pool_tasks.process_id, [(0.0,), (30.0,), (30.0,)], 2, pool_tasks.prepare, (), lambda _: None)
+    _, process = next(running)
+    start = time.monotonic()
+    running.close()
+    assert time.monotonic() - start < 5 and gone([process])
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_no_worker_outlives_a_parent_that_is_killed() -> None:
+    script = """
+import pool_tasks, sys
+from jaxgran.pool import run_tasks
+if __name__ == "__main__":
+    tasks = [(0.5,), (0.5,), (60,), (60,)]
+    for _, process in run_tasks(pool_tasks.process_id, tasks, 2, pool_tasks.prepare, (), print):
+        print(process, flush=True)
+"""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
+    assert parent.stdout is not None
+    workers = [int(parent.stdout.readline()) for _ in range(2)]
+    assert all(map(is_alive, workers))
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    assert gone(workers)
