@@ -22,7 +22,6 @@ from jaxgran.dataset import read_dataset
 pytestmark = [
     pytest.mark.faults,
     pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
-    pytest.mark.xdist_group("faults"),
 ]
 DRIVER = Path(__file__).with_name("fault_driver.py")
 MAP = (
