@@ -25,7 +25,7 @@ from rich.table import Table
 # XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from jaxgran.flow import Activation, InputError, Solver
+from jaxgran.flow import MAX_REPLICAS, Activation, InputError, Solver, shown
 from jaxgran.progress import progress
 
 NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
@@ -67,7 +67,10 @@ def main() -> None:
     except InputError as mistake:
         _stop(str(mistake))
     except _UsageError as mistake:
-        _stop(f"{mistake.format_message().rstrip('.')}.")
+        words = " ".join(mistake.format_message().split()).rstrip(".")
+        _stop(f"{words if len(words) <= 500 else f'{words[:250]} … {words[-245:]}'}.")
+    except OSError as error:
+        _stop(f"stopped by the file system, {error.strerror or error}.", NO_FILE)
     raise SystemExit(status)
 
 
@@ -77,13 +80,14 @@ def number_list(text: str, name: str) -> tuple[float, ...]:
         if ":" in text:
             start, stop, count = text.split(":")
             steps = int(count) - 1
-            if steps < 1:
+            if not 1 <= steps < MAX_REPLICAS:
                 raise ValueError(count)
             return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
         return tuple(float(x) for x in text.split(","))
     except ValueError:
         raise InputError(
-            f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with count >= 2, not {text!r}."
+            f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to "
+            f"{MAX_REPLICAS}, not {shown(text)}."
         ) from None
 
 
@@ -179,8 +183,8 @@ def plot_command(
 
     data = read_dataset(file)
     folder = file.parent if output is None else output
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"output must be a folder that exists and can be written to, not {str(folder)!r}.")
+    if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
+        raise InputError(f"output must be a folder that exists and can be written to, not {shown(str(folder))}.")
     _say_written(save_figures(data, folder / file.stem))
 
 
@@ -205,7 +209,7 @@ def run_command(
             raise InputError(f"{name} is not available yet: run without it.")
     step = _numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
-        raise InputError(f"timestep must be one number or auto, not {timestep!r}.")
+        raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
     chosen = {
         "restitution": (restitution,),
         "packing_fraction": (packing_fraction,),
@@ -285,8 +289,8 @@ def _compilation_cache() -> str:
 def _batch(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
-    if not text.isdecimal() or int(text) < 1:
-        raise InputError(f"batch must be auto or a whole number of at least 1, not {text!r}.")
+    if not text.isdecimal() or len(text) > 9 or int(text) < 1:
+        raise InputError(f"batch must be auto or a whole number of at least 1, below a billion, not {shown(text)}.")
     return int(text)
 
 
@@ -325,7 +329,7 @@ def _measure(
     results = {} if checkpoint is None else dict(checkpoint.done)
     run: dict[str, Any] = {
         "automatic_choice": automatic_choice,
-        "command": shlex.join(["jaxgran", *sys.argv[1:]]),
+        "command": os.fsencode(shlex.join(["jaxgran", *sys.argv[1:]])).decode(errors="backslashreplace"),
         "workers": workers,
         "resumed_replicas": len(results),
     }

@@ -14,6 +14,8 @@ import numpy as np
 from jax.scipy.special import erf
 from jaxtyping import Array, Float
 
+from jaxgran.flow import require_number
+
 
 class Kernel(NamedTuple):
     """A coarse-graining function of unit width, g(q), normalised in the plane.
@@ -115,14 +117,19 @@ class CoarseGraining:
 
 def gaussian(width: float | Array) -> CoarseGraining:
     """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w: smooth everywhere, not cut off within the cell."""
-    return CoarseGraining(width, GAUSSIAN)
+    return _of_width(width, "width", GAUSSIAN)
 
 
 def lucy(radius: float | Array) -> CoarseGraining:
     """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c: compact, with two continuous derivatives."""
-    return CoarseGraining(radius, LUCY)
+    return _of_width(radius, "radius", LUCY)
 
 
 def heaviside(radius: float | Array) -> CoarseGraining:
     """The average over a disc of radius c, 1/(πc²): fields jump where a grain enters, so no derivatives."""
-    return CoarseGraining(radius, HEAVISIDE)
+    return _of_width(radius, "radius", HEAVISIDE)
+
+
+def _of_width(width: float | Array, name: str, kernel: Kernel) -> CoarseGraining:
+    require_number(name, width, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    return CoarseGraining(width, kernel)

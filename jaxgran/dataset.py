@@ -9,16 +9,19 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, fields
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import h5py
 import jax
 import numpy as np
 import xarray as xr
 
 from jaxgran.batch import stack
-from jaxgran.flow import InputError
+from jaxgran.flow import InputError, shown
 from jaxgran.kinetic_theory import gaussian_moments
+from jaxgran.maps import RATIO, what_lacks
 from jaxgran.measure import Sample, correlation_strains, estimates
 from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
@@ -30,6 +33,7 @@ NOT_RUN = -1
 Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
+_LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside the output are longer
 _PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
 _AXES = {
     "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
@@ -149,12 +153,17 @@ def map_dataset(
 def check_output(path: Path) -> None:
     """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
     if path.suffix != ".nc":
-        raise InputError(f"output must be a file name that ends in .nc, not {str(path)!r}.")
+        raise InputError(f"output must be a file name that ends in .nc, not {shown(str(path))}.")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise InputError(f"output must be a file name of at most {_LONGEST_NAME} bytes, not {shown(path.name)}.")
     for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in _PICTURES)):
-        if file.is_dir():
+        if os.path.isdir(file):
             raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
-    if not path.parent.is_dir():
-        raise InputError(f"output must be in a folder that exists, and {str(path.parent)!r} does not.")
+    if not os.path.isdir(path.parent):
+        raise InputError(f"output must be in a folder that exists, and {shown(str(path.parent))} does not.")
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    if unfinished.exists() and not unfinished.is_dir():
+        raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
@@ -170,21 +179,26 @@ def check_output(path: Path) -> None:
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
+    content = BytesIO()
+    data.to_netcdf(content, engine="h5netcdf")
     with replaced(path) as temporary:
-        data.to_netcdf(temporary, engine="h5netcdf")
+        temporary.write_bytes(content.getbuffer())
 
 
 def read_dataset(path: Path) -> xr.Dataset:
     """Read a dataset that ``write_dataset`` wrote; ValueError in one sentence where it is not one."""
-    if not path.is_file():
-        raise InputError(f"there is no file {str(path)!r}.")
+    if not os.path.isfile(path):
+        raise InputError(f"there is no file {shown(str(path))}.")
     try:
+        with h5py.File(path, "r") as file:  # h5netcdf complains a second time about what it could not open
+            file.attrs.get("_nc3_strict")
         data = xr.load_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{str(path)!r} is not a NetCDF file that can be read: {error}.") from None
-    missing = {"force_ratio", "force_ratio_stderr", "status"} - set(data.variables)
-    if missing:
-        raise InputError(f"{str(path)!r} is not a ratio map: it has no {', '.join(sorted(missing))}.")
+    except Exception as error:  # a torn file may fail in any way
+        why = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
+    lack = what_lacks(data, *RATIO, "status")
+    if lack:
+        raise InputError(f"{shown(str(path))} is not a ratio map: {lack}.")
     return data
 
 
@@ -197,6 +211,8 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
                 chosen[field.name] = tuple(data[field.name].values.tolist())
             elif field.name in data.attrs:
                 chosen[field.name] = np.asarray(data.attrs[field.name]).tolist()
+            elif field.name not in ("strain", "error"):  # one is there in place of the other
+                raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")

@@ -20,6 +20,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxgran.flow import InputError, shown
+
+LONGEST_NAME = 200  # bytes; file systems take 255, and the names of figures are longer
 LABEL_SIZE, TICK_SIZE, SMALL_SIZE = 9.0, 8.0, 7.0  # fonts, in points
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
@@ -67,7 +70,7 @@ def is_plane(data: xr.Dataset) -> bool:
 def require_plane(data: xr.Dataset) -> None:
     """Raise a ValueError where a map is no plane."""
     if not is_plane(data):
-        raise ValueError(
+        raise InputError(
             "contours need at least two restitutions and two packing fractions, "
             f"and this map has {data.sizes['restitution']} and {data.sizes['packing_fraction']}."
         )
@@ -220,6 +223,20 @@ def _run_description(attrs: dict) -> str:
     if "strain" in attrs:
         parts.append(f"strain {float(attrs['strain']):g} per seed")
     return ", ".join(parts)
+
+
+def writable_stem(stem: Path | str) -> Path:
+    """Return folder and beginning of the names of figures, or raise an InputError where none can be written."""
+    if not isinstance(stem, (str, os.PathLike)):
+        raise InputError(f"stem must be folder and beginning of the file names, not {shown(stem)}.")
+    stem = Path(stem)
+    if len(os.fsencode(stem.name)) > LONGEST_NAME:
+        raise InputError(f"the names of figures must begin with at most {LONGEST_NAME} bytes, not {shown(stem.name)}.")
+    if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
+        raise InputError(
+            f"figures must be written to a folder that exists and can be written to, not {shown(str(stem.parent))}."
+        )
+    return stem
 
 
 def write(figure: Figure, path: Path) -> Path:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.delassus import grain_impulses, in_clusters
-from jaxgran.flow import ShearFlow
+from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number
 from jaxgran.grains import Grains
 from jaxgran.pairs import (
     Frame,
@@ -60,6 +60,16 @@ class State:
     velocities: Float[Array, "grains 2"]
     side: Float[Array, ""]
     tilt: Float[Array, ""]
+
+
+def require_state(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError unless this is one flow, and one state of its grains."""
+    require_flow(flow)
+    if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
+        raise InputError(
+            f"state must be one State of {flow.grains} grains, best from prepare, not "
+            f"{f'of positions {jnp.shape(state.positions)}' if isinstance(state, State) else type(state).__name__}."
+        )
 
 
 class _Pairs(NamedTuple):
@@ -107,6 +117,9 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
       The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
       the status ``nonfinite``.
     """
+    require_state(flow, state)
+    words = f"a whole number of 0 to {MAX_STEPS}"
+    require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
 
     def unfinished(now: _Carry):

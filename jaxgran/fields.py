@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.cell import displacement
 from jaxgran.coarse_graining import CoarseGraining
 from jaxgran.dynamics import State
-from jaxgran.flow import require
+from jaxgran.flow import InputError, require, shown
 from jaxgran.snapshots import Snapshot, collided
 
 _POINTS_AT_ONCE, _BRANCHES_AT_ONCE = 128, 128
@@ -124,6 +124,12 @@ def fields_at(seen: Snapshot, points: Float[Array, "points 2"], graining: Coarse
 
     Sources: see the head of this file.
     """
+    if not isinstance(seen, Snapshot) or jnp.ndim(seen.state.positions) != 2:
+        raise InputError("seen must be one Snapshot: one of a series is jax.tree.map(lambda x: x[k], series).")
+    if not isinstance(graining, CoarseGraining):
+        raise InputError(f"graining must be made by gaussian, lucy or heaviside, not {shown(graining)}.")
+    words = "an array (points, 2) of finite numbers"
+    require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), words)
     _check(graining, seen.state)
     return _fields_at(seen, points, graining)
 

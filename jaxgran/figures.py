@@ -55,8 +55,11 @@ from jaxgran.drawing import (
     scientific,
     status_note,
     suspect,
+    writable_stem,
     write,
 )
+from jaxgran.flow import InputError
+from jaxgran.maps import RATIO, require_map
 from jaxgran.rheology_figures import friction_figure, has_friction_law
 from jaxgran.theory_figures import (
     cluster_shares,
@@ -82,6 +85,7 @@ def ratio_curves(data: xr.Dataset) -> Figure:
                                              status is not `ok` is an open symbol in a ring
     ======== =============================== =====================================================
     """
+    require_map(data, *RATIO)
     data = finest(ordered(data))
     figure = empty_figure(width=5.0, height=3.5)
     axes = figure.add_subplot()
@@ -116,6 +120,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
+    require_map(data, *RATIO)
     require_plane(data)
     data = finest(ordered(data))
     x, y = refined_axes(data)
@@ -156,8 +161,9 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
     raises   ValueError                                fewer than two time steps
     ======== ========================================= =============================================
     """
+    require_map(data, *RATIO)
     if not _has_timesteps(data):
-        raise ValueError(
+        raise InputError(
             f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
         )
     data = ordered(data)
@@ -205,9 +211,11 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
     stem     path          folder and beginning of the names; the folder must exist
     returns  list of Path  the files written, in the order above
+    raises   ValueError    this is no map, or no files can be written there
     ======== ============= =====================================================================
     """
-    stem = Path(stem)
+    require_map(data, *RATIO)
+    stem = writable_stem(stem)
     figures = {
         "curves": (True, ratio_curves),
         "contours": (is_plane(data), ratio_contours),
@@ -216,11 +224,11 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
         "clusters": (has_clusters(data), cluster_shares),
         "rheology": (has_friction_law(data), friction_figure),
     }
-    return [
-        write(draw(data), stem.with_name(f"{stem.name}_{name}.png"))
-        for name, (possible, draw) in figures.items()
-        if possible
-    ]
+    drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}
+    for path in drawn:
+        if path.is_dir():
+            raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
+    return [write(draw(data), path) for path, draw in drawn.items()]
 
 
 def _has_timesteps(data: xr.Dataset) -> bool:

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from typing import Literal, get_args
+from reprlib import Repr
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -12,7 +13,10 @@ Activation = Literal["midpoint", "touching"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83
-MIN_GRAINS = 16
+MIN_GRAINS, MAX_GRAINS = 16, 10**7  # more would need some 20 GB
+MAX_REPLICAS = 10**6  # of a map
+MAX_STEPS = 2**31 - 1  # of a sample: they are counted in an int32
+SHORTEST_TIMESTEP = 1e-8  # in 1/shear_rate: the longest block of a run has fewer steps than MAX_STEPS
 
 
 class InputError(ValueError):
@@ -33,7 +37,7 @@ class ShearFlow:
     ================  =================  ===============================================================
     field             unit               meaning
     ================  =================  ===============================================================
-    grains            –                  number of discs N, at least 16
+    grains            –                  number of discs N, 16 to 1e7
     restitution       –                  α in [0, 1], ratio of normal velocities after and before
     packing_fraction  –                  ν in (0, 0.83], area of the grains over the area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
@@ -64,19 +68,21 @@ class ShearFlow:
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
 
     def __post_init__(self):
-        whole = isinstance(self.grains, (int, np.integer)) and not isinstance(self.grains, bool)
-        if not whole or self.grains < MIN_GRAINS:
-            raise InputError(f"grains must be a whole number of at least {MIN_GRAINS}, not {self.grains!r}.")
+        require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
         for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {getattr(self, name)!r}."
-                )
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in allowed:
+                raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")
         for name, (accepts, words) in _RANGES.items():
             require(name, getattr(self, name), accepts, words)
+        shapes = sorted({np.shape(getattr(self, name)) for name in _RANGES} - {()})
+        if len(shapes) > 1:
+            raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {shown(shapes)}.")
         timestep, shear_rate = _known(self.timestep), _known(self.shear_rate)
-        if timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1):
-            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {self.timestep!r}.")
+        with np.errstate(over="ignore"):
+            too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
+        if too_long:
+            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {shown(self.timestep)}.")
 
     @property
     def activation_fraction(self) -> float:
@@ -121,12 +127,14 @@ _RANGES = {
 }
 
 
-def _known(value) -> np.ndarray | None:
-    """The value as an array of numbers, or None while it is only traced or a placeholder of a pytree."""
-    numbers = (bool, int, float, complex, str, list, tuple, np.generic, np.ndarray, jax.Array)
-    if isinstance(value, Tracer) or not isinstance(value, numbers):
+def _known(value: Any) -> np.ndarray | None:
+    """The value as an array, of numbers if it is a number or an array of them; None while it is traced."""
+    if isinstance(value, Tracer):
         return None
-    return np.asarray(value)
+    key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
+    number = isinstance(value, (bool, int, float, np.generic, np.ndarray, jax.Array)) and not key
+    number = number and not isinstance(value, np.ma.MaskedArray)  # whose values need not mean anything
+    return np.asarray(value if number else None)
 
 
 def two_digits(value: float, up: bool) -> str:
@@ -135,10 +143,61 @@ def two_digits(value: float, up: bool) -> str:
     return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
 
 
+_BRIEF = Repr()
+_BRIEF.maxother = _BRIEF.maxstring = 100
+
+
+def shown(value: Any) -> str:
+    """A value as one short line, for a sentence."""
+    try:
+        return " ".join(_BRIEF.repr(value).split())
+    except ValueError:  # of a whole number with thousands of digits
+        return f"this {type(value).__name__}"
+
+
 def require(name: str, value, accepts, words: str) -> None:
     """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
     known = _known(value)
     if known is None:
         return
-    if isinstance(value, (list, tuple)) or known.dtype.kind not in "iuf" or not np.all(accepts(known)):
-        raise InputError(f"{name} must be {words}, not {' '.join(repr(value).split())}.")
+    if known.dtype.kind not in "iuf" or known.size == 0 or not np.all(accepts(known)):
+        raise InputError(f"{name} must be {words}, not {shown(value)}.")
+
+
+def require_number(name: str, value, accepts, words: str) -> None:
+    """The same for what must be a single number."""
+    require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
+
+
+def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
+    """Raise an InputError that says what is accepted, and why not more, unless the value is such a whole number."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} must be a whole number of at least {least}, not {shown(value)}.")
+    if value > most:
+        raise InputError(f"{name} must be at most {most}, {why}, not {shown(value)}.")
+
+
+def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
+    """Raise an InputError unless a strain is at least a time step for each part, and no more than can be counted."""
+    require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
+        step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
+        least, most = parts * step, MAX_STEPS * step
+        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}")
+        require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
+
+
+def require_flow(flow: Any) -> None:
+    """Raise an InputError unless this is one ShearFlow, not a batch."""
+    if not isinstance(flow, ShearFlow):
+        raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
+    if any(np.ndim(getattr(flow, name)) for name in _TRACED):
+        raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")
+
+
+def require_key(key: Any) -> None:
+    """Raise an InputError unless this is one random key of JAX."""
+    typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
+    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
+    if not typed and not raw:
+        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")

@@ -11,13 +11,13 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from jaxgran.dynamics import State, advance
-from jaxgran.flow import InputError, ShearFlow, require, two_digits
+from jaxgran.dynamics import State, advance, require_state
+from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, two_digits
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, correlation_length, jackknife
 from jaxgran.tally import Tally
 
-BLOCKS = 32
+BLOCKS, MOST_BLOCKS = 32, 10**6
 ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # those that a relative error is asked for
 _ROUNDING_STEPS = 20  # a grain at shear velocity must move by that many roundings of a position in one step
 
@@ -159,13 +159,12 @@ def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = B
       The state at the end and the sample.
 
     Raises:
-      ValueError: the strain is not a positive number or shorter than a time step for each block, or positions in
-        float32 cannot resolve the time step.
+      ValueError: the strain is not a positive number, shorter than a time step for each block or longer than 2**31 - 1
+        of them, or positions in float32 cannot resolve the time step.
     """
-    require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
-        least = blocks * np.max(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
-        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {blocks} time steps, {least:g}")
+    require_state(flow, state)
+    require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
+    require_strain(flow, strain, blocks)
     check_precision(flow, state)
     return _sample(flow, state, strain, blocks)
 

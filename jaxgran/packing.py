@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.cell import cell_side
 from jaxgran.dynamics import State
-from jaxgran.flow import ShearFlow
+from jaxgran.flow import ShearFlow, require_flow, require_key
 from jaxgran.grains import Grains, polydisperse
 from jaxgran.pairs import Frame, Neighbourhood, consumed_skin, neighbourhood, present, refresh, separations_now
 from jaxgran.replica import any_replica, where_active
@@ -47,6 +47,8 @@ def pack(flow: ShearFlow, key: Array) -> tuple[State, Bool[Array, ""]]:
       The state, with zero velocities and no tilt, and False where ten random starts all got stuck, which below
       the largest accepted packing fraction 0.83 is not expected.
     """
+    require_flow(flow)
+    require_key(key)
     size_key, place_key = jax.random.split(key)
     grains = polydisperse(flow.grains, flow.polydispersity, size_key)
     side = cell_side(grains.radii, flow.packing_fraction)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.batch import Drive, advance_batch, replicated, stack
 from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow, two_digits
+from jaxgran.flow import SHORTEST_TIMESTEP, InputError, ShearFlow, require_flow, require_key, require_number, two_digits
 from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
 from jaxgran.measure import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.observables import averages
@@ -74,6 +74,11 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
         positions cannot resolve the step.
       RuntimeError: the flow did not become steady, or ended with a bad status.
     """
+    require_flow(flow)
+    require_key(key)
+    if equilibrate is not None:
+        words = "None or a number of at least 0 and at most 1e6"
+        require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     batch = prepare_batch(stack([flow]), key[None], equilibrate)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if batch.status[0] > tolerated:
@@ -148,6 +153,10 @@ def predicted(flow: ShearFlow) -> SteadyShear:
 
 def check_timestep(flow: ShearFlow, theory: SteadyShear) -> None:
     """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step."""
+    if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < 0.49 * SHORTEST_TIMESTEP):
+        raise InputError(
+            f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
+        )
     longest = _CROSSING / _thermal_speed(theory)
     too_long = np.asarray(flow.timestep) > longest
     if np.any(too_long):

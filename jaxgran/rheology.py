@@ -16,6 +16,8 @@ import numpy as np
 import xarray as xr
 from scipy.optimize import curve_fit
 
+from jaxgran.flow import InputError, require_number
+from jaxgran.maps import require_map
 from jaxgran.status import Status
 
 LARGEST_INERTIAL_NUMBER, SMALLEST_PACKING_FRACTION = 0.3, 0.7  # of a dense flow
@@ -96,9 +98,15 @@ def friction_law(
                                                                 fewer than three packing fractions
     =========================  ===============================  =====================================================
     """
+    require_map(data, *NEEDED)
+    for name, limit in (
+        ("largest_inertial_number", largest_inertial_number),
+        ("smallest_packing_fraction", smallest_packing_fraction),
+    ):
+        require_number(name, limit, lambda x: ~np.isnan(x), "a number")
     points = dense_points(data, largest_inertial_number, smallest_packing_fraction)
     if not enough(points):
-        raise ValueError(
+        raise InputError(
             f"a friction law needs at least {FEWEST_POINTS} points of status ok at {FEWEST_PACKING_FRACTIONS} packing "
             f"fractions, with I <= {largest_inertial_number:g} and packing fraction >= {smallest_packing_fraction:g}, "
             f"and this map has {points.sizes['point']} at {len(np.unique(points.packing_fraction))}."

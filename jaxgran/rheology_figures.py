@@ -28,6 +28,7 @@ from jaxgran.drawing import (
     status_note,
     suspect,
 )
+from jaxgran.maps import RATIO, require_map, what_lacks
 from jaxgran.rheology import (
     LARGEST_INERTIAL_NUMBER,
     NEEDED,
@@ -48,7 +49,7 @@ _FRICTION_NOTE = (
 
 def has_friction_law(data: xr.Dataset) -> bool:
     """Return whether a map has what :func:`friction_figure` draws, with enough dense points."""
-    return all(name in data for name in NEEDED) and enough(dense_points(data))
+    return not what_lacks(data, *NEEDED) and enough(dense_points(data))
 
 
 def friction_figure(data: xr.Dataset) -> Figure:
@@ -61,6 +62,7 @@ def friction_figure(data: xr.Dataset) -> Figure:
     raises   ValueError                      too few dense points
     ======== =============================== =====================================================
     """
+    require_map(data, *RATIO, *NEEDED)
     data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
     law = friction_law(data)
     measured = np.isfinite(data.macroscopic_friction.values)

@@ -9,17 +9,17 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.cell import remap_tilt, wrap
 from jaxgran.contacts import Contacts
 from jaxgran.delassus import grain_impulses
-from jaxgran.dynamics import State, advance, contacts_now
-from jaxgran.flow import ShearFlow, require
+from jaxgran.dynamics import State, advance, contacts_now, require_state
+from jaxgran.flow import ShearFlow, require_strain, require_whole
 from jaxgran.solver import solve
+
+_MOST_SNAPSHOTS = 10**9  # times grains
 
 
 @jax.tree_util.register_dataclass
@@ -83,12 +83,12 @@ def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count:
       The state at the end, which is that of the last snapshot, and the snapshots with a leading (times,) axis.
 
     Raises:
-      ValueError: the strain is not a positive number, or shorter than a time step for each snapshot.
+      ValueError: the strain is not a positive number, shorter than a time step for each snapshot or longer than
+        2**31 - 1 of them.
     """
-    require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
-        least = count * np.max(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
-        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {count} time steps, {least:g}")
+    require_state(flow, state)
+    require_whole("count", count, 1, _MOST_SNAPSHOTS // flow.grains, "as memory is limited")
+    require_strain(flow, strain, count)
     return _snapshot_series(flow, state, strain, count)
 
 

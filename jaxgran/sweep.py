@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from jaxgran.batch import Drive, Report, advance_batch, reporting, stack
 from jaxgran.checkpoint import Checkpoint
 from jaxgran.cluster import run_on_cluster
 from jaxgran.dataset import Key, Replica, map_dataset
-from jaxgran.flow import Activation, InputError, ShearFlow, Solver
+from jaxgran.flow import MAX_REPLICAS, Activation, InputError, ShearFlow, Solver, shown
 from jaxgran.journal import Journal
 from jaxgran.pool import Died, run_tasks, send
 from jaxgran.protocol import COARSE_TIMESTEP, prepare_batch, sample_batch
@@ -37,6 +37,7 @@ _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
 _GRAIN_BYTES = 2000  # lists, network and state of a replica
 _SHARE_OF_MEMORY = 0.5
+_MOST_WORKERS = 1024
 _LIKE = 2  # replicas that advance in lockstep differ in cost by at most this factor
 
 
@@ -88,13 +89,12 @@ def ratio_map(
     Raises:
       ValueError: a parameter is out of range; the sentence says what is accepted.
     """
-    dt = np.asarray(timestep).tolist()
     choices = {
-        "restitution": tuple(float(x) for x in restitution),
-        "packing_fraction": tuple(float(x) for x in packing_fraction),
+        "restitution": restitution,
+        "packing_fraction": packing_fraction,
         "grains": grains,
         "seeds": seeds,
-        "timestep": tuple(dt) if isinstance(dt, list) else dt,
+        "timestep": timestep,
         "equilibrate": equilibrate,
         "strain": strain,
         "error": error,
@@ -102,9 +102,11 @@ def ratio_map(
         "solver": solver,
         "activation": activation,
     }
-    numbers, automatic_choice = automatic(choices, target_error)
+    numbers, automatic_choice = automatic({name: _plain(x) for name, x in choices.items()}, target_error)
     settings = MapSettings(**numbers)
     check_batches(batch, workers)
+    if report is not None and not callable(report):
+        raise InputError(f"report must be a function of one number, not {shown(report)}.")
     start, done = perf_counter(), 0.0
 
     def count(steps: float) -> None:
@@ -127,10 +129,12 @@ def ratio_map(
 def check_batches(batch: int | Literal["auto"], workers: int) -> None:
     """Raise a ValueError in one sentence where replicas cannot be run in such batches by so many processes."""
     for name, value in (("batch", batch), ("workers", workers)):
-        whole = isinstance(value, int) and not isinstance(value, bool) and value >= 1
-        if not whole and (name, value) != ("batch", "auto"):
+        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
+        if not whole and not (name == "batch" and isinstance(value, str) and value == "auto"):
             words = "auto or a whole number" if name == "batch" else "a whole number"
-            raise InputError(f"{name} must be {words} of at least 1, not {value!r}.")
+            raise InputError(f"{name} must be {words} of at least 1, not {shown(value)}.")
+    if workers > _MOST_WORKERS:
+        raise InputError(f"workers must be at most {_MOST_WORKERS}, not {shown(workers)}.")
     if workers > 1 and jax.default_backend() != "cpu":
         raise InputError("workers must be 1 on an accelerator.")
 
@@ -176,6 +180,18 @@ def replicas(
             if scheduler is not None:
                 hear(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
             yield from outcome
+
+
+def _plain(value: Any) -> Any:
+    """A number as it is in Python, a list or array of them as a tuple; what is neither is left for ``MapSettings``."""
+    try:
+        if isinstance(value, np.ma.MaskedArray) or (isinstance(value, Sequence) and len(value) > MAX_REPLICAS):
+            return value
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # a key, or lists of several lengths
+        return value
+    plain = array.astype(float).tolist() if array.ndim and array.dtype.kind in "iu" else array.tolist()
+    return tuple(plain) if isinstance(plain, list) else plain
 
 
 def usable_cores() -> int:

@@ -47,6 +47,7 @@ from jaxgran.drawing import (
     status_note,
     suspect,
 )
+from jaxgran.maps import RATIO, require_map, what_lacks
 
 ERROR_LEVELS = {
     "÷10": np.log(0.1),
@@ -69,6 +70,9 @@ SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
 """Contour values of the share of the clusters."""
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
+_STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
+_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
+_SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # where its logarithmic axis begins at the latest
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 _CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
@@ -81,12 +85,12 @@ _THEORY_NOTE = (
 
 def has_theory(data: xr.Dataset) -> bool:
     """Return whether a map has what :func:`theory_errors` draws."""
-    return all(f"theory_{name}" in data for name in _QUANTITIES)
+    return not what_lacks(data, *RATIO, *_NEEDED)
 
 
 def has_clusters(data: xr.Dataset) -> bool:
     """Return whether a map has what :func:`cluster_shares` draws."""
-    return "cluster_pressure_share" in data
+    return not what_lacks(data, *RATIO, *_SHARES)
 
 
 # ---------------------------------------------------------------------------------------------- theory
@@ -136,9 +140,9 @@ def theory_errors(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
+    require_map(data, *RATIO, *_NEEDED)
     require_plane(data)
-    stresses = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
-    data = finest(ordered(data, *stresses, "stress_ratio"))
+    data = finest(ordered(data, *_STRESSES, "stress_ratio"))
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
     figure = empty_figure(width=7.6, height=5.9)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
@@ -211,6 +215,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     returns  Figure                          error bars are one standard error, in both directions
     ======== =============================== =====================================================
     """
+    require_map(data, *RATIO, *_SHARES)
     data = finest(ordered(data, "cluster_pressure_share", "cluster_shear_share"))
     shares = {"pressure": "cluster_pressure_share", "shear stress": "cluster_shear_share"}
     measured = np.isfinite(data.cluster_pressure_share.values)

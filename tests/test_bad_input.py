@@ -1,0 +1,650 @@
+"""Bad input of any kind ends with one sentence that says what is accepted: nothing runs, and no file is left behind."""
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import h5netcdf
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import one_sentence, snapshot_of
+from test_cli import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
+from test_figures import ratio_dataset, with_timesteps
+
+import jaxgran as jg
+from jaxgran import fields, measure, protocol, snapshots, sweep
+from jaxgran import settings as map_settings
+from jaxgran.dataset import read_dataset
+from jaxgran.flow import InputError
+from jaxgran.status import Status
+
+GRAINS = 32
+FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
+MAP = {"restitution": [0.5, 0.9], "packing_fraction": [0.6]}
+WOULD_RUN = 77  # exit status of a command whose input is accepted, in these tests
+SECONDS = 1.0  # in which bad input is refused, whatever it is
+few = partial(settings, deadline=None, derandomize=True)
+
+
+class WouldRun(Exception):
+    """The input has been accepted."""
+
+
+def would_run(*_, **__):
+    raise WouldRun
+
+
+def cold(flows: jg.ShearFlow) -> np.ndarray:
+    """A temperature in place of the theory's, which is compiled for every number of points."""
+    return np.full(np.shape(flows.restitution), 0.1)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_runs() -> Iterator[None]:
+    """Whatever a public function would compile and run raises ``WouldRun``."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name in (
+            (measure, "_sample"),
+            (snapshots, "_snapshot_series"),
+            (fields, "_fields_at"),
+            (protocol, "prepare_batch"),
+            (sweep, "replicas"),
+        ):
+            patch.setattr(module, name, would_run)
+        patch.setattr(map_settings, "_temperature", cold)
+        yield
+
+
+def verdict(function: Callable[[Any], Any], value: Any) -> str:
+    """The sentence that refuses a value, empty where it is accepted; all else is a failure."""
+    start = time.perf_counter()
+    try:
+        function(value)
+    except WouldRun:
+        return ""
+    except InputError as mistake:
+        assert one_sentence(str(mistake)), mistake
+        assert len(str(mistake)) < 500
+        assert time.perf_counter() - start < SECONDS
+        return str(mistake)
+    return ""
+
+
+# Python: every argument of the public functions
+
+KEY = jax.random.key(0)
+SEEN = jax.tree.map(lambda x: x[0], snapshot_of(np.random.default_rng(0).uniform(0, 40, (1, GRAINS, 2))))
+POINT = np.zeros((1, 2))
+
+
+def flow() -> jg.ShearFlow:
+    return jg.ShearFlow(**FLOW)
+
+
+def make_flow(name: str, value: Any) -> jg.ShearFlow:
+    return jg.ShearFlow(**{**FLOW, name: value})
+
+
+def make_map(name: str, value: Any) -> xr.Dataset:
+    return jg.ratio_map(**{**MAP, name: value})
+
+
+NUMBERS: dict[str, Callable[[Any], Any]] = {
+    **{f"ShearFlow {name}": partial(make_flow, name) for name in jg.ShearFlow.__dataclass_fields__},
+    **{f"ratio_map {name}": partial(make_map, name) for name in sweep.ratio_map.__kwdefaults__},
+    "ratio_map restitution": partial(make_map, "restitution"),
+    "ratio_map packing_fraction": partial(make_map, "packing_fraction"),
+    "polydisperse count": lambda x: jg.polydisperse(x, 0.2, "no key"),
+    "polydisperse polydispersity": lambda x: jg.polydisperse(4, x, "no key"),
+    "prepare equilibrate": lambda x: jg.prepare(flow(), KEY, x),
+    "sample strain": lambda x: jg.sample(flow(), SEEN.state, x),
+    "sample blocks": lambda x: jg.sample(flow(), SEEN.state, 1.0, x),
+    "snapshot_series strain": lambda x: jg.snapshot_series(flow(), SEEN.state, x, 4),
+    "snapshot_series count": lambda x: jg.snapshot_series(flow(), SEEN.state, 1.0, x),
+    "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.lucy(1.0)),
+    "gaussian width": lambda x: jg.fields_at(SEEN, POINT, jg.gaussian(x)),
+    "lucy radius": lambda x: jg.fields_at(SEEN, POINT, jg.lucy(x)),
+    "heaviside radius": lambda x: jg.fields_at(SEEN, POINT, jg.heaviside(x)),
+    "friction_law largest_inertial_number": lambda x: jg.friction_law(dense_map(), x),
+    "friction_law smallest_packing_fraction": lambda x: jg.friction_law(dense_map(), 0.3, x),
+}
+OBJECTS: dict[str, Callable[[Any], Any]] = {
+    "polydisperse key": lambda x: jg.polydisperse(4, 0.2, x),
+    "pack flow": lambda x: jg.pack(x, KEY),
+    "pack key": lambda x: jg.pack(flow(), x),
+    "prepare flow": lambda x: jg.prepare(x, KEY),
+    "prepare key": lambda x: jg.prepare(flow(), x),
+    "sample flow": lambda x: jg.sample(x, SEEN.state, 1.0),
+    "sample state": lambda x: jg.sample(flow(), x, 1.0),
+    "advance flow": lambda x: jg.advance(x, SEEN.state, 1),
+    "advance state": lambda x: jg.advance(flow(), x, 1),
+    "snapshot_series flow": lambda x: jg.snapshot_series(x, SEEN.state, 1.0, 4),
+    "snapshot_series state": lambda x: jg.snapshot_series(flow(), x, 1.0, 4),
+    "fields_at seen": lambda x: jg.fields_at(x, POINT, jg.lucy(1.0)),
+    "fields_at graining": lambda x: jg.fields_at(SEEN, POINT, x),
+    "friction_law data": jg.friction_law,
+    **{
+        name: getattr(jg, name)
+        for name in (
+            "ratio_curves",
+            "ratio_contours",
+            "ratio_against_timestep",
+            "theory_errors",
+            "cluster_shares",
+            "friction_figure",
+        )
+    },
+    "save_figures data": lambda x: jg.save_figures(x, "none/map"),
+}
+
+
+def dense_map() -> xr.Dataset:
+    """A map with what a friction law needs, and too few dense points for one."""
+    names = ("inertial_number", "macroscopic_friction")
+    data = ratio_dataset(alphas=2, nus=2)
+    return data.assign({f"{name}{end}": data.force_ratio for name in names for end in ("", "_stderr")})
+
+
+NEVER: list[Any] = [  # no argument of any function
+    10**5000,
+    1j,
+    b"0.5",
+    {},
+    {0.5},
+    {"a": 1},
+    object(),
+    datetime(2020, 1, 1),
+    np.datetime64("2020"),
+    np.array("0.5"),
+    np.array([None, 0.5]),
+    np.array([]),
+    np.zeros((0, 2)),
+    np.zeros((2, 3, 0)),
+    np.array([np.nan, 1.0]),
+    np.array([1j]),
+    np.ma.masked,
+    [[0.1], [0.2, 0.3]],
+    [None],
+    ["0.5"],
+    [float("nan")],
+    [10**400],
+    range(10**12),
+    jnp.array([jnp.nan]),
+    jnp.zeros(0),
+    jax.random.split(KEY),
+    SEEN,
+    xr.Dataset(),
+]
+ODD = [None, True, False, "", "a\nb", "auto", [], (), math.nan, math.inf, -math.inf, -1, 0, 0.0, -0.0, 5e-324, 1e308]
+ODD += [10**12, 10**30, -(10**400), 10**400, 2**31, 2**63, 1e30, 1e-300, np.float32(0.5), np.int8(1), np.array(0.5)]
+ODD += [jnp.asarray(0.5), np.array([0.5]), np.zeros((2, 2)), np.ones((3, 2)), jnp.ones((2, 2)), np.float64("nan")]
+scalars = st.one_of(
+    st.floats(), st.integers(), st.complex_numbers(), st.booleans(), st.text(max_size=9), st.none(), st.binary()
+)
+anything = st.one_of(
+    scalars,
+    st.sampled_from(ODD),
+    st.lists(st.one_of(st.floats(-1, 2), scalars), max_size=3),
+    st.lists(st.floats(-1, 2), max_size=6).map(np.array),
+    st.tuples(st.integers(0, 3), st.integers(0, 3)).map(np.ones),
+)
+
+
+@pytest.mark.parametrize("argument", [*NUMBERS, *OBJECTS])
+def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> None:
+    function = {**NUMBERS, **OBJECTS}[argument]
+    for value in NEVER:
+        if not (value is SEEN and argument == "fields_at seen"):
+            assert verdict(function, value) or (argument == "ratio_map batch" and value == 10**5000)
+
+
+@pytest.mark.parametrize("argument", NUMBERS)
+def test_odd_values_are_accepted_or_refused_in_one_sentence(argument: str) -> None:
+    for value in ODD:
+        verdict(NUMBERS[argument], value)
+
+
+@pytest.mark.parametrize("argument", NUMBERS)
+@few(max_examples=25)
+@given(value=anything)
+def test_any_value_is_accepted_or_refused_in_one_sentence(argument: str, value: Any) -> None:
+    verdict(NUMBERS[argument], value)
+
+
+@few(max_examples=50)
+@given(st.dictionaries(st.sampled_from(list(jg.ShearFlow.__dataclass_fields__)), anything, min_size=2))
+def test_any_flow_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]) -> None:
+    verdict(lambda _: jg.ShearFlow(**{**FLOW, **changes}), None)
+
+
+@few(max_examples=50)
+@given(st.dictionaries(st.sampled_from([*MAP, *sweep.ratio_map.__kwdefaults__]), anything, min_size=2))
+def test_any_map_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]) -> None:
+    verdict(lambda _: jg.ratio_map(**{**MAP, **changes}), None)
+
+
+BATCH = jg.ShearFlow(**{**FLOW, "restitution": np.array([0.5, 0.9])})
+SEVERAL = jax.tree.map(lambda x: np.stack([x, x]), SEEN)
+REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
+    "flow of unlike batches": (
+        lambda: jg.ShearFlow(GRAINS, np.array([0.5, 0.9]), np.array([0.5, 0.6, 0.7]), 1e-3),
+        "arrays of one shape",
+    ),
+    "flow of too many grains": (partial(make_flow, "grains", 10**12), "at most 10000000, as memory is limited"),
+    "too many seeds": (partial(make_map, "seeds", 10**9), "at most 1000000, the most replicas of a map"),
+    "too many replicas": (partial(make_map, "seeds", 600_000), "at most 1000000 replicas, points times seeds"),
+    "too many restitutions": (partial(make_map, "restitution", range(10**9)), "a list of at most 1000000 numbers"),
+    "too long a strain": (partial(make_map, "strain", 1e30), r"at most 2147483647 time steps, that is 2.14748e\+06"),
+    "too long an equilibration": (partial(make_map, "equilibrate", 1e30), r"at least 0 and at most 1e\+06"),
+    "too short a time step": (partial(make_map, "timestep", 1e-300), "at least 1e-08 / shear rate"),
+    "too short a time step in a list": (partial(make_map, "timestep", [1e-3, 1e-12]), "at least 1e-08 / shear rate"),
+    "too many workers": (partial(make_map, "workers", 10**9), "at most 1024"),
+    "too many blocks": (lambda: jg.sample(flow(), SEEN.state, 1.0, 10**9), "blocks must be at most 1000000"),
+    "too many snapshots": (lambda: jg.snapshot_series(flow(), SEEN.state, 1.0, 10**9), "count must be at most"),
+    "too long a sample": (lambda: jg.sample(flow(), SEEN.state, 1e30), "at most 2147483647 time steps"),
+    "too many steps": (lambda: jg.advance(flow(), SEEN.state, 2**31), "a whole number of 0 to 2147483647"),
+    "half a step": (lambda: jg.advance(flow(), SEEN.state, 0.5), "a whole number of 0 to 2147483647"),
+    "steps of a batch": (lambda: jg.advance(flow(), SEEN.state, np.array([1, 2])), "a whole number"),
+    "one block": (lambda: jg.sample(flow(), SEEN.state, 1.0, 0), "blocks must be a whole number of at least 1"),
+    "pack of a batch": (lambda: jg.pack(BATCH, KEY), "one ShearFlow, and this is a batch"),
+    "prepare of a batch": (lambda: jg.prepare(BATCH, KEY), "one ShearFlow, and this is a batch"),
+    "prepare with two keys": (lambda: jg.prepare(flow(), jax.random.split(KEY)), "a random key such as"),
+    "sample of a batch": (lambda: jg.sample(BATCH, SEEN.state, 1.0), "one ShearFlow, and this is a batch"),
+    "sample of a batch of states": (lambda: jg.sample(flow(), SEVERAL.state, 1.0), f"one State of {GRAINS} grains"),
+    "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
+    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "one of a series is"),
+    "fields at a point": (lambda: jg.fields_at(SEEN, np.zeros(2), jg.lucy(1.0)), r"\(points, 2\) of finite numbers"),
+    "width beyond the cell": (lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)), "positive and at most 3.25"),
+    "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),
+    "contours of a line": (lambda: jg.ratio_contours(ratio_dataset(alphas=1)), "at least two restitutions"),
+    "one time step": (lambda: jg.ratio_against_timestep(ratio_dataset()), "at least two time steps"),
+    "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory_pressure"),
+    "no clusters": (lambda: jg.cluster_shares(ratio_dataset()), "it has no cluster_pressure_share"),
+    "no friction": (lambda: jg.friction_figure(ratio_dataset()), "it has no inertial_number"),
+    "too few dense points": (lambda: jg.friction_law(dense_map()), "at least 4 points of status ok"),
+    "a report that is none": (partial(make_map, "report", 3), "report must be a function of one number"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_refusal_says_what_is_accepted(case: str) -> None:
+    function, accepted = REFUSED[case]
+    with pytest.raises(InputError, match=accepted) as caught:
+        function()
+    assert one_sentence(str(caught.value))
+
+
+def test_prepare_refuses_a_time_step_too_short_to_count_before_it_packs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocol, "_start", would_run)
+    with pytest.raises(InputError, match="timestep must be at least 1e-08 / shear_rate"):
+        protocol.check_timestep(make_flow("timestep", 1e-12), None)
+
+
+@pytest.mark.parametrize(
+    "stem", [None, 3, b"map", "none/map", "file.txt/map", f"{'n' * 300}/map", "n" * 300, "é" * 120]
+)
+def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file.txt").write_text("no folder")
+    with pytest.raises(InputError) as caught:
+        jg.save_figures(ratio_dataset(alphas=2, nus=1), stem)
+    assert one_sentence(str(caught.value))
+    assert files(tmp_path) == {"file.txt"}
+
+
+# The command line: every option
+
+
+def accepts_or_refuses(*arguments: str) -> Outcome:
+    """Give a command that does not run; nothing is left, and it is accepted or refused in one sentence."""
+    with TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep, "replicas", ends)
+        outcome = jaxgran(Path(name), *arguments)
+        assert not os.listdir(name)
+    if outcome.status != WOULD_RUN:
+        assert_one_sentence(outcome)
+        assert len(outcome.err) < 700
+    return outcome
+
+
+def ends(*_) -> Iterator:
+    raise SystemExit(WOULD_RUN)
+    yield
+
+
+RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6")
+MAP_OPTIONS = ["restitution", "packing-fraction", "grains", "seeds", "timestep", "equilibrate", "strain", "error"]
+MAP_OPTIONS += ["tolerance", "target-error", "solver", "activation", "batch", "workers", "scheduler", "preset"]
+MAP_OPTIONS += ["output", "like"]
+RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "trajectory", "output"]
+ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]
+ENORMOUS += ["a" * 5000, "a" * 5000 + ".nc", "n" * 250 + ".nc", "\udcff.nc", "../..", "/", ".nc", "..nc", "~/x", "x.NC"]
+texts = st.one_of(
+    st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])),
+    st.text("0123456789.,:e-+ nainfauto", max_size=12),
+    st.integers().map(str),
+    st.floats().map(repr),
+    st.lists(st.floats(0, 1), max_size=4).map(lambda x: ",".join(map(repr, x))),
+    st.sampled_from(ENORMOUS),
+)
+
+
+@pytest.mark.parametrize("option", MAP_OPTIONS)
+@few(max_examples=12)
+@given(texts)
+def test_any_text_in_an_option_of_map_is_accepted_or_refused_in_one_sentence(option: str, text: str) -> None:
+    accepts_or_refuses("map", f"--{option}={text}")
+
+
+@pytest.mark.parametrize("option", RUN_OPTIONS)
+@few(max_examples=12)
+@given(texts)
+def test_any_text_in_an_option_of_run_is_accepted_or_refused_in_one_sentence(option: str, text: str) -> None:
+    accepts_or_refuses(*RUN, f"--{option}={text}")
+
+
+@few(max_examples=40)
+@given(texts, texts)
+def test_any_file_and_folder_of_plot_are_refused_in_one_sentence(file: str, folder: str) -> None:
+    for words in (["plot", f"--output={folder}", "--", file], ["plot", "--", file]):
+        assert accepts_or_refuses(*words).status == 2
+
+
+@few(max_examples=40)
+@given(st.sampled_from(["map", "run", "plot", "info"]), st.lists(texts.filter(lambda x: x != "--help"), min_size=1))
+def test_any_words_after_a_command_are_refused_in_one_sentence(command: str, words: list[str]) -> None:
+    assert accepts_or_refuses(command, *words).status == 2
+
+
+@pytest.mark.parametrize("option", MAP_OPTIONS)
+def test_enormous_text_is_accepted_or_refused_at_once_in_one_sentence(option: str) -> None:
+    start = time.perf_counter()
+    for text in ENORMOUS:
+        accepts_or_refuses("map", f"--{option}={text}")
+    assert time.perf_counter() - start < SECONDS * len(ENORMOUS)
+
+
+TOO_MUCH = {
+    "map --grains 1000000000000": "grains must be at most 10000000",
+    "map --seeds 1000000000": "seeds must be at most 1000000",
+    "map --restitution 0:1:10000000": "start:stop:count with a count of 2 to 1000000",
+    "map --restitution 0:1:1000000": "at most 1000000 replicas, points times seeds",
+    "map --strain 1e30": "strain must be at most 2147483647 time steps",
+    "map --equilibrate 1e30": "equilibrate must be a number of at least 0 and at most",
+    "map --timestep 1e-300": "timestep must be at least 1e-08 / shear rate",
+    "map --batch 99999999999999": "batch must be auto or a whole number of at least 1, below a billion",
+    "map --workers 1000000000": "workers must be at most 1024",
+    "run --restitution 0.5 --packing-fraction 0.6 --grains 1000000000000": "grains must be at most 10000000",
+    "run --restitution 0.5 --packing-fraction 0.6 --strain 1e30": "at most 2147483647 time steps",
+}
+
+
+@pytest.mark.parametrize(("command", "accepted"), TOO_MUCH.items(), ids=TOO_MUCH)
+def test_more_than_can_be_held_or_counted_is_refused(command: str, accepted: str) -> None:
+    outcome = accepts_or_refuses(*command.split())
+    assert outcome.status == 2
+    assert accepted in outcome.err
+
+
+# Files
+
+
+def renamed(**names: str) -> xr.Dataset:
+    return ratio_dataset(alphas=2, nus=2).rename(names)
+
+
+NO_MAPS: dict[str, xr.Dataset] = {
+    "nothing": xr.Dataset(),
+    "no values": ratio_dataset().drop_vars("force_ratio"),
+    "no errors": ratio_dataset().drop_vars("force_ratio_stderr"),
+    "no restitution": ratio_dataset().drop_vars("restitution"),
+    "no dimension restitution": ratio_dataset().isel(restitution=0),
+    "no dimensions": ratio_dataset().isel(restitution=0, packing_fraction=0),
+    "other dimensions": renamed(restitution="speed"),
+    "another dimension": ratio_dataset().expand_dims("seed"),
+    "empty": ratio_dataset().isel(restitution=slice(0)),
+    "text": ratio_dataset().assign(force_ratio=ratio_dataset().force_ratio.astype(str)),
+    "text on an axis": ratio_dataset(alphas=2).assign_coords(restitution=["a", "b"]),
+    "times on an axis": ratio_dataset(alphas=2).assign_coords(
+        restitution=np.array(["2020-01-01", "2021-01-01"], "datetime64[ns]")
+    ),
+    "repetition on an axis": ratio_dataset(alphas=2).assign_coords(restitution=[0.5, 0.5]),
+    "not a number on an axis": ratio_dataset(alphas=2).assign_coords(restitution=[0.5, np.nan]),
+    "repeated time steps": with_timesteps(ratio_dataset(), 1e-3, 1e-3),
+    "status without meanings": ratio_dataset().assign(status=ratio_dataset().status.drop_attrs()),
+    "status with too few meanings": ratio_dataset().assign(
+        status=ratio_dataset().status.assign_attrs(flag_meanings="ok")
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", NO_MAPS)
+def test_a_dataset_that_is_no_map_is_refused_by_every_figure(kind: str, tmp_path: Path) -> None:
+    data = NO_MAPS[kind]
+    for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
+        assert "must be the dataset of a ratio map" in verdict(draw, data)
+    assert "must be the dataset of a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
+    assert "must be the dataset of a ratio map" in verdict(jg.friction_law, data)
+    assert not files(tmp_path)
+
+
+@pytest.mark.parametrize("kind", NO_MAPS)
+def test_a_file_that_is_no_map_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
+    NO_MAPS[kind].to_netcdf(tmp_path / "no.nc", engine="h5netcdf")
+    for words in (["plot", "no.nc"], ["map", "--like", "no.nc"]):
+        outcome = jaxgran(tmp_path, *words)
+        assert_one_sentence(outcome)
+        assert "'no.nc' is not a ratio map: " in outcome.err
+    assert files(tmp_path) == {"no.nc"}
+
+
+def whole_map(folder: Path) -> bytes:
+    ratio_dataset(alphas=2, nus=2).to_netcdf(folder / "whole.nc", engine="h5netcdf")
+    content = (folder / "whole.nc").read_bytes()
+    (folder / "whole.nc").unlink()
+    return content
+
+
+def other_hdf5(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["force_ratio"] = np.array([b"a", b"b"])
+        file.create_group("status")
+
+
+def other_netcdf(path: Path) -> None:
+    with h5netcdf.File(path, "w") as file:
+        file.dimensions = {"time": 3}
+        file.create_variable("time", ("time",), float)[:] = [1e300, np.nan, -1.0]
+        file.variables["time"].attrs["units"] = "days since never"
+
+
+GARBAGE: dict[str, Callable[[Path], Any]] = {
+    "empty": lambda path: path.write_bytes(b""),
+    "noise": lambda path: path.write_bytes(bytes(range(256)) * 16),
+    "signature alone": lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n"),
+    "signature and noise": lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 16),
+    "classic NetCDF": lambda path: path.write_bytes(b"CDF\x01" + bytes(28)),
+    "HDF5 of other things": other_hdf5,
+    "NetCDF of other things": other_netcdf,
+    "folder": lambda path: path.mkdir(),
+    "link to itself": lambda path: path.symlink_to(path),
+    "link to nothing": lambda path: path.symlink_to("none"),
+}
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+def test_a_file_that_is_no_netcdf_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
+    GARBAGE[kind](tmp_path / "garbage.nc")
+    for words in (["plot", "garbage.nc"], ["map", "--like", "garbage.nc"]):
+        assert_one_sentence(jaxgran(tmp_path, *words))
+    assert files(tmp_path) == {"garbage.nc"}
+
+
+@few(max_examples=30)
+@given(st.floats(0, 1, exclude_max=True))
+def test_a_truncated_map_is_refused_wherever_it_ends(share: float) -> None:
+    with TemporaryDirectory() as name:
+        content = whole_map(Path(name))
+        torn = Path(name) / "torn.nc"
+        torn.write_bytes(content[: int(share * len(content))])
+        assert_one_sentence(jaxgran(Path(name), "plot", "torn.nc"))
+        assert files(Path(name)) == {"torn.nc"}
+
+
+@few(max_examples=60)
+@given(st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8))
+def test_a_damaged_map_is_read_or_refused_in_one_sentence(place: float, damage: bytes) -> None:
+    with TemporaryDirectory() as name:
+        content = bytearray(whole_map(Path(name)))
+        start = int(place * len(content))
+        content[start : start + len(damage)] = damage
+        path = Path(name) / "damaged.nc"
+        path.write_bytes(content)
+        verdict(read_dataset, path)
+
+
+ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until steady"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("grains", value) for value in ("many", 3, 64.5, [64, 64])],
+        *[("seeds", value) for value in (0, "two", 10**9)],
+        *[("timestep", value) for value in ("short", [1e-3, 1e-4], 0.0, 1e-300)],
+        *[("strain", value) for value in ("long", 1e30, [1.0, 2.0])],
+        *[(name, value) for name in ("solver", "activation") for value in (3, "other", ["midpoint", "touching"])],
+        *[("tolerance", value) for value in (2.0, "auto ", [1e-3, 1e-4])],
+        *[("equilibrate", value) for value in ("soon", -1.0, 1e30)],
+        ("error", 7.0),
+    ],
+)
+def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any, tmp_path: Path) -> None:
+    data = ratio_dataset(alphas=2, nus=2)
+    attrs = {"restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE}
+    data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="h5netcdf")
+    outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
+    assert_one_sentence(outcome)
+    assert name in outcome.err
+    assert files(tmp_path) == {"old.nc"}
+
+
+@pytest.mark.parametrize("missing", [*ALIKE, "grains", "seeds", "timestep"])
+def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, tmp_path: Path) -> None:
+    data = ratio_dataset(alphas=2, nus=2)
+    attrs = {**data.attrs, **ALIKE}
+    del attrs[missing]
+    data.drop_attrs(deep=False).assign_attrs(attrs).to_netcdf(tmp_path / "old.nc", engine="h5netcdf")
+    outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
+    assert_one_sentence(outcome)
+    assert missing in outcome.err
+    assert files(tmp_path) == {"old.nc"}
+
+
+# Where things are written
+
+
+@pytest.mark.parametrize("name", ["my first map.nc", "-a'b\"c $d Strömung 流れ.x.nc", "\udcff.nc"])
+def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", f"--output={name}")
+    assert outcome.status == 0, outcome.err
+    stem = name.removesuffix(".nc")
+    pictures = {f"{stem}_curves.png", f"{stem}_clusters.png"}
+    assert files(tmp_path) == {name, *pictures}
+    (tmp_path / f"fig {stem}").mkdir()
+    outcome = jaxgran(tmp_path, "plot", f"--output=fig {stem}", "--", name)
+    assert outcome.status == 0, outcome.err
+    assert files(tmp_path / f"fig {stem}") == pictures
+
+
+OUTPUTS = {
+    "map.NC": "ends in .nc",
+    "map": "ends in .nc",
+    ".nc": "ends in .nc",
+    "": "ends in .nc",
+    "folder.nc": "is a folder",
+    "folder.nc/": "is a folder",
+    "file.txt/map.nc": "a folder that exists",
+    "none/map.nc": "a folder that exists",
+    "taken.nc": "an unfinished map",
+    "n" * 300 + ".nc": "at most 200 bytes",
+    "流" * 90 + ".nc": "at most 200 bytes",
+    "n" * 300 + "/map.nc": "a folder that exists",
+    "/".join(["n" * 100] * 60) + "/map.nc": "a folder that exists",
+}
+
+
+@pytest.mark.parametrize("command", ["map", "run"])
+@pytest.mark.parametrize("output", OUTPUTS, ids=lambda x: x[:20])
+def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
+    command: str, output: str, tmp_path: Path
+) -> None:
+    (tmp_path / "folder.nc").mkdir()
+    (tmp_path / "file.txt").write_text("no folder")
+    (tmp_path / "taken.nc.unfinished").write_text("no folder")
+    before = files(tmp_path)
+    outcome = jaxgran(tmp_path, *(RUN if command == "run" else ["map"]), f"--output={output}")
+    assert_one_sentence(outcome)
+    assert OUTPUTS[output] in outcome.err
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("folder", ["file.txt", "none", "n" * 300, ""])
+def test_figures_need_a_folder(folder: str, tmp_path: Path) -> None:
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    (tmp_path / "file.txt").write_text("no folder")
+    if folder:
+        outcome = jaxgran(tmp_path, "plot", "map.nc", f"--output={folder}")
+        assert_one_sentence(outcome)
+        assert "a folder that exists and can be written to" in outcome.err
+    assert files(tmp_path) == {"map.nc", "file.txt"}
+
+
+def test_a_picture_that_is_a_folder_stops_plot_in_one_sentence(tmp_path: Path) -> None:
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    (tmp_path / "map_curves.png").mkdir()
+    assert_one_sentence(jaxgran(tmp_path, "plot", "map.nc"))
+    assert files(tmp_path) == {"map.nc", "map_curves.png"}
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_path: Path) -> None:
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    tmp_path.chmod(0o500)
+    try:
+        for words in (["plot", "map.nc"], ["map", "--output", "new.nc"], [*RUN, "--output", "new.nc"]):
+            assert_one_sentence(jaxgran(tmp_path, *words))
+        (tmp_path / "map.nc").chmod(0)
+        for words in (["plot", "map.nc"], ["map", "--like", "map.nc"]):
+            assert_one_sentence(jaxgran(tmp_path, *words))
+    finally:
+        tmp_path.chmod(0o700)
+    assert files(tmp_path) == {"map.nc"}
+
+
+def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    monkeypatch.setattr(os, "replace", full)
+    outcome = jaxgran(tmp_path, "plot", "map.nc")
+    assert (outcome.status, outcome.err) == (1, "jaxgran: stopped by the file system, No space left on device.\n")
+    assert files(tmp_path) == {"map.nc"}
