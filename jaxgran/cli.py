@@ -365,7 +365,7 @@ def _measure(
 
 
 def _say_resumed(checkpoint, count: int) -> None:
-    journals = len(list(checkpoint.folder.glob("journal-*.nc")))
+    journals = len(checkpoint.journals())
     _say(f"continued: {len(checkpoint.done)} of {count} replicas are done, {journals} batches are under way.")
     if checkpoint.damaged:
         _say(f"damaged and computed anew: {', '.join(checkpoint.damaged)}.")

@@ -117,19 +117,20 @@ class CoarseGraining:
 
 def gaussian(width: float | Array) -> CoarseGraining:
     """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w: smooth everywhere, not cut off within the cell."""
-    return _of_width(width, "width", GAUSSIAN)
+    return _of_width(width, GAUSSIAN)
 
 
 def lucy(radius: float | Array) -> CoarseGraining:
     """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c: compact, with two continuous derivatives."""
-    return _of_width(radius, "radius", LUCY)
+    return _of_width(radius, LUCY)
 
 
 def heaviside(radius: float | Array) -> CoarseGraining:
     """The average over a disc of radius c, 1/(πc²): fields jump where a grain enters, so no derivatives."""
-    return _of_width(radius, "radius", HEAVISIDE)
+    return _of_width(radius, HEAVISIDE)
 
 
-def _of_width(width: float | Array, name: str, kernel: Kernel) -> CoarseGraining:
-    require_number(name, width, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+def _of_width(width: float | Array, kernel: Kernel) -> CoarseGraining:
+    words = "positive and at most what fits into the cell"
+    require_number("the width of the coarse-graining", width, lambda x: (x > 0) & np.isfinite(x), words)
     return CoarseGraining(width, kernel)

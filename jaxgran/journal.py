@@ -21,6 +21,8 @@ from jaxgran.store import Damaged, read_arrays, write_arrays
 from jaxgran.tally import Tally, flat_tally, tally_from_flat
 
 SECONDS = 5.0  # between two writings of a journal
+_SHARE = 0.05  # of the time, at most, that large journals are written
+_LONGEST = 45.0  # seconds between two writings, however long they take
 
 
 class Journal:
@@ -30,16 +32,16 @@ class Journal:
       path: file of the journal. Its folder may vanish; the journal is then not written, and nothing else suffers.
       keys: what tells the replicas of the batch, in their order; the journal of others is not repeated.
       drive: what advances the batch beyond the journal.
-      seconds: time between two writings, or None for ``SECONDS``.
+      seconds: time between two writings, or None for ``SECONDS``, and longer where a writing takes long itself.
     """
 
     def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: Drive, seconds: float | None = None):
-        self.path, self.drive, self.seconds = path, drive, SECONDS if seconds is None else seconds
+        self.path, self.drive, self.seconds = path, drive, seconds
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
         self.tallies: list[np.ndarray] = []
         self.leaves: list[np.ndarray] = []
-        self.position, self.written = 0, time.monotonic()
+        self.position, self.next = 0, time.monotonic() + (SECONDS if seconds is None else seconds)
         if path.exists():
             self._read()
 
@@ -52,7 +54,7 @@ class Journal:
         state, tally = self.drive(flow, state, steps)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
-        if time.monotonic() - self.written >= self.seconds:
+        if time.monotonic() >= self.next:
             self.leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
             self._write()
         return state, tally
@@ -66,11 +68,14 @@ class Journal:
         return jax.tree.unflatten(jax.tree.structure(state), leaves), tally
 
     def _write(self) -> None:
+        begun = time.monotonic()
         states = {f"state_{k}": leaf for k, leaf in enumerate(self.leaves)}
         series = {"steps": np.stack(self.steps), "tallies": np.stack(self.tallies)}
         with suppress(FileNotFoundError):  # whoever collects the results will notice
             write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
-        self.written = time.monotonic()
+        now = time.monotonic()
+        pause = max(SECONDS, min((now - begun) / _SHARE, _LONGEST)) if self.seconds is None else self.seconds
+        self.next = now + pause
 
     def _read(self) -> None:
         arrays, _ = read_arrays(self.path)

@@ -1,22 +1,25 @@
 """Tasks on worker processes that may die: a dead worker is replaced, and its task repeated.
 
-Every worker is a process of its own with one task at a time, so that it is known which task a death has hit. A worker
-ends when the process that started it is gone, however that ended. Tasks must be idempotent.
+Every worker is a process of its own with one task at a time, so that it is known which task a death has hit. All that
+connects it with its parent is one pipe, which ends with either of them; there are no queues, threads or semaphores that
+a killed process could leave behind. A worker ends when the process that started it is gone, however that ended. Tasks
+must be idempotent.
 """
 
 import os
+import pickle
 import signal
 import threading
+import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context, parent_process
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 ATTEMPTS = 3  # workers that a task may kill before it is given up
-_POLL_SECONDS = 0.05
+_READY, _MESSAGE, _RESULT, _ERROR, _DEAD = "ready", "message", "result", "error", "dead"
 T = TypeVar("T")
 
 
@@ -25,28 +28,34 @@ class Died(Exception):
 
 
 class _Worker:
-    """A process with one task at a time, and the pipe through which it sends messages."""
+    """A process that is sent the arguments of one task after another."""
 
-    def __init__(self, initialise: Callable[..., None], arguments: tuple):
+    def __init__(self, function: Callable, initialise: Callable[..., None], arguments: tuple):
         context = get_context("spawn")
-        self.messages, sender = context.Pipe(duplex=False)
-        self.executor = ProcessPoolExecutor(1, context, _start, (sender, initialise, arguments))
-        self._sender = sender  # the process is not started before its first task, and needs it then
+        self.ready = False
+        self.task: int | None = None
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, function, initialise, arguments), daemon=True)
+        with theirs, _no_interrupt():  # their end is closed here, so that the pipe ends with the worker
+            self.process.start()
 
-    def read(self) -> list[Any]:
-        """The messages that have come. They are short, so that a pipe takes them whole or not at all."""
-        found = []
-        while self.messages.poll():
-            found.append(self.messages.recv())
-        return found
+    def begin(self, task: int, arguments: tuple) -> None:
+        self.task = task
+        with suppress(OSError):  # of a worker that has died in this moment
+            self.connection.send(arguments)
+
+    def says(self) -> tuple[str, Any]:
+        """What it says next, which is nothing where it has died, even in the middle of a word."""
+        try:
+            return self.connection.recv()
+        except (EOFError, OSError):
+            return _DEAD, None
 
     def end(self) -> None:
-        processes = list((self.executor._processes or {}).values())
-        self.executor.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        self._sender.close()
-        self.messages.close()
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+        self.connection.close()
 
 
 def run_tasks(
@@ -68,55 +77,85 @@ def run_tasks(
 
     Yields:
       The number of the task, and its result or ``Died``. An exception of a task is raised here.
+
+    Raises:
+      ChildProcessError: workers die before they have a task.
     """
-    waiting, deaths = deque(range(len(tasks))), Counter()
-    idle = [_Worker(initialise, arguments) for _ in range(min(workers, len(tasks)))]
-    running: dict[Future, tuple[int, _Worker]] = {}
+    waiting, deaths, stillborn, left = deque(range(len(tasks))), Counter(), 0, len(tasks)
+    crew: list[_Worker] = []
     try:
-        while waiting or running:
-            while waiting and idle:
-                task, worker = waiting.popleft(), idle.pop()
-                running[worker.executor.submit(function, *tasks[task])] = task, worker
-            done, _ = wait(running, _POLL_SECONDS, FIRST_COMPLETED)
-            for _, worker in running.values():
-                for message in worker.read():
-                    hear(message)
-            for future in done:
-                task, worker = running.pop(future)
-                try:
-                    result = future.result()
-                except BrokenProcessPool:
+        while left:
+            while len(crew) < min(workers, left):
+                crew.append(_Worker(function, initialise, arguments))
+            for worker in crew:
+                if waiting and worker.ready and worker.task is None:
+                    task = waiting.popleft()
+                    worker.begin(task, tasks[task])
+            speaking = wait([worker.connection for worker in crew])
+            for worker in [one for one in crew if one.connection in speaking]:
+                kind, content = worker.says()
+                task = worker.task
+                if kind == _MESSAGE:
+                    hear(content)
+                elif kind == _READY:
+                    worker.ready, stillborn = True, 0
+                elif kind == _ERROR:
+                    raise content
+                elif kind == _RESULT and task is not None:
+                    worker.task, left = None, left - 1
+                    yield task, content
+                else:
+                    crew.remove(worker)
                     worker.end()
-                    idle.append(_Worker(initialise, arguments))
+                    stillborn += not worker.ready
+                    if stillborn == ATTEMPTS:
+                        raise ChildProcessError(f"{ATTEMPTS} workers in a row died before they had a task")
+                    if task is None:
+                        continue
                     deaths[task] += 1
                     if deaths[task] < ATTEMPTS:
                         waiting.appendleft(task)
                     else:
+                        left -= 1
                         yield task, Died(f"a batch has killed its worker {ATTEMPTS} times")
-                else:
-                    idle.append(worker)
-                    yield task, result
     finally:
-        for worker in [*idle, *(worker for _, worker in running.values())]:
+        for worker in crew:
             worker.end()
 
 
-_sender: Connection | None = None
+_parent: Connection | None = None
 
 
 def send(message: Any) -> None:
     """Send a message from a worker to whoever runs the tasks."""
-    if _sender is not None:
-        _sender.send(message)
+    if _parent is not None:
+        _parent.send((_MESSAGE, message))
 
 
-def _start(sender: Connection, initialise: Callable[..., None], arguments: tuple) -> None:
-    """Set up a worker: Ctrl-C is left to the parent, and nothing outlives it."""
-    global _sender
+def _work(parent: Connection, function: Callable, initialise: Callable[..., None], arguments: tuple) -> None:
+    """The life of a worker: Ctrl-C is left to the parent, and nothing outlives it."""
+    global _parent
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _sender = sender
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    initialise(*arguments)
+    _parent = parent
+    try:
+        initialise(*arguments)
+        parent.send((_READY, None))
+        while True:
+            task = parent.recv()
+            parent.send((_RESULT, function(*task)))
+    except Exception as error:
+        with suppress(OSError):
+            parent.send((_ERROR, _portable(error)))
+
+
+def _portable(error: Exception) -> Exception:
+    """The error with where it came from as a note, or what can be said of it where it cannot be pickled."""
+    error.add_note(f"in a worker:\n{''.join(traceback.format_exception(error))}")
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
 
 
 def _end_with_parent() -> None:
@@ -124,3 +163,16 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back while a process starts, which inherits this and does not die of it with a traceback."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

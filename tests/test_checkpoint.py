@@ -1,5 +1,7 @@
 """A checkpoint gives back what was kept, tells what is damaged or foreign, and has one writer."""
 
+import errno
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from jaxgran.dataset import Key, Replica
 from jaxgran.flow import InputError
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
+from jaxgran.store import write_arrays
 
 SETTINGS = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0)
 
@@ -97,11 +100,59 @@ def test_a_damaged_file_costs_its_own_batch_alone(output: Path, how: str) -> Non
     resumed.close(finished=False)
 
 
-def test_damaged_parameters_are_one_sentence(output: Path) -> None:
+def test_damaged_parameters_are_known_from_the_names_of_the_batches(output: Path) -> None:
+    kept = cut_off(output)
+    file = output.with_name("map.nc.unfinished") / "map.nc"
+    file.write_bytes(b"half")
+    with pytest.raises(InputError, match="damaged: remove the folder") as refused:
+        Checkpoint(output, replace(SETTINGS, tolerance=1e-3), resume=True)
+    assert one_sentence(str(refused.value))
+    for damaged in (["map.nc"], []):
+        resumed = Checkpoint(output, SETTINGS, resume=True)
+        assert resumed.damaged == damaged
+        assert_same_bits(resumed.done, kept)
+        resumed.close(finished=False)
+
+
+def test_what_a_finished_map_has_left_is_no_part_of_the_next_one(output: Path) -> None:
     cut_off(output)
-    (output.with_name("map.nc.unfinished") / "map.nc").write_bytes(b"half")
-    with pytest.raises(InputError, match="damaged: remove the folder"):
-        Checkpoint(output, SETTINGS, resume=True)
+    (output.with_name("map.nc.unfinished") / "map.nc").unlink()  # killed while it removed its folder
+    other = replace(SETTINGS, tolerance=1e-3)
+    first = Checkpoint(output, other, resume=False)
+    assert first.done == {}
+    first.add(batches()[0])
+    first.close(finished=False)
+    resumed = Checkpoint(output, other, resume=True)
+    assert set(resumed.done) == set(batches()[0])
+    resumed.close(finished=True)
+
+
+def test_batches_of_another_map_are_never_taken_for_those_of_this_one(output: Path) -> None:
+    cut_off(output)
+    folder = output.with_name("map.nc.unfinished")
+    done = {path.name: path.read_bytes() for path in folder.glob("done-*.nc")}
+    shutil.rmtree(folder)
+    other = Checkpoint(output, replace(SETTINGS, tolerance=1e-3), resume=False)
+    assert other.journal_path([(0, 0)]) != Checkpoint(output.with_name("b.nc"), SETTINGS, False).journal_path([(0, 0)])
+    for name, content in done.items():
+        (folder / name).write_bytes(content)
+    journal = other.journal_path([(0, 0)])
+    write_arrays(journal, {"keys": np.array([[3, 1]])}, {})  # the name is that of another batch
+    assert other.journals() == [] and not journal.exists()
+    other.close(finished=False)
+    resumed = Checkpoint(output, other.settings, resume=True)
+    assert resumed.done == {} and resumed.damaged == []
+    resumed.close(finished=False)
+
+
+def test_no_replica_is_under_way_twice(output: Path) -> None:
+    run = Checkpoint(output, SETTINGS, resume=False)
+    run.add(batches()[0])
+    for keys in ([(1, 0), (1, 1)], [(1, 1), (2, 0)], [(0, 1), (2, 1)], [(3, 0)]):
+        write_arrays(run.journal_path(keys), {"keys": np.array(keys)}, {})
+    begun = [key for batch in run.journals() for key in batch]
+    assert len(set(begun)) == len(begun) and (3, 0) in begun and (0, 1) not in begun
+    run.close(finished=True)
 
 
 def test_a_folder_that_is_removed_is_made_again_with_all_that_was_known(output: Path) -> None:
@@ -117,6 +168,60 @@ def test_a_folder_that_is_removed_is_made_again_with_all_that_was_known(output: 
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert_same_bits(resumed.done, first | second | third)
     resumed.close(finished=True)
+
+
+def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) -> None:
+    run = Checkpoint(output, SETTINGS, resume=False)
+    shutil.rmtree(run.folder)
+    run.add(batches()[0])
+    with pytest.raises(InputError, match="another process is writing"):
+        Checkpoint(output, SETTINGS, resume=True)
+    run.close(finished=True)
+    assert list(output.parent.iterdir()) == []
+
+
+def test_the_folder_of_another_run_is_not_removed(output: Path) -> None:
+    run = Checkpoint(output, SETTINGS, resume=False)
+    shutil.rmtree(run.folder)
+    other = Checkpoint(output, SETTINGS, resume=False)
+    other.add(batches()[0])
+    run.close(finished=True)
+    other.close(finished=False)
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert set(resumed.done) == set(batches()[0])
+    resumed.close(finished=True)
+
+
+def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(output: Path) -> None:
+    cut_off(output)
+    folder = output.with_name("map.nc.unfinished")
+    for litter in (folder / ".done-0123-0123456789abcdef.nc", output.with_name(".map-0123456789abcdef.nc")):
+        litter.write_bytes(b"half")
+    shutil.copytree(folder, output.with_name(".map.nc.unfinished"))
+    other = output.with_name(".map-of-mine.nc")
+    other.write_bytes(b"")
+    Checkpoint(output, SETTINGS, resume=True).close(finished=True)
+    assert list(output.parent.iterdir()) == [other]
+
+
+def test_a_file_in_place_of_the_folder_is_one_sentence(output: Path) -> None:
+    output.with_name("map.nc.unfinished").write_text("mine")
+    with pytest.raises(InputError, match="there is a file of this name") as refused:
+        Checkpoint(output, SETTINGS, resume=False)
+    assert one_sentence(str(refused.value))
+
+
+def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(checkpoint.fcntl, "flock", no_locks)
+    kept = cut_off(output)
+    monkeypatch.setattr(checkpoint, "fcntl", None)
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert_same_bits(resumed.done, kept)
+    resumed.close(finished=True)
+    assert list(output.parent.iterdir()) == []
 
 
 def test_a_map_that_had_hardly_begun_leaves_nothing(output: Path) -> None:

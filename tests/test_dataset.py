@@ -200,11 +200,13 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_other(
     write_dataset(data, path)
     old = path.read_bytes()
 
-    def half_written(self, temporary, **_):
-        Path(temporary).write_bytes(b"half")
+    whole = Path.write_bytes
+
+    def half_written(self: Path, content) -> int:
+        whole(self, bytes(content)[:100])
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", half_written)
+    monkeypatch.setattr(Path, "write_bytes", half_written)
     with pytest.raises(OSError, match="No space left"):
         write_dataset(data, path)
     assert path.read_bytes() == old

@@ -12,12 +12,17 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 import xarray as xr
 
+from jaxgran import sweep
 from jaxgran.dataset import read_dataset
+from jaxgran.settings import MapSettings
 
 pytestmark = [
     pytest.mark.faults,
@@ -45,7 +50,7 @@ class Lab:
         command = [sys.executable, str(DRIVER), *MAP.split(), "--workers", str(workers), "--output", output, *words]
         environment = os.environ | {"XDG_CACHE_HOME": str(self.folder / "cache"), "FAULT": fault}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
-        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
         return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)
 
     def finish(self, process: subprocess.Popen) -> subprocess.CompletedProcess:
@@ -58,6 +63,22 @@ class Lab:
         folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
         while not any(folder.glob(pattern)):
             assert time.monotonic() < end and (process is None or process.poll() is None)
+            time.sleep(0.02)
+
+    def wait_for_work(self, output: str, process: subprocess.Popen) -> None:
+        """Wait until the process has written or removed a journal or a batch, or ended."""
+        folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
+
+        def now() -> set[tuple[str, int]]:
+            found = set()
+            for path in folder.glob("[dj]o*.nc"):
+                with suppress(FileNotFoundError):
+                    found.add((path.name, path.stat().st_mtime_ns))
+            return found
+
+        before = now()
+        while now() == before and process.poll() is None:
+            assert time.monotonic() < end
             time.sleep(0.02)
 
     def assert_whole(self, output: str) -> None:
@@ -84,7 +105,7 @@ def children(process: int) -> list[int]:
 
 
 def workers_of(process: subprocess.Popen) -> list[int]:
-    """The workers of a map, without the process that looks after the semaphores."""
+    """The workers of a map, without the process that multiprocessing starts beside them."""
 
     def words(child: int) -> str:
         try:
@@ -100,14 +121,16 @@ def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: L
     rng, maps, kills, known = random.Random(workers), 1, 0, 0
     while kills < KILLS // 2:
         output = f"killed{workers}-{maps}.nc"
-        process = lab.start(output, "--resume", workers=workers)
-        if rng.random() < 0.7:  # in the middle of the work, else at any moment of the start
-            lab.wait_for(output, "*.nc", process)
-            time.sleep(rng.uniform(0, 1.0))
+        process = lab.start(output, "--resume", "--batch", "1", workers=workers)
+        if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start
+            lab.wait_for_work(output, process)
+            time.sleep(rng.uniform(0, 1.5))
         else:
             time.sleep(rng.uniform(0, 3.0))
         process.kill()
         _, err = process.communicate(timeout=PATIENCE)
+        begun = "Ran out of input" not in err  # what Python says of a worker that has only half been started
+        assert "Warning" not in err and not (begun and "Traceback" in err), err
         for done in re.findall(r"continued: (\d+) of 8", err):
             assert int(done) >= known  # what is done stays done
             known = int(done)
@@ -147,7 +170,7 @@ def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: La
 def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab) -> None:
     process = lab.start("interrupted.nc")
     lab.wait_for("interrupted.nc", process=process)
-    process.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the workers too
     done = lab.finish(process)
     assert done.returncode == 130
     *_, last = done.stderr.strip().splitlines()
@@ -195,3 +218,32 @@ def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> No
         assert second.stderr.count("\n") == 1 and "another process is writing 'one.nc'" in second.stderr
     assert lab.finish(first).returncode == 0
     lab.assert_whole("one.nc")
+
+
+def test_a_batch_that_does_not_fit_into_the_memory_is_halved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = MapSettings((0.5, 0.9), (0.6,), grains=64, seeds=2, timestep=1e-3, equilibrate=0.5, strain=1.6)
+    keys, sizes = [(0, 0), (0, 1), (1, 0), (1, 1)], []
+    whole = dict(sweep._run_task(settings, keys))
+    prepare = sweep.prepare_batch
+
+    def small_device(flow, replica_keys, *arguments):
+        sizes.append(len(replica_keys))
+        if len(replica_keys) > 1:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 42 bytes.")
+        return prepare(flow, replica_keys, *arguments)
+
+    monkeypatch.setattr(sweep, "prepare_batch", small_device)
+    halved = sweep._run_task(settings, keys, tmp_path / "journal.nc")
+    assert sizes == [4, 2, 1, 1, 2, 1, 1]
+    assert [key for key, _ in halved] == keys
+    for key, replica in halved:
+        jax.tree.map(np.testing.assert_array_equal, replica, whole[key])
+
+
+def test_another_error_of_the_device_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken_device(*_):
+        raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
+
+    monkeypatch.setattr(sweep, "prepare_batch", broken_device)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
+        sweep._run_task(MapSettings((0.5,), (0.6,), grains=64, strain=1.6), [(0, 0), (0, 1)])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
+from jaxgran import journal as journal_module
 from jaxgran.batch import advance_batch, stack
 from jaxgran.dynamics import State
 from jaxgran.flow import ShearFlow
@@ -120,3 +121,22 @@ def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monke
         time.sleep(0.02)
         journal(None, small_state(), np.array([k, k]))
     assert len(read_arrays(path)[0]["tallies"]) == 3
+
+
+def test_a_journal_that_takes_long_to_write_is_written_less_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal_module, "SECONDS", 0.0)
+    monkeypatch.setattr(journal_module, "write_arrays", lambda *_: written.append(time.sleep(0.02)))
+    written: list[None] = []
+    walk(Journal(tmp_path / "batch.nc", KEYS, fake_drive), 20)
+    assert len(written) < 3
+
+
+def test_a_batch_goes_on_from_its_journal_without_compiling_anew(whole, tmp_path: Path) -> None:
+    path = tmp_path / "batch.nc"
+    with pytest.raises(CutOff):
+        measured(Journal(path, KEYS, cut_after(advance_batch, 5), seconds=0))
+    compiled = advance_batch._cache_size()
+    measured(Journal(path, KEYS, advance_batch, seconds=0))
+    assert advance_batch._cache_size() == compiled

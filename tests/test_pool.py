@@ -45,6 +45,11 @@ def test_a_dead_worker_is_replaced_and_its_task_repeated(tmp_path: Path) -> None
     assert run(pool_tasks.die_at_first, tasks) == {k: k for k in range(6)}
 
 
+def test_a_worker_that_dies_in_the_middle_of_a_word_is_replaced(tmp_path: Path) -> None:
+    tasks = [(str(tmp_path), k) for k in range(3)]
+    assert run(pool_tasks.die_in_the_middle_of_a_word, tasks) == {k: k for k in range(3)}
+
+
 def test_a_task_that_keeps_killing_its_worker_is_given_up_and_the_others_are_done(tmp_path: Path) -> None:
     tasks = [(str(tmp_path), k, 99 if k == 1 else 0) for k in range(6)]
     results = run(pool_tasks.die_at_first, tasks)
@@ -58,6 +63,38 @@ def test_a_mistake_in_a_task_is_raised() -> None:
         run(pool_tasks.fail, [(0,)])
 
 
+def test_a_mistake_that_cannot_be_sent_is_told_in_words() -> None:
+    with pytest.raises(RuntimeError, match="Stubborn: 1 and 2"):
+        run(pool_tasks.fail_stubbornly, [()])
+
+
+def test_a_mistake_in_the_preparation_is_raised_and_workers_that_die_of_it_are_not_replaced_forever() -> None:
+    for prepare, error, words in (
+        (pool_tasks.fail_to_prepare, ValueError, "nothing is ready"),
+        (pool_tasks.die_before_it_begins, ChildProcessError, "3 workers in a row"),
+    ):
+        with pytest.raises(error, match=words):
+            list(run_tasks(pool_tasks.square, [(k,) for k in range(9)], 2, prepare, (), lambda _: None))
+
+
+def test_an_interrupt_is_left_to_the_parent() -> None:
+    assert run(pool_tasks.interrupt_itself, [(k,) for k in range(3)]) == {k: k for k in range(3)}
+
+
+def test_no_tasks_need_no_workers() -> None:
+    assert run(pool_tasks.square, []) == {}
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="looks for open files in /proc")
+def test_nothing_stays_open(tmp_path: Path) -> None:
+    counts = []
+    for name in ("one", "other"):  # the first also starts what looks after the processes
+        (tmp_path / name).mkdir()
+        run(pool_tasks.die_at_first, [(str(tmp_path / name), k, 1) for k in range(3)])
+        counts.append(len(list(Path("/proc/self/fd").iterdir())))
+    assert counts[0] == counts[1]
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_workers_end_with_the_iterator() -> None:
     running = run_tasks(pool_tasks.process_id, [(0.0,), (30.0,), (30.0,)], 2, pool_tasks.prepare, (), lambda _: None)
@@ -68,7 +105,7 @@ def test_workers_end_with_the_iterator() -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-def test_no_worker_outlives_a_parent_that_is_killed() -> None:
+def test_no_worker_outlives_a_parent_that_is_killed_nor_says_a_word_about_it() -> None:
     script = """
 import pool_tasks, sys
 from jaxgran.pool import run_tasks
@@ -77,12 +114,13 @@ if __name__ == "__main__":
     for _, process in run_tasks(pool_tasks.process_id, tasks, 2, pool_tasks.prepare, (), print):
         print(process, flush=True)
 """
+    pipe = subprocess.PIPE
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=environment)
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=pipe, stderr=pipe, text=True, env=environment)
     assert parent.stdout is not None
     workers = [int(parent.stdout.readline()) for _ in range(2)]
     assert all(map(is_alive, workers))
     parent.kill()
-    parent.wait()
-    parent.stdout.close()
+    _, err = parent.communicate(timeout=10)
+    assert err == ""
     assert gone(workers)
