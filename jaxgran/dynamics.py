@@ -324,7 +324,8 @@ def _impulses(
     loaded = impulses > 0
     clustered = in_clusters(network, impulses, count) if impulses.size > 1 else jnp.zeros_like(loaded)
     flags = jnp.stack([network.used, loaded, network.used & (approach < 0)]).astype(nx.dtype)
-    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags, jnp.where(clustered, impulses, 0)[None]])
+    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags])
+    in_cluster = jnp.where(clustered, impulses, 0)
     status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
     status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok
@@ -335,6 +336,7 @@ def _impulses(
     return impulses, Sums(
         flights=sums.flights,
         contacts=sums.contacts + jnp.matmul(features, weights.T, precision=lax.Precision.HIGHEST),
+        clusters=sums.clusters + jnp.sum(features[1:4] * in_cluster[None, :], axis=1),
         solves=sums.solves + jnp.concatenate([counts, by_residual.astype(nx.dtype)]),
         largest=jnp.maximum(sums.largest, jnp.stack([deepest, solution.residual])),
         status=jnp.maximum(sums.status, status),

@@ -110,9 +110,9 @@ class Sums(NamedTuple):
     field            shape    sum of
     ===============  =======  =====================================================================================
     flights          (5,)     time, steps, and the integrals of Σ m c_x c_x, Σ m c_x c_y, Σ m c_y c_y
-    contacts         (7, 6)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
-                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching,
-                              p in clusters)
+    contacts         (7, 5)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
+                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching)
+    clusters         (3,)     (l n_x n_x, l n_x n_y, l n_y n_y) p over contacts in clusters
     solves           (67,)    networks solved, iterations, unconverged solves, and the counts by residual
     largest          (2,)     (the largest) overlap of a contact and relative residual of a solve
     status           ()       (the worst) status
@@ -120,7 +120,8 @@ class Sums(NamedTuple):
     """
 
     flights: Float[Array, "5"]
-    contacts: Float[Array, "7 6"]
+    contacts: Float[Array, "7 5"]
+    clusters: Float[Array, "3"]
     solves: Float[Array, "67"]
     largest: Float[Array, "2"]
     status: Int[Array, ""]
@@ -138,7 +139,7 @@ class Sums(NamedTuple):
             binary_impulse=self.contacts[0, 1],
             contact_moment=tensor(self.contacts[1:4, 0]),
             binary_moment=tensor(self.contacts[1:4, 1]),
-            cluster_moment=tensor(self.contacts[1:4, 5]),
+            cluster_moment=tensor(self.clusters),
             kinetic_moment=tensor(self.flights[2:]),
             dissipation=self.contacts[4, 0],
             complementarity=self.contacts[6, 0],
@@ -162,7 +163,8 @@ def empty_sums(dtype: jnp.dtype) -> Sums:
     """The sums of no time at all."""
     return Sums(
         flights=jnp.zeros(5, dtype),
-        contacts=jnp.zeros((7, 6), dtype),
+        contacts=jnp.zeros((7, 5), dtype),
+        clusters=jnp.zeros(3, dtype),
         solves=jnp.zeros(3 + RESIDUAL_EDGES.size - 1, dtype),
         largest=jnp.zeros(2, dtype),
         status=jnp.int32(0),
