@@ -1,16 +1,28 @@
 """Tests run in float64 with strict promotion, so that no precision or rank changes unnoticed.
 
-The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each.
+The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each. What is
+compiled is kept in a folder of the run, for the processes that share its tests and for those that they start.
 """
 
+import os
+import shutil
+import tempfile
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
+if FIRST_PROCESS:
+    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxgran-tests-")
+CACHE = Path(os.environ["XDG_CACHE_HOME"])
+
+jax.config.update("jax_compilation_cache_dir", str(CACHE / "compiled"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -27,6 +39,12 @@ GRAINS = 32
 def pytest_configure():
     """``pytest.GRAINS`` is the number of grains that the shared compiled functions are for."""
     pytest.GRAINS = GRAINS
+
+
+def pytest_unconfigure():
+    """The folder of compiled programs goes with the run."""
+    if FIRST_PROCESS:
+        shutil.rmtree(CACHE, ignore_errors=True)
 
 
 class Compiled:

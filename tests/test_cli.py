@@ -55,8 +55,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
 def in_a_process(folder: Path, *arguments: str) -> Outcome:
     """Run a command as its user would, in a process of its own."""
     command = [sys.executable, "-c", "from jaxgran.cli import main; main()", *arguments]
-    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache")}
-    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     return Outcome(done.returncode, done.stdout, done.stderr)
 
@@ -220,7 +219,10 @@ def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch
     assert "Permission denied" in outcome.err
 
 
-def test_a_mistake_is_one_sentence_in_a_process_of_its_own_with_and_without_cached_programs(tmp_path: Path) -> None:
+def test_a_mistake_is_one_sentence_in_a_process_of_its_own_with_and_without_cached_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     for _ in range(2):
         outcome = in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09")
         assert_one_sentence(outcome)

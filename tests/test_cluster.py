@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 from synthetic import one_sentence
 
@@ -17,7 +18,7 @@ SCRIPT = Path(__file__).parents[1] / "benchmarks" / "slurm_map.py"
 
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess:
-    environment = os.environ | {"XDG_CACHE_HOME": str(folder), "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled")}
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
     return subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
 
 
