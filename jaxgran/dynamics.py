@@ -4,8 +4,14 @@ A time step finds the contacts at its beginning, changes the velocities by the i
 flies freely for dt. Between contacts the velocity in the laboratory frame is constant, so separations are linear
 in time and the step at which some pair next becomes an approaching contact is known in advance: ``advance`` jumps
 there in one evaluation. The trajectory is the one of the fixed time step; the cost follows the contacts.
+
+Derivatives of a trajectory hold the time steps of its contacts: the numbers of steps flown are whole and do not change.
+That is the derivative of what is computed. It is not that of the flow in the limit dt → 0, in which a contact comes
+earlier or later where the grains before it are moved: with ``moving_contacts`` every contact that begins in a step adds
+what a shift of its time by dτ does, to first order, with the values as they are.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.delassus import grain_impulses, in_clusters
-from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number
+from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number, require_whole
 from jaxgran.grains import Grains
 from jaxgran.pairs import (
     Frame,
@@ -36,6 +42,7 @@ from jaxgran.status import Status
 from jaxgran.tally import RESIDUAL_EDGES, Sums, Tally, empty_sums
 
 DEEP_OVERLAP = 1e-2
+_FEW_RUNGS = 3  # of the contact buffers, where derivatives are compiled along
 _LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
 
 
@@ -87,6 +94,13 @@ class _Pairs(NamedTuple):
         return jnp.stack([self.ux, self.uy], axis=-1)
 
 
+class _Derivative(NamedTuple):
+    """What an advance is made for besides its values: fewer contact buffers are compiled sooner."""
+
+    rungs: int | None = None  # contact buffers, the largest; None for all of them
+    moving_contacts: bool = False
+
+
 class _Carry(NamedTuple):
     hood: Neighbourhood
     pairs: _Pairs
@@ -103,8 +117,19 @@ def contact_capacities(grains: int) -> tuple[int, ...]:
     return tuple(sorted({1, *(max(4, top // share) for share in (96, 24, 6, 3, 1))}))
 
 
-def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> tuple[State, Tally]:
+def advance(
+    flow: ShearFlow,
+    state: State,
+    steps: Int[Array, ""],
+    free_flight: bool = True,
+    events: int | None = None,
+    moving_contacts: bool = False,
+) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
+
+    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
+    (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
+    every event, about 0.7 kB for each grain, and finds its contacts and impulses again on the way back.
 
     Args:
       flow: parameters; all numbers of one replica.
@@ -112,11 +137,43 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
       steps: number of time steps, traced.
       free_flight: whether steps without an approaching contact are jumped over. ``False`` visits every step;
         the trajectory is the same.
+      events: None for as many evaluations as it takes, or the number of them, static, in a loop of fixed length: one
+        for each step that is visited, ``steps + 1`` at most, see ``count_events``. Where they do not suffice the
+        status is ``capacity``.
+      moving_contacts: whether derivatives include that a contact moves in time, see the module. Values do not change.
 
     Returns:
       The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
       the status ``nonfinite``.
     """
+    rungs = None if events is None and not moving_contacts else _FEW_RUNGS
+    how = _Derivative(rungs, moving_contacts)
+    start, body, unfinished = _event_loop(flow, state, steps, free_flight, how)
+    if events is None:
+        end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
+    else:
+        require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
+        end = _scanned(start, body, unfinished, events)
+    positions, tilt = present(end.hood, state.side)
+    status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
+    status = jnp.maximum(status, jnp.where(unfinished(end), Status.capacity, Status.ok)).astype(jnp.int32)
+    grains = state.grains
+    tally = end.sums.tally(
+        energy_change=_energy(grains, end.velocities) - _energy(grains, state.velocities),
+        momentum_drift=_relative_momentum(grains, end.velocities),
+    )
+    return State(grains, positions, end.velocities, state.side, tilt), replace(tally, status=status)
+
+
+def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:
+    """Evaluations that an advance takes: the ``events`` that it needs in a loop of fixed length."""
+    start, body, unfinished = _event_loop(flow, state, steps, free_flight, _Derivative())
+    counted = jnp.int32(0), start
+    return lax.while_loop(lambda at: any_replica(unfinished(at[1])), lambda at: (at[0] + 1, body(at[1])), counted)[0]
+
+
+def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, how: _Derivative):
+    """Start and body of the loop of an advance, and whether it has to go on."""
     require_state(flow, state)
     words = f"a whole number of 0 to {MAX_STEPS}"
     require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
@@ -143,7 +200,10 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
         pairs = pairs._replace(x=pairs.x + flight * pairs.ux, y=pairs.y + flight * pairs.uy)
         step = now.step + jump
         meets = go & (step < steps)
-        velocities, pairs, sums = _collide(flow, hood.near, grains, velocities, pairs, sums, meets)
+        velocities, pairs, sums, shift = _collide(flow, hood.near, grains, velocities, pairs, sums, meets, how)
+        if shift is not None:
+            frame, velocities, pairs = _shifted(shift, shear_rate, hood, velocities, pairs)
+            hood = replace(hood, frame=frame)
         status = jnp.where(
             hood.near.overflow | (slack < -16 * jnp.finfo(slack.dtype).eps * hood.near.skin), Status.capacity, Status.ok
         )
@@ -156,14 +216,16 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: b
     sums = empty_sums(state.positions.dtype)
     sums = sums._replace(status=_status_if_finite(state.positions, state.velocities))
     start = _Carry(hood, pairs, hood.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
-    end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
-    positions, tilt = present(end.hood, side)
-    status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
-    tally = end.sums.tally(
-        energy_change=_energy(grains, end.velocities) - _energy(grains, state.velocities),
-        momentum_drift=_relative_momentum(grains, end.velocities),
-    )
-    return State(grains, positions, end.velocities, side, tilt), replace(tally, status=status)
+    return start, body, unfinished
+
+
+def _scanned(start: _Carry, body: Callable, unfinished: Callable, events: int) -> _Carry:
+    """The end of a loop of fixed length, of which reverse mode keeps what is carried and computes all else again."""
+
+    def one(now: _Carry, _: None) -> tuple[_Carry, None]:
+        return lax.cond(any_replica(unfinished(now)), body, lambda now: now, now), None
+
+    return lax.scan(jax.checkpoint(one), start, length=events)[0]
 
 
 def _energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
@@ -173,6 +235,7 @@ def _energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
 def _relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
     """|Σ m c| over Σ m |c|, zero at rest."""
     momenta = grains.masses[:, None] * velocities
+    momenta = lax.stop_gradient(momenta)  # a measure of rounding; at rest a norm has no derivative
     all_of_it = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
     return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(all_of_it > 0, all_of_it, 1)
 
@@ -206,10 +269,11 @@ def _fresh_lists(
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
     r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
     """
-    cx, cy = now.velocities[:, 0], now.velocities[:, 1]
+    velocities = lax.stop_gradient(now.velocities)  # the lists decide what is looked at, not what it is
+    cx, cy = velocities[:, 0], velocities[:, 1]
     longest = jnp.maximum(_LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
     speed = jnp.sqrt(-_smallest(-(cx * cx + cy * cy))) * (1 + longest)
-    diameter = 2 * jnp.max(grains.radii)
+    diameter = 2 * jnp.max(lax.stop_gradient(grains.radii))
 
     def loss(skin: Array) -> Array:
         return 2 * speed + flow.shear_rate * (diameter + skin) / 2
@@ -218,7 +282,7 @@ def _fresh_lists(
 
     def fresh():
         hood = refresh(now.hood, grains, side, stale)
-        new = hood, _pairs_now(hood, now.velocities, flow.shear_rate), hood.near.skin
+        new = hood, _pairs_now(hood, now.velocities, flow.shear_rate), lax.stop_gradient(hood.near.skin)
         return where_active(stale, new, (now.hood, now.pairs, now.slack))
 
     hood, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.hood, now.pairs, now.slack))
@@ -254,9 +318,19 @@ def _add_flight(
 
 
 def _collide(
-    flow: ShearFlow, near: PairList, grains: Grains, velocities: Array, pairs: _Pairs, sums: Sums, meets: Array
-) -> tuple[Array, _Pairs, Sums]:
-    """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches."""
+    flow: ShearFlow,
+    near: PairList,
+    grains: Grains,
+    velocities: Array,
+    pairs: _Pairs,
+    sums: Sums,
+    meets: Array,
+    how: _Derivative,
+) -> tuple[Array, _Pairs, Sums, Array | None]:
+    """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches.
+
+    The last result are displacements that are zero, and have the derivatives that come of contacts that move in time.
+    """
     look_ahead = flow.activation_fraction * flow.timestep
     contact, approaching = is_contact(pairs.separations(), pairs.velocities(), near.reach, look_ahead)
     words = bit_words(contact)
@@ -264,23 +338,55 @@ def _collide(
     meets = meets & jnp.any(bit_words(approaching) > 0)
     # A lone contact has a closed form, which differs in the last bits: never chosen by what else is in a batch.
     capacities = contact_capacities(grains.radii.size)[1 if in_batch() else 0 :]
+    capacities = capacities if how.rungs is None else capacities[-how.rungs :]
+    separations, delays, still = pairs.separations(), None, None
+    if how.moving_contacts:
+        delays = _delays(pairs, near.reach, approaching, flow.timestep)
+        separations, still = separations + delays[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
     rung = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
     rung = largest_replica(jnp.where(meets, rung, 0))
 
     def with_capacity(capacity: int):
         def collided():
             index = set_bits(words, capacity, contact.size)
-            network = contact_network(index, near, pairs.separations(), pairs.velocities(), grains)
+            network = contact_network(index, near, separations, pairs.velocities(), grains)
             impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
             change = _velocity_changes(network, impulses, grains)
             (xi, yi), (xj, yj) = change(near.i), change(near.j)
             kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)
             moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
-            return where_active(meets, (moved, kicked, new), (velocities, pairs, sums))
+            shift = None
+            if delays is not None:
+                delayed = impulses * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
+                shift = -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
+            return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, still))
 
         return collided
 
-    return lax.switch(rung, [lambda: (velocities, pairs, sums), *map(with_capacity, capacities)])
+    return lax.switch(rung, [lambda: (velocities, pairs, sums, still), *map(with_capacity, capacities)])
+
+
+def _delays(pairs: _Pairs, reach: Array, approaching: Array, timestep: float | Array) -> Float[Array, " pairs"]:
+    """Zero, with the derivative of the time at which each contact of this step began.
+
+    Contacts that began long before are clusters at rest: theirs is not a moment, and moves nothing.
+    """
+    time, _ = first_contact_time(pairs.separations(), pairs.velocities(), reach)
+    begins = approaching & (jnp.abs(time) <= timestep)
+    time = jnp.where(begins, time, 0)
+    return time - lax.stop_gradient(time)
+
+
+def _shifted(
+    shift: Array, shear_rate: float | Array, hood: Neighbourhood, velocities: Array, pairs: _Pairs
+) -> tuple[Frame, Array, _Pairs]:
+    """Frame, velocities and pairs with the grains displaced, at the same velocities in the laboratory."""
+    x, y = shift[:, 0], shift[:, 1]
+    frame, near = hood.frame, hood.near
+    moved = frame.displacements + jnp.stack([x - frame.strain * y, y], axis=-1)
+    apart = shift[near.i] - shift[near.j]
+    pairs = pairs._replace(x=pairs.x + apart[:, 0], y=pairs.y + apart[:, 1])
+    return Frame(moved, frame.strain), velocities - shear_rate * jnp.stack([y, jnp.zeros_like(y)], axis=-1), pairs
 
 
 def _velocity_changes(network: Contacts, impulses: Array, grains: Grains):

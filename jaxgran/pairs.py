@@ -136,6 +136,7 @@ def refresh(hood: Neighbourhood, grains: Grains, side: Array, stale: Bool[Array,
     still = Frame(jnp.zeros_like(hood.positions), jnp.zeros_like(hood.tilt))
     nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
     left = hood.outer.skin - consumed_skin(hood.frame, still, 2 * jnp.max(grains.radii) + nominal)
+    left = jax.lax.stop_gradient(left)
     search = stale & ~(left >= nominal)
 
     def searched(_):

@@ -5,14 +5,27 @@ With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact l
     u⁺ = u⁻ + W p,    0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0.
 
 Its solution is p = (1 + α) p₀, where p₀ solves it at α = 0; so only 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0 is ever solved.
+
+Derivatives do not go through the iteration. On the contacts that press, A = {p₀ > 0}, the solution satisfies
+W_AA p₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press or to part:
+
+    W_AA dp₀ = −(dW p₀ + du⁻)_A,    dp₀ = 0 elsewhere.
+
+This linear system is solved by conjugate gradients, in forward and in reverse mode, whose memory does not depend on the
+iterations. Where W_AA is singular, as in a cluster with more contacts than degrees of freedom, velocities after the
+step have this derivative and the impulses are not unique, nor are their derivatives: one solution is returned. The
+set A is that of the solution found, so derivatives want a small tolerance (1e-8 or less).
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contacts import Contacts
@@ -23,6 +36,7 @@ from jaxgran.replica import any_replica, where_active
 from jaxgran.status import Status
 
 _JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
 
 
 @jax.tree_util.register_dataclass
@@ -48,6 +62,7 @@ class Solution:
     status: Int[Array, ""]
 
 
+@partial(jax.custom_jvp, nondiff_argnums=(1, 6))
 def solve(
     contacts: Contacts,
     grains: int,
@@ -69,6 +84,8 @@ def solve(
       relaxation: ω of the Jacobi methods; the others do not use it.
       method: name of a projected method, see ``methods``.
       active: whether this replica has something to solve; others of its batch return zero impulses.
+
+    Impulses and response have derivatives with respect to the network, see the module; all else has none.
     """
     b, own = contacts.approach, diagonal(contacts, grains)
     if b.size == 1:
@@ -119,6 +136,44 @@ def solve(
         residual=jnp.where(active, end.at.best_residual / jnp.maximum(scale, target), 0),
         iterations=end.at.iterations,
         status=jnp.where(active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status).astype(jnp.int32),
+    )
+
+
+@solve.defjvp
+def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    contacts, shear_rate, tolerance, max_iterations, relaxation, active = primals
+    solution = solve(contacts, grains, shear_rate, tolerance, max_iterations, relaxation, method, active)
+    impulses, pressing = solution.impulses, solution.impulses > 0
+    own = diagonal(contacts, grains)
+
+    def response(normals: Array, inverse_mass_i: Array, inverse_mass_j: Array) -> Array:
+        network = replace(contacts, normals=normals, inverse_mass_i=inverse_mass_i, inverse_mass_j=inverse_mass_j)
+        return delassus_product(network, impulses, grains)
+
+    def of_pressing(change: Array) -> Array:
+        """W_AA on the contacts that press, and the identity on the others."""
+        felt = delassus_product(contacts, jnp.where(pressing, change, 0), grains)
+        return jnp.where(pressing, felt, change)
+
+    def solved(operator, wanted: Array) -> Array:
+        change, _ = cg(operator, wanted, tol=_DERIVATIVE_TOLERANCE, maxiter=4 * impulses.size, M=lambda x: x / own)
+        missed = wanted - operator(change)
+        good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
+        return jnp.where(good, change, jnp.nan)
+
+    places = ("normals", "inverse_mass_i", "inverse_mass_j")
+    change = tangents[0]
+    at, along = (tuple(getattr(x, name) for name in places) for x in (contacts, change))
+    _, turned = jax.jvp(response, at, along)
+    wanted = jnp.where(pressing, -(turned + change.approach), 0)
+    impulse_change = lax.custom_linear_solve(of_pressing, wanted, solved, symmetric=True)
+    none: Any = np.zeros((), jax.dtypes.float0)
+    return solution, Solution(
+        impulses=impulse_change,
+        response=turned + delassus_product(contacts, impulse_change, grains),
+        residual=jnp.zeros_like(solution.residual),
+        iterations=none,
+        status=none,
     )
 
 

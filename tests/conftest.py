@@ -19,6 +19,7 @@ import pytest
 FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
 if FIRST_PROCESS:
     os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxgran-tests-")
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, and why
 CACHE = Path(os.environ["XDG_CACHE_HOME"])
 
 jax.config.update("jax_compilation_cache_dir", str(CACHE / "compiled"))

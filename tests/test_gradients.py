@@ -1,0 +1,312 @@
+"""Derivatives of a contact solve and of a run, against finite differences and against laws that are known."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import Phase, assume, given, settings
+from hypothesis import strategies as st
+from jax import lax
+from oracles import MAX_DISCS, delassus, padded_network, random_network
+
+from jaxgran.cell import displacement
+from jaxgran.contacts import Contacts
+from jaxgran.delassus import delassus_product, grain_impulses, spectral_bound
+from jaxgran.dynamics import State, advance, count_events
+from jaxgran.flow import ShearFlow
+from jaxgran.grains import Grains
+from jaxgran.sensitivity import margins
+from jaxgran.snapshots import snapshot
+from jaxgran.solver import solve
+from jaxgran.status import Status
+
+networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, MAX_DISCS))
+STEPS = 40
+
+
+def impulses_of(approach, angles, inverse_masses, network: Contacts):
+    """Impulses of a network with given approach velocities, directions of the normals and inverse masses of grains."""
+    normals = jnp.where(network.used[:, None], jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1), 0)
+    turned = replace(
+        network,
+        approach=approach,
+        normals=normals,
+        inverse_mass_i=jnp.where(network.used, inverse_masses[network.i], 0),
+        inverse_mass_j=jnp.where(network.used, inverse_masses[network.j], 0),
+    )
+    numbers = (jnp.asarray(1.0), jnp.asarray(1e-13), jnp.asarray(100_000), jnp.asarray(1.8))
+    return solve(turned, MAX_DISCS, *numbers, "barzilai-borwein", jnp.asarray(True)).impulses
+
+
+@jax.jit
+def weighted(approach, angles, inverse_masses, network, weights):
+    return jnp.sum(weights * impulses_of(approach, angles, inverse_masses, network))
+
+
+gradient = jax.jit(jax.grad(weighted, argnums=(0, 1, 2)))
+tangent = jax.jit(lambda at, along, *rest: jax.jvp(lambda *x: weighted(*x, *rest), at, along)[1])
+
+
+def inputs(network: Contacts, masses: np.ndarray):
+    angles = jnp.arctan2(network.normals[:, 1], network.normals[:, 0])
+    return network.approach, angles, jnp.asarray(1 / masses)
+
+
+def strictness(network: Contacts, masses: np.ndarray) -> float:
+    """How far the network is from a contact that neither presses nor parts."""
+    impulses = np.asarray(impulses_of(*inputs(network, masses), network))
+    matrix = delassus(network, masses)
+    margin = np.maximum(np.diag(matrix) * impulses, matrix @ impulses + np.asarray(network.approach))
+    return float(np.min(margin[np.asarray(network.used)]))
+
+
+@settings(max_examples=25, derandomize=True, deadline=None, phases=[Phase.generate])
+@given(networks, st.sampled_from([1.0, 100.0]))
+def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest):
+    """With respect to velocities, geometry and masses, wherever no contact is about to press or to part."""
+    network, masses, _ = random_network(*network_of, heaviest)
+    assume(np.any(network.used) and strictness(network, masses) > 1e-3)
+    used = np.asarray(network.used)
+    rng = np.random.default_rng(network_of[0])
+    at, weights = inputs(network, masses), jnp.asarray(rng.normal(size=used.size) * used)
+    derivative = gradient(*at, network, weights)
+    for k in range(3):
+        real = used if k < 2 else np.ones(MAX_DISCS)
+        along = tuple(jnp.asarray(real * rng.normal(size=x.shape) if n == k else 0 * x) for n, x in enumerate(at))
+
+        def difference(step: float, along=along) -> float:
+            moved = [tuple(x + sign * step * d for x, d in zip(at, along, strict=True)) for sign in (1, -1)]
+            return float(weighted(*moved[0], network, weights) - weighted(*moved[1], network, weights)) / (2 * step)
+
+        numerical = (4 * difference(1e-5) - difference(2e-5)) / 3  # of fourth order
+        exact = float(jnp.sum(derivative[k] * along[k]))
+        scale = float(jnp.sqrt(jnp.sum(derivative[k] ** 2))) + 1
+        assert abs(numerical - exact) < 1e-6 * scale
+        assert abs(tangent(at, along, network, weights) - exact) < 1e-8 * scale
+
+
+def test_implicit_derivative_is_that_of_the_unrolled_iteration():
+    """Ten thousand projected Jacobi steps, differentiated one by one, have the derivative of the one linear solve."""
+
+    def unrolled(approach, network, weights):
+        bound = spectral_bound(network, MAX_DISCS)
+
+        def step(impulses, _):
+            return jnp.maximum(0, impulses - (delassus_product(network, impulses, MAX_DISCS) + approach) / bound), None
+
+        return jnp.sum(weights * lax.scan(step, jnp.zeros_like(approach), length=10_000)[0])
+
+    derivative = jax.jit(jax.grad(unrolled))
+    for seed in range(3):
+        network, masses, _ = random_network(seed, 12)
+        weights = jnp.where(network.used, np.random.default_rng(seed).normal(size=network.used.size), 0)
+        own = gradient(*inputs(network, masses), network, weights)[0]
+        theirs = derivative(network.approach, network, weights)
+        np.testing.assert_allclose(own, theirs, rtol=0, atol=1e-7 * float(jnp.max(jnp.abs(theirs))))
+
+
+def test_velocities_are_differentiable_where_impulses_are_not_unique():
+    """A disc that hits a rigid hexagon of seven, which has one contact more than it takes to hold it together."""
+    angles = np.arange(6) * np.pi / 3
+    places = np.concatenate([[[0.0, 0.0]], np.stack([np.cos(angles), np.sin(angles)], -1), [[2.0, 0.1]]])
+    places[7, 0] = 1 + np.sqrt(1 - 0.01)
+    pairs = [(0, k) for k in range(1, 7)] + [(k, k % 6 + 1) for k in range(1, 7)] + [(1, 7)]
+    i, j = np.array(pairs).T
+    normals = places[i] - places[j]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    masses = np.ones(MAX_DISCS)
+    empty = padded_network(i, j, normals, np.zeros(len(i)), masses)
+    assert np.linalg.matrix_rank(delassus(empty, masses)[: len(i), : len(i)]) < len(i)
+
+    @jax.jit
+    def after(velocities):
+        approach = jnp.sum(empty.normals * (velocities[empty.i] - velocities[empty.j]), axis=-1)
+        network = replace(empty, approach=jnp.where(empty.used, approach, 0))
+        numbers = (jnp.asarray(1.0), jnp.asarray(1e-13), jnp.asarray(1_000_000), jnp.asarray(1.8))
+        impulses = solve(network, MAX_DISCS, *numbers, "nesterov", jnp.asarray(True)).impulses
+        return velocities + grain_impulses(network, impulses, MAX_DISCS)
+
+    inwards = np.zeros((MAX_DISCS, 2))
+    inwards[1:7] = -0.1 * places[1:7]  # so that every contact of the hexagon presses
+    inwards[7] = -1.0, 0.2
+    along = np.random.default_rng(0).normal(size=inwards.shape) * (np.arange(MAX_DISCS) < 8)[:, None]
+    ends = [after(jnp.asarray(inwards + sign * 1e-5 * along)) for sign in (1, -1)]
+    _, change = jax.jvp(after, (jnp.asarray(inwards),), (jnp.asarray(along),))
+    np.testing.assert_allclose(change, (ends[0] - ends[1]) / 2e-5, rtol=0, atol=1e-6)
+
+
+# Through time
+
+NAMES = ("restitution", "shear_rate", "timestep", "side", "radii", "masses", "positions", "velocities")
+
+
+def parameters(flow: ShearFlow, state: State) -> dict:
+    numbers = {name: jnp.asarray(getattr(flow, name), float) for name in NAMES[:3]}
+    own = {"side": state.side, "radii": state.grains.radii, "masses": state.grains.masses}
+    return numbers | own | {"positions": state.positions, "velocities": state.velocities}
+
+
+def made(flow: ShearFlow, state: State, values: dict, events: int | None = None, moving_contacts: bool = False):
+    flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
+    grains = Grains(values["radii"], values["masses"])
+    start = State(grains, values["positions"], values["velocities"], values["side"], state.tilt)
+    return advance(flow, start, jnp.int32(STEPS), True, events, moving_contacts)
+
+
+@pytest.fixture(scope="module")
+def tilting(flowing) -> tuple[ShearFlow, State, int]:
+    """A flow whose tilt is about to be remapped, in which outer lists are built anew, and its number of events."""
+    flow = ShearFlow(pytest.GRAINS, 0.6, 0.7, 5e-3, tolerance=1e-12, max_iterations=100_000)
+    state = replace(flowing(0.7), tilt=jnp.asarray(0.45))
+    end, tally = jax.jit(advance)(flow, state, jnp.int32(STEPS))
+    assert end.tilt < 0 and tally.collisions > 20
+    return flow, state, int(jax.jit(count_events)(flow, state, jnp.int32(STEPS)))
+
+
+@pytest.fixture(scope="module")
+def derivative(tilting):
+    """A random linear function of the end of the run, its gradient, and the function."""
+    flow, state, events = tilting
+    weights = np.random.default_rng(0).normal(size=(2, pytest.GRAINS, 2))
+    with jax.numpy_rank_promotion("allow"):
+        end = jax.jit(lambda values: made(flow, state, values))(parameters(flow, state))[0]
+
+    def score(values: dict, events: int | None):
+        after, tally = made(flow, state, values, events)
+        moved = displacement(after.positions, end.positions, lax.stop_gradient(after.side), after.tilt)
+        return jnp.sum(weights[0] * moved) + jnp.sum(weights[1] * after.velocities), tally
+
+    compiled = jax.jit(jax.value_and_grad(score, has_aux=True), static_argnums=1)
+    (value, tally), slopes = compiled(parameters(flow, state), events)
+    assert tally.status <= Status.deep_overlap
+    forward = jax.jit(lambda values: score(values, None)[0])
+    return value, slopes, forward, score
+
+
+def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative):
+    flow, state, _ = tilting
+    value, _, forward, _ = derivative
+    np.testing.assert_allclose(value, forward(parameters(flow, state)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, name):
+    """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and nothing else."""
+    flow, state, _ = tilting
+    _, slopes, forward, score = derivative
+    at = parameters(flow, state)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=at[name].shape))
+    step = 1e-8
+    ends = [forward(at | {name: at[name] + sign * step * along}) for sign in (1, -1)]
+    numerical, exact = float((ends[0] - ends[1]) / (2 * step)), float(jnp.sum(slopes[name] * along))
+    assert abs(numerical - exact) <= 1e-6 * max(1, abs(exact))
+    if name == "radii":
+        assert exact == 0
+    change = jax.tree.map(jnp.zeros_like, at) | {name: along}
+    other = jax.jit(lambda a, d: jax.jvp(lambda values: score(values, None)[0], (a,), (d,))[1])(at, change)
+    np.testing.assert_allclose(other, exact, rtol=1e-7, atol=1e-9)
+
+
+def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative):
+    flow, state, events = tilting
+    _, slopes, _, score = derivative
+    at = parameters(flow, state)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), at) | {"restitution": jnp.asarray([0.6, 0.3])}
+    one = jax.grad(lambda values: score(values, events)[0])
+    for batched in (jax.vmap(one, axis_name="replica"), lambda values: lax.map(one, values)):
+        found = jax.jit(batched)(batch)
+        for name in NAMES:
+            scale = float(jnp.max(jnp.abs(slopes[name]))) + 1
+            np.testing.assert_allclose(found[name][0], slopes[name], rtol=0, atol=1e-6 * scale)
+            assert np.all(np.isfinite(found[name][1]))
+
+
+def test_events_that_do_not_suffice_are_reported(tilting):
+    flow, state, events = tilting
+    short = jax.jit(advance, static_argnums=(3, 4))
+    assert short(flow, state, jnp.int32(STEPS), True, events)[1].status < Status.capacity
+    assert short(flow, state, jnp.int32(STEPS), True, events - 2)[1].status == Status.capacity
+
+
+# What the derivative means
+
+
+def collision(gap, scene, dt: float, moving_contacts: bool):
+    """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at rest in the shear."""
+    state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
+    state = replace(state, positions=state.positions.at[1, 0].add(gap))
+    flow = ShearFlow(pytest.GRAINS, 0.5, 0.02, dt, tolerance=1e-12)
+    end, _ = advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
+    return end.positions[0, 0]
+
+
+@pytest.mark.parametrize("moving_contacts", [False, True])
+def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene, moving_contacts):
+    """At fixed steps, the first disc has come no further when it has further to go: ∂x/∂gap = 0. In truth it meets the
+    other one later, and loses the velocity Δv later: ∂x/∂gap = Δv/u = (1 + α)/2.
+    """
+    at = jnp.asarray(0.2 + 3e-4)
+    slope = jax.jit(jax.jacfwd(lambda gap: collision(gap, scene, 1e-3, moving_contacts)))(at)
+    np.testing.assert_allclose(slope, 0.75 if moving_contacts else 0.0, atol=1e-9)
+    far = [collision(at + sign * 0.05, scene, 1e-3, False) for sign in (1, -1)]
+    np.testing.assert_allclose((far[0] - far[1]) / 0.1, 0.75, atol=0.02)  # a difference over many steps sees the event
+
+
+def test_derivative_of_many_collisions_is_that_of_the_flow_without_time_steps(packed):
+    """With respect to the restitution, at a step so short that differences see the limit; fixed steps miss most."""
+    state = packed(0.3)
+    velocities = np.random.default_rng(0).normal(size=(pytest.GRAINS, 2))
+    state, dt = replace(state, velocities=jnp.asarray(velocities)), 1e-6
+
+    def after(alpha, moving_contacts: bool = False):
+        flow = ShearFlow(pytest.GRAINS, alpha, 0.3, dt, tolerance=1e-11, max_iterations=100_000)
+        end, tally = advance(flow, state, jnp.int32(round(0.4 / dt)), True, None, moving_contacts)
+        return end.velocities, tally.collisions
+
+    compiled = jax.jit(after)
+    (high, met), (low, also) = (compiled(jnp.asarray(0.8 + sign * 3e-4)) for sign in (1, -1))
+    assert met == also and met > 8
+    difference = (high - low) / 6e-4
+
+    def missed(moving_contacts: bool) -> float:
+        slope = jax.jit(
+            lambda alpha: jax.jvp(lambda a: after(a, moving_contacts)[0], (alpha,), (jnp.ones_like(alpha),))[1]
+        )
+        return float(jnp.linalg.norm(slope(jnp.asarray(0.8)) - difference) / jnp.linalg.norm(difference))
+
+    assert missed(True) < 0.02
+    assert missed(False) > 0.2
+
+
+def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
+    """A disc hits a second one that a third one touches at a right angle: the third contact neither presses nor parts.
+
+    Hit a little from above or from below, the second disc pushes the third or leaves it alone: the derivatives to
+    both sides differ, and the one returned is one of them.
+    """
+    touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    flow = ShearFlow(pytest.GRAINS, 0.0, 0.02, 1e-6, tolerance=1e-12)
+
+    @jax.jit
+    def pushed(slant):
+        """Velocity of the third disc along y, where the first one comes at a slant."""
+        turn = jnp.stack([jnp.cos(slant), -jnp.sin(slant)])
+        state = replace(touching, positions=touching.positions.at[0].set(touching.positions[1] - turn))
+        return advance(flow, state, jnp.int32(2))[0].velocities[2, 1]
+
+    at, step = jnp.asarray(0.0), 1e-4
+    returned = jax.jit(jax.jacfwd(pushed))(at)
+    sides = [(pushed(at + sign * step) - pushed(at)) / (sign * step) for sign in (1, -1)]
+    assert abs(sides[0] - sides[1]) > 0.1
+    assert min(abs(returned - side) for side in sides) < 1e-3
+
+    def nearest(third) -> float:
+        state = replace(touching, positions=touching.positions.at[2].set(jnp.asarray(third)))
+        series = jax.tree.map(lambda x: x[None], snapshot(flow, state))
+        return float(margins(flow.activation_fraction, series).pressing[0])
+
+    angle = np.pi / 3
+    assert nearest([4.0, 3.0]) < 1e-9
+    assert nearest([4 + np.sin(angle), 4 - np.cos(angle)]) > 0.1
