@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jaxgran.sweep import ratio_map
     from jaxgran.tally import Tally
     from jaxgran.theory_figures import cluster_shares, theory_errors
+    from jaxgran.trajectory import Trajectory, read_trajectory
 
 __version__ = version("jaxgran")
 
@@ -53,6 +54,8 @@ _HOME = {
     "ratio_map": "sweep",
     "Snapshot": "snapshots",
     "snapshot_series": "snapshots",
+    "Trajectory": "trajectory",
+    "read_trajectory": "trajectory",
     "Fields": "fields",
     "fields_at": "fields",
     "gaussian": "coarse_graining",
@@ -76,6 +79,7 @@ __all__ = [
     "State",
     "Status",
     "Tally",
+    "Trajectory",
     "advance",
     "cluster_shares",
     "fields_at",
@@ -91,6 +95,7 @@ __all__ = [
     "ratio_contours",
     "ratio_curves",
     "ratio_map",
+    "read_trajectory",
     "sample",
     "save_figures",
     "snapshot_series",

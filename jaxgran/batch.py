@@ -19,6 +19,7 @@ from jaxgran.tally import Tally
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call
 Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances a batch, each replica by its own steps
+Wrap = Callable[[Drive], Drive]  # adds to what a drive does, and changes no state
 
 
 def stack(flows: list[ShearFlow]) -> ShearFlow:

@@ -11,7 +11,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
@@ -25,10 +25,11 @@ from rich.table import Table
 # XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from jaxgran.flow import MAX_REPLICAS, Activation, InputError, Solver, shown
+from jaxgran.flow import MAX_REPLICAS, Activation, InputError, Solver, require_number, shown
 from jaxgran.progress import progress
 
 NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
+MOST_FRAMES = 100_000  # of a trajectory
 FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
 
 _UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
@@ -199,14 +200,16 @@ def run_command(
         typer.Option(help="Relative standard error of force ratio and stresses to reach, in place of --strain."),
     ] = None,
     timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
-    trajectory: Annotated[Path | None, typer.Option(help="GSD file of the trajectory (not available yet).")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
+    every: Annotated[
+        float | None, typer.Option(help="Strain from frame to frame. [default: a hundredth of the sampled strain]")
+    ] = None,
     movie: Annotated[Path | None, typer.Option(help="GIF of the flow (not available yet).")] = None,
     output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
 ) -> None:
     """Run one flow to its steady state, sample it, and print its averages with their errors."""
-    for name, wanted in (("--trajectory", trajectory), ("--movie", movie)):
-        if wanted is not None:
-            raise InputError(f"{name} is not available yet: run without it.")
+    if movie is not None:
+        raise InputError("--movie is not available yet: run without it.")
     step = _numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
@@ -219,9 +222,30 @@ def run_command(
         "strain": _first_strain(strain, error) or 5.0,
         "error": error,
     }
-    data, interrupted = _measure(chosen, "auto", 1, output, quiet=False)
+    recorder = _recorder(trajectory, every, chosen["strain"])
+    record = None if recorder is None else recorder.recording
+    data, interrupted = _measure(chosen, "auto", 1, output, quiet=False, record=record)
     _print_table(_summary_table(data))
+    if recorder is not None and recorder.frames:
+        _say(f"wrote {trajectory}: {recorder.frames} frames")
     _finish(data, [output] if output else [], interrupted)
+
+
+def _recorder(trajectory: Path | None, every: float | None, strain: float):
+    """What records the flow in a file, frame by frame; None where no file is given."""
+    if trajectory is None:
+        if every is not None:
+            raise InputError("every is the strain between the frames of a trajectory: add --trajectory FILE.gsd.")
+        return None
+    _configured_jax()
+    from jaxgran.trajectory import Recorder, check_trajectory
+
+    if every is not None:
+        least, most = strain / MOST_FRAMES, strain
+        words = f"at least {least:g} and at most the sampled strain, {most:g}"
+        require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)
+    check_trajectory(trajectory)
+    return Recorder(trajectory, strain / 100 if every is None else every)
 
 
 def _like(file: Path) -> dict[str, Any]:
@@ -303,10 +327,12 @@ def _measure(
     target_error: float = 0.02,
     resume: bool | None = None,
     scheduler: str | None = None,
+    record: Callable | None = None,
 ):
     """Run a map with progress, write its dataset, and return it and whether it was interrupted.
 
-    Where ``resume`` is not None a checkpoint is kept beside the output, and continued if ``resume`` is True.
+    Where ``resume`` is not None a checkpoint is kept beside the output, and continued if ``resume`` is True. What
+    ``record`` is, ``replicas`` says.
     """
     jax = _configured_jax()
     from jaxgran.checkpoint import Checkpoint
@@ -340,7 +366,7 @@ def _measure(
     try:
         with progress(costs, settings.seeds, quiet) as meter:
             meter.resumed(point for point, _ in results)
-            running = replicas(settings, batch, workers, meter.steps, checkpoint, _say, scheduler)
+            running = replicas(settings, batch, workers, meter.steps, checkpoint, _say, scheduler, record)
             try:
                 for key, replica in running:
                     results[key] = replica

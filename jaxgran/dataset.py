@@ -4,7 +4,6 @@ import math
 import os
 import platform
 import subprocess
-import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, fields
@@ -26,14 +25,13 @@ from jaxgran.measure import Sample, correlation_strains, estimates
 from jaxgran.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.settings import MapSettings
 from jaxgran.status import Status
-from jaxgran.store import replaced
+from jaxgran.store import replaced, require_place
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1
 Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
-_LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside the output are longer
 _PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
 _AXES = {
     "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
@@ -152,28 +150,13 @@ def map_dataset(
 
 def check_output(path: Path) -> None:
     """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
-    if path.suffix != ".nc":
-        raise InputError(f"output must be a file name that ends in .nc, not {shown(str(path))}.")
-    if len(os.fsencode(path.name)) > _LONGEST_NAME:
-        raise InputError(f"output must be a file name of at most {_LONGEST_NAME} bytes, not {shown(path.name)}.")
-    for file in (path, *(path.with_name(f"{path.stem}_{name}.png") for name in _PICTURES)):
+    require_place(path, "output", ".nc")
+    for file in (path.with_name(f"{path.stem}_{name}.png") for name in _PICTURES):
         if os.path.isdir(file):
             raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
-    if not os.path.isdir(path.parent):
-        raise InputError(f"output must be in a folder that exists, and {shown(str(path.parent))} does not.")
     unfinished = path.with_name(f"{path.name}.unfinished")
     if unfinished.exists() and not unfinished.is_dir():
         raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-        if path.exists():
-            with path.open("ab"):
-                pass
-    except OSError as error:
-        raise InputError(
-            f"output must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
-        ) from None
 
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:

@@ -37,6 +37,7 @@ from jaxgran.status import Status
 
 _JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
 _DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
+_DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 
 
 @jax.tree_util.register_dataclass
@@ -156,7 +157,7 @@ def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> 
         return jnp.where(pressing, felt, change)
 
     def solved(operator, wanted: Array) -> Array:
-        change, _ = cg(operator, wanted, tol=_DERIVATIVE_TOLERANCE, maxiter=4 * impulses.size, M=lambda x: x / own)
+        change, _ = cg(operator, wanted, tol=_DERIVATIVE_TOLERANCE, maxiter=_DERIVATIVE_ITERATIONS * impulses.size, M=lambda x: x / own)
         missed = wanted - operator(change)
         good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
         return jnp.where(good, change, jnp.nan)

@@ -13,6 +13,7 @@ import io
 import json
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,11 +22,36 @@ import h5netcdf
 import h5py
 import numpy as np
 
+from jaxgran.flow import InputError, shown
+
 _DIGEST = hashlib.sha256().digest_size
+_LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside a file are longer
 
 
 class Damaged(Exception):
     """A file that cannot be read, or whose content is not what was written."""
+
+
+def require_place(path: Path, option: str, ending: str) -> None:
+    """Raise an InputError that says what is accepted, unless a file of that ending can be written to ``path``."""
+    if path.suffix != ending:
+        raise InputError(f"{option} must be a file name that ends in {ending}, not {shown(str(path))}.")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise InputError(f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {shown(path.name)}.")
+    if os.path.isdir(path):
+        raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.")
+    if not os.path.isdir(path.parent):
+        raise InputError(f"{option} must be in a folder that exists, and {shown(str(path.parent))} does not.")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists():
+            with path.open("ab"):
+                pass
+    except OSError as error:
+        raise InputError(
+            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
+        ) from None
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Container, Generator, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from jaxgran.batch import Drive, Report, advance_batch, reporting, stack
+from jaxgran.batch import Drive, Report, Wrap, advance_batch, reporting, stack
 from jaxgran.checkpoint import Checkpoint
 from jaxgran.cluster import run_on_cluster
 from jaxgran.dataset import Key, Replica, map_dataset
@@ -147,6 +148,7 @@ def replicas(
     checkpoint: Checkpoint | None = None,
     warn: Callable[[str], None] = warnings.warn,
     scheduler: str | None = None,
+    record: Wrap | None = None,
 ) -> Generator[tuple[Key, Replica]]:
     """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
 
@@ -159,6 +161,7 @@ def replicas(
       warn: told in one sentence what went wrong with a batch that is given up.
       scheduler: address of a Dask cluster whose workers run the batches, in place of processes of this machine. A
         journal is kept where they see the folder of the checkpoint; the report follows whole batches.
+      record: wraps the drive of every sample, not of what precedes it; heard in this process alone.
     """
     tasks = _remaining(settings, batch, workers, checkpoint)
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
@@ -169,7 +172,7 @@ def replicas(
     elif workers > 1:
         outcomes = run_tasks(_run_task, calls, workers, _configure, configuration, hear)
     else:
-        outcomes = ((number, _run_task(*call, report)) for number, call in enumerate(calls))
+        outcomes = ((number, _run_task(*call, report, record)) for number, call in enumerate(calls))
     with closing(outcomes):
         for number, outcome in outcomes:
             if isinstance(outcome, Died):
@@ -264,33 +267,42 @@ def _points(settings: MapSettings, task: Sequence[Key]) -> str:
 
 
 def _run_task(
-    settings: MapSettings, task: Sequence[Key], journal: Path | None = None, report: Report | None = None
+    settings: MapSettings,
+    task: Sequence[Key],
+    journal: Path | None = None,
+    report: Report | None = None,
+    record: Wrap | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of one batch; one that does not fit into the memory is halved."""
     drive = reporting(advance_batch, report or send)
+    measured = _measured if record is None else partial(_measured, record=record)
     try:
-        done = _measured(settings, task, drive if journal is None else Journal(journal, task, drive))
-        return _retried(settings, done, drive)
+        done = measured(settings, task, drive if journal is None else Journal(journal, task, drive))
+        return _retried(settings, done, partial(measured, drive=drive, refinement=2))
     except Damaged:
         assert journal is not None
         journal.unlink(missing_ok=True)
-        return _run_task(settings, task, journal, report)
+        return _run_task(settings, task, journal, report, record)
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error) or len(task) == 1:
             raise
         middle = len(task) // 2  # without a journal, which is that of the whole batch
-        return [done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report)]
+        return [
+            done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report, record)
+        ]
 
 
-def _retried(settings: MapSettings, done: list[tuple[Key, Replica]], drive: Drive) -> list[tuple[Key, Replica]]:
+def _retried(
+    settings: MapSettings, done: list[tuple[Key, Replica]], refined: Callable[..., list[tuple[Key, Replica]]]
+) -> list[tuple[Key, Replica]]:
     """The replicas of a batch, those that came to nothing once more from another start and with half the time steps."""
     failed = [key for key, replica in done if replica.status >= Status.infeasible]
-    again = dict(_measured(settings, failed, drive, refinement=2)) if failed else {}
+    again = dict(refined(settings, failed)) if failed else {}
     return [(key, again[key] if key in again and again[key].status < one.status else one) for key, one in done]
 
 
 def _measured(
-    settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1
+    settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1, record: Wrap | None = None
 ) -> list[tuple[Key, Replica]]:
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
@@ -300,7 +312,7 @@ def _measured(
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     prepared = batch.strain
     error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
-    batch, sample = sample_batch(batch, settings.strain, drive, error)
+    batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)
     return [
         (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(prepared[k])))
         for k, key in enumerate(task)

@@ -327,9 +327,11 @@ RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6")
 MAP_OPTIONS = ["restitution", "packing-fraction", "grains", "seeds", "timestep", "equilibrate", "strain", "error"]
 MAP_OPTIONS += ["tolerance", "target-error", "solver", "activation", "batch", "workers", "scheduler", "preset"]
 MAP_OPTIONS += ["output", "like"]
-RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "trajectory", "output"]
+RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "output"]
+RUN_OPTIONS += ["trajectory", "trajectory=x.gsd --every"]
 ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]
 ENORMOUS += ["a" * 5000, "a" * 5000 + ".nc", "n" * 250 + ".nc", "\udcff.nc", "../..", "/", ".nc", "..nc", "~/x", "x.NC"]
+ENORMOUS += ["n" * 250 + ".gsd", "\udcff.gsd", "x.gsd"]
 texts = st.one_of(
     st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])),
     st.text("0123456789.,:e-+ nainfauto", max_size=12),
@@ -351,7 +353,8 @@ def test_any_text_in_an_option_of_map_is_accepted_or_refused_in_one_sentence(opt
 @few(max_examples=12)
 @given(texts)
 def test_any_text_in_an_option_of_run_is_accepted_or_refused_in_one_sentence(option: str, text: str) -> None:
-    accepts_or_refuses(*RUN, f"--{option}={text}")
+    *others, option = option.split(" --")
+    accepts_or_refuses(*RUN, *(f"--{other}" for other in others), f"--{option}={text}")
 
 
 @few(max_examples=40)

@@ -21,6 +21,7 @@ from jaxgran import cli, sweep
 from jaxgran.dataset import NOT_RUN, read_dataset, write_dataset
 from jaxgran.flow import InputError
 from jaxgran.status import Status
+from jaxgran.trajectory import read_trajectory
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
@@ -63,7 +64,7 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
 def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
     """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
 
-    def replicas(settings, batch, workers, report, checkpoint, warn, scheduler) -> Iterator:
+    def replicas(settings, batch, workers, report, checkpoint, warn, scheduler, record) -> Iterator:
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
             report(100.0)
@@ -172,7 +173,11 @@ MISTAKES = {
     "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
     "run --restitution 0.5 --packing-fraction 0.9": "packing_fraction must be above 0 and at most 0.83",
     "run --restitution 0.5 --packing-fraction 0.5 --grains 3": "grains must be a whole number of at least 16",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd": "--trajectory is not available yet",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.xyz": "trajectory must be a file name that ends in",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 0": "every must be at least 5e-05 and",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 6": "at most the sampled strain, 5",
+    "run --restitution 0.5 --packing-fraction 0.5 --every 1": "add --trajectory FILE.gsd",
     "run --restitution 0.5 --packing-fraction 0.5 --movie flow.gif": "--movie is not available yet",
     "run --restitution 0.5 --packing-fraction 0.5 --output flow.csv": "ends in .nc",
     "run --restitution 0.5": "--packing-fraction",
@@ -310,9 +315,11 @@ def test_plot_into_a_folder_that_is_not_there_is_one_sentence(small_map) -> None
 
 def test_run_prints_every_average_with_its_error_and_unit(tmp_path: Path) -> None:
     words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep auto --strain 4 --output flow.nc"
-    outcome = jaxgran(tmp_path, *words.split())
+    outcome = jaxgran(tmp_path, *words.split(), "--trajectory", "flow.gsd", "--every", "0.5")
     assert outcome.status in (0, 3)
-    assert files(tmp_path) == {"flow.nc"}
+    assert files(tmp_path) == {"flow.nc", "flow.gsd"}
+    assert "wrote flow.gsd: 9 frames\n" in outcome.err
+    np.testing.assert_allclose(read_trajectory(tmp_path / "flow.gsd").strain, 0.5 * np.arange(9), atol=5e-3)
     data = read_dataset(tmp_path / "flow.nc")
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]

@@ -15,9 +15,9 @@ SOURCES = sorted(path for path in Path(jaxgran.__file__).parent.glob("*.py") if 
 # A module imports only modules before it.
 LAYERS = """
     replica status flow maps grains cell neighbours pairs contacts delassus methods solver tally dynamics snapshots
-    coarse_graining fields sensitivity calibrate packing observables statistics series force_chains structure measure kinetic_theory
-    kinetics batch protocol accuracy settings store dataset journal checkpoint pool cluster sweep rheology drawing
-    contours theory_figures rheology_figures figures progress cli __main__
+    coarse_graining fields sensitivity calibrate packing observables statistics series force_chains structure measure
+    kinetic_theory kinetics batch protocol accuracy settings store trajectory dataset journal checkpoint pool cluster
+    sweep rheology drawing contours theory_figures rheology_figures figures progress cli __main__
 """
 
 

@@ -1,0 +1,460 @@
+"""Trajectories come back bit for bit, and other programs see in them the cell, the grains and the contacts."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import freud
+import gsd.fl
+import gsd.hoomd
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.batch import stack
+from jaxgran.cell import displacement
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.snapshots import snapshot
+from jaxgran.trajectory import Recorder, Trajectory, append_frame, check_trajectory, read_trajectory, start_trajectory
+
+GRAINS = pytest.GRAINS
+TILTS = (-0.4, 0.0, 0.3)
+
+
+@pytest.fixture(scope="module")
+def flow() -> ShearFlow:
+    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-10)
+
+
+@pytest.fixture(scope="module")
+def seen(flow, flowing, run):
+    """Snapshots that carry forces, by tilt: the flow is sheared until its cell is tilted so."""
+    by_tilt, one_snapshot, state = {}, jax.jit(snapshot), flowing(0.78)
+    for tilt in TILTS:
+        state, _ = run(flow, state, round((tilt - state.tilt.item()) % 1 / 1e-3))
+        by_tilt[tilt] = one_snapshot(flow, state)
+        while np.count_nonzero(by_tilt[tilt].impulses) < 3:
+            state, _ = run(flow, state, 1)
+            by_tilt[tilt] = one_snapshot(flow, state)
+    return by_tilt
+
+
+@pytest.fixture(scope="module")
+def drive(flow, run):
+    """A drive of a batch of one by the compiled function that all tests share."""
+
+    def driven(_, states, steps):
+        state = jax.tree.map(lambda x: x[0], states)
+        return jax.tree.map(lambda x: x[None], run(flow, state, int(steps[0])))
+
+    return driven
+
+
+@pytest.fixture(scope="module")
+def recorded(flow, flowing, drive, tmp_path_factory):
+    """A file of five frames, ten steps apart, that were driven in blocks of 25 and 15 steps; and the last state."""
+    path = tmp_path_factory.mktemp("trajectory") / "flow.gsd"
+    recorder = Recorder(path, 0.0101)
+    end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15))
+    assert (recorder.frames, recorder.steps) == (5, 40)
+    return path, end, tallies
+
+
+def driven_in_blocks(drive, flow, state, blocks):
+    flows, states, tallies = stack([flow]), jax.tree.map(lambda x: x[None], state), []
+    for steps in blocks:
+        states, tally = drive(flows, states, jnp.asarray([steps], jnp.int32))
+        tallies.append(tally)
+    return jax.tree.map(lambda x: x[0], (states, tallies))
+
+
+def assert_same_bits(one, other) -> None:
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+def frame_of(trajectory: Trajectory, k: int):
+    return jax.tree.map(lambda x: x[k], trajectory.state)
+
+
+def first_frame(path: Path):
+    with gsd.hoomd.open(path) as file:
+        return file[0]
+
+
+# What is written is read
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_a_state_is_read_back_to_the_bit(seen, tilt: float, tmp_path: Path) -> None:
+    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    append_frame(tmp_path / "flow.gsd", seen[TILTS[0]], 700)
+    read = read_trajectory(tmp_path / "flow.gsd")
+    assert_same_bits(frame_of(read, 0), seen[tilt].state)
+    assert_same_bits(frame_of(read, 1), seen[TILTS[0]].state)
+    np.testing.assert_array_equal(read.step, [0, 700])
+    np.testing.assert_allclose(read.strain, [0, 0.7], rtol=1e-15)
+    assert (read.timestep, read.shear_rate, read.restitution) == (1e-3, 1.0, 0.3)
+    assert read.packing_fraction == pytest.approx(0.78, rel=1e-14)
+
+
+def test_a_state_in_single_precision_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
+    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, seen[0.3])
+    start_trajectory(tmp_path / "flow.gsd", single)
+    read = read_trajectory(tmp_path / "flow.gsd")
+    for a, b in zip(jax.tree.leaves(frame_of(read, 0)), jax.tree.leaves(single.state), strict=True):
+        assert a.dtype == np.float32
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_flow_goes_on_from_what_is_read(flow, run, recorded) -> None:
+    path, end, _ = recorded
+    on, _ = run(flow, jax.tree.map(jnp.asarray, frame_of(read_trajectory(path), 3)), 10)
+    assert_same_bits(on, end)
+
+
+# Recording
+
+
+def test_frames_are_those_of_the_flow_at_equal_distances(flow, flowing, run, recorded) -> None:
+    path, end, _ = recorded
+    read, state = read_trajectory(path), flowing(0.78)
+    np.testing.assert_array_equal(read.step, [0, 10, 20, 30, 40])
+    np.testing.assert_allclose(read.strain, 1e-3 * read.step, rtol=1e-14)
+    assert_same_bits(frame_of(read, 0), state)
+    assert_same_bits(frame_of(read, 4), end)
+    for k in range(1, 5):
+        state, _ = run(flow, state, 10)
+        frame = frame_of(read, k)
+        apart = displacement(frame.positions, state.positions, state.side, state.tilt)
+        np.testing.assert_allclose(apart, 0, atol=1e-9)
+        np.testing.assert_allclose(frame.velocities, state.velocities, atol=1e-9)
+        np.testing.assert_allclose(frame.tilt, state.tilt, atol=1e-12)
+
+
+def test_recording_changes_no_sum_beyond_rounding(flow, flowing, drive, recorded) -> None:
+    _, end, tallies = recorded
+    plain_end, plain = driven_in_blocks(drive, flow, flowing(0.78), (25, 15))
+    np.testing.assert_allclose(end.velocities, plain_end.velocities, atol=1e-9)
+    for tally, other in zip(tallies, plain, strict=True):
+        for name in ("duration", "steps", "impulse", "contact_moment", "kinetic_moment", "loaded_contacts", "solves"):
+            np.testing.assert_allclose(getattr(tally, name), getattr(other, name), rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("every", [0.01, 0.02], ids=["every block", "every other block"])
+def test_frames_at_the_ends_of_blocks_change_no_bit(flow, flowing, drive, every: float, tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flow.gsd", every)
+    recorded = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (10, 10, 10, 10))
+    assert_same_bits(recorded, driven_in_blocks(drive, flow, flowing(0.78), (10, 10, 10, 10)))
+    assert recorder.frames == 1 + round(0.04 / every)
+
+
+def test_a_replica_that_waits_has_no_frames(flow, flowing, drive, tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flow.gsd", 0.01)
+    end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (10, 0, 0))
+    assert [float(tally.steps) for tally in tallies] == [10, 0, 0]
+    assert recorder.frames == 2
+    assert_same_bits(frame_of(read_trajectory(recorder.path), 1), end)
+
+
+def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "flow.gsd", 0.01)
+    for steps in (30, 20):
+        driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (steps,))
+        assert len(read_trajectory(recorder.path).step) == recorder.frames == 1 + steps // 10
+
+
+# What other programs see
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_box_is_the_sheared_cell_and_holds_all_grains(seen, tilt: float, tmp_path: Path) -> None:
+    state = seen[tilt].state
+    assert abs(state.tilt.item() - tilt) < 0.1  # it had to be sheared on until there were forces
+    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    frame = first_frame(tmp_path / "flow.gsd")
+    side, tilt = state.side.item(), state.tilt.item()
+    np.testing.assert_allclose(frame.configuration.box, [side, side, 0, tilt, 0, 0], rtol=1e-6)
+    assert (frame.configuration.dimensions, frame.particles.N) == (2, GRAINS)
+    box = freud.box.Box.from_box(frame.configuration.box)
+    assert box.is2D
+    np.testing.assert_allclose(box.to_matrix()[:2, :2], [[side, tilt * side], [0, side]], rtol=1e-6, atol=1e-7)
+    fractions = box.make_fractional(frame.particles.position)[:, :2]
+    assert fractions.min() >= -1e-6 and fractions.max() <= 1 + 1e-6
+    np.testing.assert_allclose(frame.particles.diameter, 2 * state.grains.radii, rtol=1e-6)
+    np.testing.assert_allclose(frame.particles.mass, state.grains.masses, rtol=1e-6)
+    np.testing.assert_allclose(frame.particles.velocity[:, :2], state.velocities, rtol=1e-6, atol=1e-12)
+    assert not frame.particles.velocity[:, 2].any() and not frame.particles.position[:, 2].any()
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_distances_in_the_box_are_those_of_the_flow(seen, tilt: float, tmp_path: Path) -> None:
+    state = seen[tilt].state
+    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    frame = first_frame(tmp_path / "flow.gsd")
+    box = freud.box.Box.from_box(frame.configuration.box)
+    near = freud.locality.AABBQuery(box, frame.particles.position)
+    pairs = near.query(frame.particles.position, {"r_max": 1.6, "exclude_ii": True}).toNeighborList()
+    i, j = pairs.query_point_indices, pairs.point_indices
+    ours = displacement(state.positions[j], state.positions[i], state.side, state.tilt)
+    assert len(pairs) > 4 * GRAINS
+    np.testing.assert_allclose(pairs.vectors[:, :2], ours, atol=1e-5)
+
+
+@pytest.mark.parametrize("tilt", TILTS)
+def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, tilt: float, tmp_path: Path) -> None:
+    """By the bonds, by the neighbours that overlap by the middle of the step, and by the sums of the step."""
+    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    frame = first_frame(tmp_path / "flow.gsd")
+    _, tally = run(flow, seen[tilt].state, 1)
+    assert frame.bonds.types == ["contact"]
+    coordination = np.bincount(frame.bonds.group.ravel(), minlength=GRAINS)
+    assert coordination.sum() / GRAINS == 2 * tally.loaded_contacts.item() / GRAINS > 0
+    np.testing.assert_allclose(np.sum(frame.log["bonds/force"]) * 1e-3, tally.impulse, rtol=1e-9)
+
+    box = freud.box.Box.from_box(frame.configuration.box)
+    position, velocity, radii = frame.particles.position, frame.particles.velocity, frame.particles.diameter / 2
+    near = freud.locality.AABBQuery(box, position).query(position, {"r_max": 1.6, "exclude_ii": True}).toNeighborList()
+    i, j, apart = near.query_point_indices, near.point_indices, near.vectors
+    closing = velocity[j] - velocity[i]
+    closing[:, 0] += apart[:, 1]  # shear rate one
+    gaps = np.linalg.norm(apart + 0.5e-3 * closing, axis=1) - radii[i] - radii[j]
+    touching = {(a, b) for a, b, gap in zip(i, j, gaps, strict=True) if gap < 1e-5}
+    bonds = {tuple(pair) for pair in frame.bonds.group}
+    assert bonds | {(b, a) for a, b in bonds} <= touching
+    bonded = freud.locality.NeighborList.from_arrays(
+        GRAINS,
+        GRAINS,
+        *frame.bonds.group.T,
+        box.wrap(position[frame.bonds.group[:, 1]] - position[frame.bonds.group[:, 0]]),
+    )
+    sums = radii[frame.bonds.group].sum(axis=1)
+    assert np.all(bonded.distances < 1.01 * sums) and np.all(bonded.distances > 0.95 * sums)
+
+
+def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
+    lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
+    start_trajectory(tmp_path / "flow.gsd", seen[0.3])
+    append_frame(tmp_path / "flow.gsd", lost, 1)
+    append_frame(tmp_path / "flow.gsd", seen[0.0], 2)
+    with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
+        counts = [frame.bonds.N for frame in file]
+        assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
+    assert counts[1] == 0 < min(counts[0], counts[2])
+
+
+# Files of other programs
+
+
+def foreign(path: Path, frames: int = 2, **changes) -> Path:
+    """A file as another program writes it: single precision, and a cell tilted by more than a half."""
+    rng = np.random.default_rng(0)
+    with gsd.hoomd.open(path, "w") as file:
+        for k in range(frames):
+            frame = gsd.hoomd.Frame()
+            frame.configuration.step, frame.configuration.box = 100 * k, [8, 8, 0, 0.7, 0, 0]
+            frame.particles.N = 20
+            frame.particles.position = np.pad(rng.uniform(-4, 4, (20, 2)), ((0, 0), (0, 1)))
+            frame.particles.velocity = np.pad(rng.normal(size=(20, 2)), ((0, 0), (0, 1)))
+            frame.particles.diameter, frame.particles.mass = np.full(20, 1.5), np.full(20, 3.0)
+            for name, value in changes.items():
+                section, attribute = name.split("_")
+                setattr(getattr(frame, section), attribute, value(k) if callable(value) else value)
+            file.append(frame)
+    return path
+
+
+def test_a_file_of_another_program_is_read(tmp_path: Path) -> None:
+    path = foreign(tmp_path / "other.gsd")
+    read, frame = read_trajectory(path), first_frame(path)
+    state = frame_of(read, 0)
+    assert state.positions.shape == state.velocities.shape == (20, 2)
+    assert state.positions.min() >= 0 and state.positions.max() < 8
+    box = freud.box.Box.from_box(frame.configuration.box)
+    for k in range(20):
+        theirs = box.wrap(frame.particles.position - frame.particles.position[k])[:, :2]
+        ours = displacement(state.positions, state.positions[k : k + 1], state.side, state.tilt)
+        apart = box.wrap(np.pad(np.asarray(ours) - theirs, ((0, 0), (0, 1))))
+        np.testing.assert_allclose(apart, 0, atol=1e-5)
+    np.testing.assert_array_equal(state.velocities, frame.particles.velocity[:, :2])
+    np.testing.assert_array_equal(state.grains.radii, 0.75)
+    np.testing.assert_array_equal(state.grains.masses, 3)
+    assert (state.side, state.tilt) == (8, pytest.approx(-0.3, abs=1e-6))
+    np.testing.assert_array_equal(read.step, [0, 100])
+    assert np.isnan([*read.strain, read.timestep, read.shear_rate, read.restitution]).all()
+    assert read.packing_fraction == pytest.approx(20 * np.pi * 0.75**2 / 64)
+
+
+def test_diameters_and_masses_that_are_not_told_are_one(tmp_path: Path) -> None:
+    state = read_trajectory(foreign(tmp_path / "x.gsd", particles_diameter=None, particles_mass=None)).state
+    np.testing.assert_array_equal(state.grains.radii, 0.5)
+    np.testing.assert_array_equal(state.grains.masses, 1)
+
+
+def test_a_flow_may_start_at_rest(tmp_path: Path) -> None:
+    """Velocities of zero are those that a file does not tell, unless it never tells any."""
+    path = foreign(tmp_path / "x.gsd", particles_velocity=lambda k: np.full((20, 3), k))
+    read = read_trajectory(path)
+    np.testing.assert_array_equal(read.state.velocities, np.stack([np.zeros((20, 2)), np.ones((20, 2))]))
+
+
+LACKING = {
+    "there are no velocities": {"particles_velocity": None},
+    "there are no positions": {"particles_position": None},
+    "the cell has three dimensions": {"configuration_dimensions": 3},
+    "the cell is not a square": {"configuration_box": [8, 9, 0, 0, 0, 0]},
+    "there are no grains": {
+        "particles_N": 0,
+        **dict.fromkeys([f"particles_{x}" for x in ("position", "velocity", "diameter", "mass")]),
+    },
+    "some number is not finite": {"particles_mass": np.full(20, np.nan)},
+    "some diameter is not positive": {"particles_diameter": np.zeros(20)},
+    "some mass is not positive": {"particles_mass": -np.ones(20)},
+    "it has no frames": {"frames": 0},
+}
+
+
+def assert_refused(path, words: str) -> None:
+    with pytest.raises(InputError) as mistake:
+        read_trajectory(path)
+    sentence = str(mistake.value)
+    assert words in sentence
+    assert sentence.endswith(".") and sentence.count("\n") == 0 and len(sentence) < 500
+
+
+@pytest.mark.parametrize(("words", "changes"), LACKING.items(), ids=LACKING)
+def test_a_file_that_lacks_something_is_refused_in_one_sentence(words: str, changes: dict, tmp_path: Path) -> None:
+    assert_refused(foreign(tmp_path / "lacks.gsd", **changes), words)
+
+
+def test_frames_of_several_numbers_of_grains_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    names = {"position": (1, 1, 0), "velocity": (1, 0, 0), "diameter": 1.5, "mass": 3.0}
+    changes = {
+        f"particles_{name}": lambda k, one=value: np.full((20 - k, *np.shape(one)), one)
+        for name, value in names.items()
+    }
+    path = foreign(tmp_path / "other.gsd", particles_N=lambda k: 20 - k, **changes)
+    assert_refused(path, "in frame 1 the number of grains is another")
+
+
+def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
+    content = recorded[0].read_bytes()
+    assert_refused(tmp_path / "none.gsd", "there is no file")
+    assert_refused(tmp_path, "there is no file")
+    assert_refused(3, "path must be a file name")
+    for name, torn in {
+        "empty": b"",
+        "text": b"no trajectory " * 99,
+        "torn": content[:-300],
+        "head": content[:256],
+    }.items():
+        (tmp_path / f"{name}.gsd").write_bytes(torn)
+        assert_refused(tmp_path / f"{name}.gsd", "is not a GSD file that can be read")
+    with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
+        pass
+    assert_refused(tmp_path / "other.gsd", "its schema is 'rods'")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_damaged_file_is_read_or_refused_in_one_sentence(seed: int, recorded, tmp_path: Path) -> None:
+    rng = np.random.default_rng(seed)
+    content = bytearray(recorded[0].read_bytes())
+    for place in rng.integers(len(content), size=30):
+        content[place] = rng.integers(256)
+    (tmp_path / "damaged.gsd").write_bytes(content)
+    try:
+        read_trajectory(tmp_path / "damaged.gsd")
+    except InputError as mistake:
+        assert str(mistake).endswith(".") and "\n" not in str(mistake)
+
+
+# Interruptions
+
+
+def test_an_old_file_stays_until_the_first_frame_is_there(seen, tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "flow.gsd"
+    path.write_bytes(b"old")
+    with monkeypatch.context() as patch:
+        patch.setattr(gsd.hoomd.HOOMDTrajectory, "append", interrupts)
+        with pytest.raises(KeyboardInterrupt):
+            start_trajectory(path, seen[0.3])
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["flow.gsd"]
+    start_trajectory(path, seen[0.3])
+    assert len(read_trajectory(path).step) == 1
+
+
+def interrupts(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("chunk", ["configuration/step", "particles/position", "log/jaxgran/tilt"])
+def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
+    seen, chunk: str, tmp_path: Path, monkeypatch
+) -> None:
+    """And can be added to."""
+    path = tmp_path / "flow.gsd"
+    start_trajectory(path, seen[0.3])
+    append_frame(path, seen[0.0], 1)
+    before = read_trajectory(path)
+    append = partial(append_frame, path, seen[-0.4], 2)
+    with monkeypatch.context() as patch:
+        library = gsd.fl.open
+        patch.setattr(gsd.fl, "open", lambda *words, **more: Interrupted(library(*words, **more), chunk))
+        with pytest.raises(KeyboardInterrupt):
+            append()
+    assert_same_bits(read_trajectory(path), before)
+    append()
+    assert_same_bits(frame_of(read_trajectory(path), 2), seen[-0.4].state)
+
+
+class Interrupted:
+    """A file whose writing is interrupted at a chunk."""
+
+    def __init__(self, file, chunk: str):
+        self._file, self._chunk = file, chunk
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._file.close()
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
+
+    def write_chunk(self, name: str, data) -> None:
+        if name == self._chunk:
+            raise KeyboardInterrupt
+        self._file.write_chunk(name, data)
+
+
+def test_a_file_is_whole_after_every_frame(flow, flowing, drive, tmp_path: Path) -> None:
+    """Whoever is killed leaves the frames before."""
+    recorder, seen_frames = Recorder(tmp_path / "flow.gsd", 0.002), []
+
+    def watched(*arguments):
+        seen_frames.append(len(read_trajectory(recorder.path).step))
+        return drive(*arguments)
+
+    driven_in_blocks(recorder.recording(watched), flow, flowing(0.78), (8,))
+    assert seen_frames == [1, 2, 3, 4]
+
+
+# Where trajectories are written
+
+
+@pytest.mark.parametrize("name", ["flow.nc", "flow", "none/flow.gsd", "n" * 250 + ".gsd", "\udcff.gsd", "folder.gsd"])
+def test_a_place_that_does_not_do_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
+    (tmp_path / "folder.gsd").mkdir()
+    with pytest.raises(InputError, match=r"^trajectory must be .*\.$"):
+        check_trajectory(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["flow.gsd", "my flow.x.gsd", "Strömung 流れ.gsd"])
+def test_a_file_of_any_other_name_is_written_and_read(name: str, seen, tmp_path: Path) -> None:
+    check_trajectory(tmp_path / name)
+    start_trajectory(tmp_path / name, seen[0.3])
+    assert len(read_trajectory(tmp_path / name).step) == 1
+    check_trajectory(tmp_path / name)
