@@ -29,7 +29,8 @@ from jaxgran.status import Status
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)
 _STRIDE = 0.003  # mean grain diameters that a grain moves in a time step of ours, at the root mean square velocity
 _FEWEST_STEPS = 10  # of a window
-_LARGEST_STEP, _MOST_STEPS, _SETTLED = 0.2, 50, 1e-2  # the last in standard errors
+_LARGEST_STEP, _LEAST_STEP, _MOST_STEPS = 0.2, 1e-9, 50
+_SETTLED = 1e-2  # standard errors
 _CAUCHY = 2.385  # in noises: 95 % as efficient as least squares where the noise is Gaussian
 _LEAST_NOISE = 1e-4  # of the root mean square velocity: an exact trajectory has none
 _TOLERANCE = 1e-9
@@ -104,7 +105,7 @@ def fit_restitution(
     for _ in range(_MOST_STEPS):
         step, error = at.step(least_noise)
         at = compare(float(np.clip(at.restitution + step, 0, 1)))
-        if abs(step) <= _SETTLED * error:
+        if abs(step) <= max(_SETTLED * error, _LEAST_STEP):
             break
     else:
         raise RuntimeError(f"the restitution did not settle: it was last {at.restitution:.3g}.")

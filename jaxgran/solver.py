@@ -157,7 +157,13 @@ def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> 
         return jnp.where(pressing, felt, change)
 
     def solved(operator, wanted: Array) -> Array:
-        change, _ = cg(operator, wanted, tol=_DERIVATIVE_TOLERANCE, maxiter=_DERIVATIVE_ITERATIONS * impulses.size, M=lambda x: x / own)
+        change, _ = cg(
+            operator,
+            wanted,
+            tol=_DERIVATIVE_TOLERANCE,
+            maxiter=_DERIVATIVE_ITERATIONS * impulses.size,
+            M=lambda x: x / own,
+        )
         missed = wanted - operator(change)
         good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
         return jnp.where(good, change, jnp.nan)

@@ -1,0 +1,53 @@
+"""Growth of the derivatives of a flow."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.cell import displacement
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.sensitivity import growth, lyapunov_exponent
+
+
+def flow_of(restitution) -> ShearFlow:
+    return ShearFlow(pytest.GRAINS, restitution, 0.6, 1e-3, tolerance=1e-12, max_iterations=100_000)
+
+
+def test_growth_is_that_of_two_neighbouring_runs(flowing, run) -> None:
+    """At fixed time steps, over a strain in which no contact changes its step."""
+    state, steps, change = flowing(0.6), 60, 1e-9
+    grown = growth(flow_of(0.6), state, 0.06, 3, moving_contacts=False)
+    high, low = (run(flow_of(0.6 + sign * change), state, steps)[0] for sign in (1, -1))
+    moved = displacement(high.positions, low.positions, high.side, high.tilt)
+    squares = np.sum(np.square(moved) + np.square(high.velocities - low.velocities), axis=1)
+    assert grown.derivative[-1] == pytest.approx(np.sqrt(np.mean(squares)) / (2 * change), rel=1e-4)
+    np.testing.assert_allclose(grown.strain, [0.02, 0.04, 0.06])
+    assert np.all(grown.status <= 3) and np.all(np.isfinite(grown.derivative))
+
+
+def test_unit_of_time_does_not_matter(flowing) -> None:
+    state = flowing(0.6)
+    slow = replace(state, velocities=state.velocities / 50)
+    flow = flow_of(0.6)
+    one = growth(flow, state, 0.06, 3)
+    other = growth(replace(flow, shear_rate=0.02, timestep=0.05), slow, 0.06, 3)
+    np.testing.assert_allclose(other.derivative, one.derivative, rtol=1e-6)
+
+
+def test_exponent_of_exponential_growth_is_found_within_its_error() -> None:
+    rng, strain = np.random.default_rng(0), np.linspace(0.1, 4, 40)
+    walks = np.cumsum(rng.normal(0, 0.3, (16, 40)), axis=1)
+    rate, error = lyapunov_exponent(strain, np.exp(3 * strain + walks))
+    assert abs(rate - 3) < 3 * error < 1
+
+
+def test_mistakes_are_sentences(flowing) -> None:
+    with pytest.raises(InputError, match="count must be"):
+        growth(flow_of(0.6), flowing(0.6), 0.06, 0)
+    with pytest.raises(InputError, match="strain must be"):
+        growth(flow_of(0.6), flowing(0.6), 1e-4, 3)
+    with pytest.raises(InputError, match="state must be"):
+        growth(flow_of(0.6), jax.tree.map(lambda x: jnp.stack([x, x]), flowing(0.6)), 0.06, 3)
