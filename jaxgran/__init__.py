@@ -19,8 +19,11 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from jaxgran.calibrate import RestitutionFit, fit_restitution
+    from jaxgran.closure import Closure, predict
+    from jaxgran.closure_fit import fit_closure
     from jaxgran.coarse_graining import gaussian, heaviside, lucy
-    from jaxgran.dynamics import State, advance
+    from jaxgran.dynamics import State, advance, count_events
     from jaxgran.fields import Fields, fields_at
     from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from jaxgran.rheology_figures import friction_figure
     from jaxgran.snapshots import Snapshot, snapshot_series
     from jaxgran.status import Status
+    from jaxgran.stress_inversion import restitution_from_stresses
     from jaxgran.sweep import ratio_map
     from jaxgran.tally import Tally
     from jaxgran.theory_figures import cluster_shares, theory_errors
@@ -62,6 +66,13 @@ _HOME = {
     "heaviside": "coarse_graining",
     "lucy": "coarse_graining",
     "friction_law": "rheology",
+    "Closure": "closure",
+    "fit_closure": "closure_fit",
+    "predict": "closure",
+    "restitution_from_stresses": "stress_inversion",
+    "RestitutionFit": "calibrate",
+    "fit_restitution": "calibrate",
+    "count_events": "dynamics",
     "friction_figure": "rheology_figures",
     "theory_errors": "theory_figures",
     "cluster_shares": "theory_figures",
@@ -71,8 +82,10 @@ _HOME = {
     "save_figures": "figures",
 }
 __all__ = [
+    "Closure",
     "Fields",
     "Grains",
+    "RestitutionFit",
     "Sample",
     "ShearFlow",
     "Snapshot",
@@ -82,7 +95,10 @@ __all__ = [
     "Trajectory",
     "advance",
     "cluster_shares",
+    "count_events",
     "fields_at",
+    "fit_closure",
+    "fit_restitution",
     "friction_figure",
     "friction_law",
     "gaussian",
@@ -90,12 +106,14 @@ __all__ = [
     "lucy",
     "pack",
     "polydisperse",
+    "predict",
     "prepare",
     "ratio_against_timestep",
     "ratio_contours",
     "ratio_curves",
     "ratio_map",
     "read_trajectory",
+    "restitution_from_stresses",
     "sample",
     "save_figures",
     "snapshot_series",

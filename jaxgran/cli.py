@@ -1,4 +1,4 @@
-"""Command line: ``jaxgran map``, ``plot``, ``run`` and ``info``.
+"""Command line: ``jaxgran map``, ``plot``, ``run``, ``fit`` and ``info``.
 
 Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finished, but a point carries a bad status;
 130 interrupted.
@@ -267,6 +267,87 @@ def _first_strain(strain: float | None, error: float | None) -> float | None:
     if strain is not None and error is not None:
         raise InputError("strain and error exclude each other: give one of them.")
     return strain if error is None else FIRST_STRAIN
+
+
+@app.command("fit")
+def fit_command(
+    file: Annotated[Path, typer.Argument(help="Trajectory (.gsd), or dataset of a map (.nc).")],
+    timestep: Annotated[
+        float | None, typer.Option(help="Time step of the runs beside a trajectory. [default: by its velocities]")
+    ] = None,
+    packing_fraction: Annotated[
+        float | None, typer.Option(help="Of a flow whose restitution is sought from its stresses, with a map.")
+    ] = None,
+    pressure: Annotated[float | None, typer.Option(help="Its pressure, in m γ̇².")] = None,
+    shear_stress: Annotated[float | None, typer.Option(help="Its shear stress, in m γ̇².")] = None,
+    relative_error: Annotated[float, typer.Option(help="Relative standard error of these stresses.")] = 0.0,
+) -> None:
+    """Infer the restitution of a trajectory, or fit a closure to a map and infer it from stresses."""
+    _configured_jax()
+    stresses = {"packing fraction": packing_fraction, "pressure": pressure, "shear stress": shear_stress}
+    given = [name for name, value in stresses.items() if value is not None]
+    if file.suffix == ".gsd":
+        if given:
+            raise InputError(f"{given[0]} goes with a map, and {shown(file.name)} is a trajectory.")
+        _fit_trajectory(file, timestep)
+    else:
+        if timestep is not None:
+            raise InputError(f"timestep goes with a trajectory, and {shown(file.name)} is a map.")
+        if 0 < len(given) < len(stresses):
+            missing = next(name for name in stresses if name not in given)
+            raise InputError(f"{missing} must be given too, or a restitution cannot be sought.")
+        _fit_map(file, list(stresses.values()) if given else None, relative_error)
+
+
+def _fit_trajectory(file: Path, timestep: float | None) -> None:
+    from jaxgran.calibrate import fit_restitution
+    from jaxgran.trajectory import read_trajectory
+
+    seen = read_trajectory(file)
+    if not math.isfinite(float(seen.shear_rate)):
+        raise InputError(
+            f"{shown(file.name)} tells no strain and shear rate of its frames: use fit_restitution in Python."
+        )
+    try:
+        found = fit_restitution(seen.strain, seen.state, float(seen.shear_rate), timestep)
+    except RuntimeError as failure:
+        _stop(f"{failure}" if f"{failure}".endswith(("?", ".")) else f"{failure}.", BAD_STATUS)
+    table = Table(box=box.SIMPLE)
+    table.add_column("restitution ± standard error")
+    table.add_column(_with_error(found.restitution, found.stderr))
+    table.add_row("recorded restitution", f"{float(seen.restitution):g}" if math.isfinite(seen.restitution) else "none")
+    table.add_row("noise of the velocities, σγ̇", f"{found.noise:.2g}")
+    table.add_row("windows, collisions", f"{found.windows}, {found.collisions:g}")
+    table.add_row("outliers", f"{100 * found.outliers:.2g} %")
+    _print_table(table)
+
+
+def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:
+    from jaxgran.closure_fit import fit_closure
+    from jaxgran.cross_validation import leave_one_out
+    from jaxgran.dataset import read_dataset
+    from jaxgran.stress_inversion import restitution_from_stresses
+
+    data = read_dataset(file)
+    closure, errors = fit_closure(data), leave_one_out(data)
+    table = Table(
+        title="Closure of the map, each point predicted from the others", box=box.SIMPLE, title_justify="left"
+    )
+    for name in ("observable", "rms error", "largest error", "noise of a point"):
+        table.add_column(name)
+    for name in ("pressure", "shear_stress", "force_ratio"):
+        error, noise = errors[f"{name}_error"].values, errors[f"{name}_noise"].values
+        rms = (math.sqrt(float((x[~(x != x)] ** 2).mean())) for x in (error, noise))
+        largest = float(abs(error[~(error != error)]).max())
+        typical, of_point = rms
+        table.add_row(name.replace("_", " "), *(f"{100 * x:.2g} %" for x in (typical, largest, of_point)))
+    _print_table(table)
+    if stresses is not None:
+        nu, pressure, shear = (float(x) for x in stresses if x is not None)
+        noise = (relative_error * pressure, relative_error * shear)
+        found = restitution_from_stresses(closure, nu, pressure, shear, *noise)
+        words = "" if bool(found.determined) else ", hardly determined: the stresses depend little on it there"
+        print(f"restitution {_with_error(float(found.restitution), float(found.stderr))}{words}")
 
 
 @app.command("info")

@@ -17,7 +17,8 @@ LAYERS = """
     replica status flow maps grains cell neighbours pairs contacts delassus methods solver tally dynamics snapshots
     coarse_graining fields sensitivity calibrate packing observables statistics series force_chains structure measure
     kinetic_theory kinetics batch protocol accuracy settings store trajectory dataset journal checkpoint pool cluster
-    sweep rheology drawing contours theory_figures rheology_figures figures progress cli __main__
+    sweep rheology closure closure_fit stress_inversion cross_validation drawing contours
+    theory_figures rheology_figures figures progress cli __main__
 """
 
 

@@ -1,0 +1,198 @@
+"""How well a closure fitted to a map predicts points it has not seen, and finds a restitution from their stresses.
+
+Every point of a map of 30 is predicted by the closure that is fitted to the other 29. Errors are relative, and stand
+beside the noise of the point itself, which no closure can predict. Points on the edge of the map, where the closure
+extrapolates, are told apart from those inside.
+
+    python benchmarks/closure_study.py             # maps as `jaxgran map` does first, about 2 minutes on two cores
+    python benchmarks/closure_study.py MAP.nc      # the same of a map that there is
+    python benchmarks/closure_study.py --quick     # small flows, large errors, a minute
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import numpy as np
+import xarray as xr
+from hardware import hardware, json_with_rows
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, PercentFormatter, StrMethodFormatter
+
+import jaxgran as jg
+from jaxgran.closure import LAWS
+from jaxgran.cross_validation import leave_one_out
+from jaxgran.dataset import read_dataset
+from jaxgran.sweep import usable_cores
+
+RESTITUTION, PACKING_FRACTION = [0.2, 0.35, 0.5, 0.65, 0.8], [0.5, 0.6, 0.65, 0.7, 0.75, 0.79]
+NAMES = ("pressure", "shear_stress", "force_ratio")
+TARGETS = {"pressure": 0.05, "force_ratio": 0.08}
+STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v"))  # of the restitutions, in turn
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("map", nargs="?", type=Path, help="dataset of a map; without it, one is made")
+    arguments.add_argument("--quick", action="store_true", help="small flows, large errors")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    data = measured(chosen.quick) if chosen.map is None else read_dataset(chosen.map)
+    study(data, chosen.output, "closure_quick" if chosen.quick else "closure")
+
+
+def measured(quick: bool) -> xr.Dataset:
+    """The map that the command line makes first, or one of a quarter of its grains, one seed and half its strain."""
+    size = {"grains": 64, "seeds": 1, "strain": 4.0} if quick else {"grains": 256, "seeds": 2, "strain": 8.0}
+    return jg.ratio_map(RESTITUTION, PACKING_FRACTION, timestep=1e-3, workers=usable_cores(), **size)
+
+
+def study(data: xr.Dataset, output: Path, name: str) -> None:
+    """Fit, leave out, print, and write JSON and PNG."""
+    errors, closure = leave_one_out(data), jg.fit_closure(data)
+    summary = {name: error_summary(errors, name) for name in NAMES} | {"restitution": restitution_summary(errors)}
+    print("relative errors of points left out, in percent")
+    print("               rms   inside     edge  largest  noise of a point   pulls   target")
+    for key in NAMES:
+        one = summary[key]
+        shown = "".join(f"{100 * one[k]:9.1f}" for k in ("rms", "inside", "edge", "largest"))
+        target = f"{100 * TARGETS[key]:9.0f}" if key in TARGETS else ""
+        print(f"{key:12s}{shown[3:]}{100 * one['noise']:18.1f}{one['pull']:8.2f}{target}")
+    print("restitution from stresses: error and quoted standard error (rms over the packing fractions)")
+    for row in summary["restitution"]["by_restitution"]:
+        end = "   end of the range, which no estimate leaves" if row["at_end"] else ""
+        print("  α = {restitution:4.2f}   {rms:6.3f}   {quoted:6.3f}".format(**row) + end)
+    print(f"  pulls, rms: {summary['restitution']['pull']:.2f}")
+    output.mkdir(parents=True, exist_ok=True)
+    run = {k: str(v) for k, v in data.attrs.items()}
+    head = {"hardware": hardware(), "run": run, "closure": coefficients(closure), "summary": summary}
+    (output / f"{name}.json").write_text(json_with_rows(rounded(head), "points", rounded(rows(data, errors))))
+    draw(data, errors).savefig(output / f"{name}.png", dpi=150)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def error_summary(errors: xr.Dataset, name: str) -> dict[str, float]:
+    """Root mean squares of the errors of all points, those inside and on the edge, of their noise and of the pulls."""
+    error, edge = errors[f"{name}_error"].values, errors.edge.values
+    return {
+        "rms": rms(error),
+        "inside": rms(error[~edge]),
+        "edge": rms(error[edge]),
+        "largest": float(np.nanmax(np.abs(error))),
+        "largest_inside": float(np.nanmax(np.abs(error[~edge]))),
+        "noise": rms(errors[f"{name}_noise"].values),
+        "pull": rms(error / errors[f"{name}_stderr"].values),
+    }
+
+
+def restitution_summary(errors: xr.Dataset) -> dict:
+    """Errors of the restitutions found from stresses, of each restitution, and all pulls."""
+    error = errors.restitution_found - errors.restitution
+    by_restitution = [
+        {
+            "restitution": float(alpha),
+            "at_end": bool(alpha in (errors.restitution.min(), errors.restitution.max())),
+            "rms": rms(error.sel(restitution=alpha).values),
+            "quoted": rms(errors.restitution_stderr.sel(restitution=alpha).values),
+        }
+        for alpha in errors.restitution
+    ]
+    pulls = (error / errors.restitution_stderr).values
+    inside = (errors.restitution > errors.restitution.min()) & (errors.restitution < errors.restitution.max())
+    return {
+        "rms": rms(error.values),
+        "pull": rms(pulls),
+        "pull_inside_the_range": rms(pulls[:, inside.values]),
+        "by_restitution": by_restitution,
+    }
+
+
+def coefficients(closure: jg.Closure) -> dict:
+    """Coefficients of each law with standard errors, and its scatter."""
+    return {
+        name: {
+            "coefficients": np.asarray(law.coefficients).tolist(),
+            "standard_errors": np.sqrt(np.diag(law.covariance)).tolist(),
+            "scatter": float(law.scatter),
+        }
+        for name, law in ((name, getattr(closure, name)) for name in LAWS)
+    }
+
+
+def rows(data: xr.Dataset, errors: xr.Dataset) -> list[dict]:
+    """One row a point."""
+    return [
+        {
+            "restitution": float(alpha),
+            "packing_fraction": float(nu),
+            "edge": bool(errors.edge.sel(restitution=alpha, packing_fraction=nu)),
+            **{name: float(data[name].sel(restitution=alpha, packing_fraction=nu)) for name in NAMES},
+            **{
+                str(name): float(value.sel(restitution=alpha, packing_fraction=nu))
+                for name, value in errors.items()
+                if name != "edge"
+            },
+        }
+        for nu in errors.packing_fraction.values
+        for alpha in errors.restitution.values
+    ]
+
+
+def rounded(value):
+    """Numbers to five digits, anywhere within lists and dictionaries."""
+    if isinstance(value, dict):
+        return {k: rounded(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [rounded(v) for v in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def draw(data: xr.Dataset, errors: xr.Dataset) -> Figure:
+    """Predicted against measured pressure and force ratio, and under each the relative error with its expected size."""
+    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
+    grid = figure.subplots(2, 2, sharex="col", height_ratios=(1.5, 1.0))
+    for (above, below), (name, label) in zip(
+        grid.T, {"pressure": r"pressure $P$ ($m\dot\gamma^2$)", "force_ratio": "force ratio"}.items(), strict=True
+    ):
+        ends = np.array([data[name].min() * 0.85, data[name].max() * 1.2])
+        above.plot(ends, ends, color="0.6", lw=0.8, zorder=1)
+        below.axhline(0, color="0.6", lw=0.8, zorder=1)
+        if name in TARGETS:
+            below.axhspan(-TARGETS[name], TARGETS[name], color="0.92", zorder=0)
+        for k, alpha in enumerate(errors.restitution.values):
+            grey, marker = STYLES[k % len(STYLES)]
+            here, seen = errors.sel(restitution=alpha), data[name].sel(restitution=alpha)
+            faces = ["white" if edge else grey for edge in here.edge.values]
+            style = {"marker": marker, "s": 26, "edgecolors": grey, "facecolors": faces, "zorder": 3}
+            above.scatter(seen, here[f"{name}_predicted"], **style)
+            below.errorbar(
+                seen, here[f"{name}_error"], here[f"{name}_stderr"], color=grey, ls="", elinewidth=0.8, capsize=2
+            )
+            below.scatter(seen, here[f"{name}_error"], **style)
+            above.scatter([], [], marker=marker, s=26, color=grey, label=f"α = {alpha:g}")
+        above.set(xscale="log", yscale="log", xlim=ends, ylim=ends, ylabel=f"{label}, predicted")
+        below.set(xlabel=f"{label}, measured", ylabel="predicted / measured − 1")
+        below.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        ticks = [t for t in (0.5, 1, 1.5, 2, 3, 5, 10, 20, 50) if ends[0] <= t <= ends[1]]
+        ticks = [t for t in ticks if t != 1.5 or ends[1] < 10]
+        above.set(xticks=ticks, yticks=ticks)
+        for axis in (above.xaxis, above.yaxis):
+            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axis.set_minor_formatter(NullFormatter())
+        note = f"rms {100 * rms(errors[f'{name}_error'].values):.1f} %"
+        noise = f"noise of a point {100 * rms(errors[f'{name}_noise'].values):.1f} %"
+        above.text(0.97, 0.04, f"{note}\n{noise}", transform=above.transAxes, ha="right", va="bottom")
+    grid[0, 0].legend(fontsize="small", loc="upper left")
+    figure.suptitle(
+        "Every point predicted from the others. Open symbols: edge of the map; bars: expected error; grey band: target",
+        fontsize="medium",
+    )
+    return figure
+
+
+if __name__ == "__main__":
+    main()
