@@ -30,6 +30,7 @@ from jaxgran.progress import progress
 
 NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
 MOST_FRAMES = 100_000  # of a trajectory
+_FAR_FROM_A_LAW = 9.0  # χ² of stresses that belong to no restitution of a map
 FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
 
 _UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
@@ -336,17 +337,17 @@ def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: fl
     for name in ("observable", "rms error", "largest error", "noise of a point"):
         table.add_column(name)
     for name in ("pressure", "shear_stress", "force_ratio"):
-        error, noise = errors[f"{name}_error"].values, errors[f"{name}_noise"].values
-        rms = (math.sqrt(float((x[~(x != x)] ** 2).mean())) for x in (error, noise))
-        largest = float(abs(error[~(error != error)]).max())
-        typical, of_point = rms
-        table.add_row(name.replace("_", " "), *(f"{100 * x:.2g} %" for x in (typical, largest, of_point)))
+        error, noise = abs(errors[f"{name}_error"]), errors[f"{name}_noise"]
+        shares = ((error**2).mean() ** 0.5, error.max(), (noise**2).mean() ** 0.5)
+        table.add_row(name.replace("_", " "), *(f"{100 * float(share):.2g} %" for share in shares))
     _print_table(table)
     if stresses is not None:
         nu, pressure, shear = (float(x) for x in stresses if x is not None)
         noise = (relative_error * pressure, relative_error * shear)
         found = restitution_from_stresses(closure, nu, pressure, shear, *noise)
         words = "" if bool(found.determined) else ", hardly determined: the stresses depend little on it there"
+        if float(found.chi_squared) > _FAR_FROM_A_LAW:
+            words = ", the nearest in the map: none there has these stresses"
         print(f"restitution {_with_error(float(found.restitution), float(found.stderr))}{words}")
 
 

@@ -8,7 +8,8 @@ there in one evaluation. The trajectory is the one of the fixed time step; the c
 Derivatives of a trajectory hold the time steps of its contacts: the numbers of steps flown are whole and do not change.
 That is the derivative of what is computed. It is not that of the flow in the limit dt → 0, in which a contact comes
 earlier or later where the grains before it are moved: with ``moving_contacts`` every contact that begins in a step adds
-what a shift of its time by dτ does, to first order, with the values as they are.
+what a shift of its time by dτ does, to first order, with the values as they are. Exact for collisions of two grains;
+where a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
 """
 
 from collections.abc import Callable
@@ -342,7 +343,8 @@ def _collide(
     separations, delays, still = pairs.separations(), None, None
     if how.moving_contacts:
         delays = _delays(pairs, near.reach, approaching, flow.timestep)
-        separations, still = separations + delays[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
+        apart = jnp.where(_alone(near, contact, grains), delays, 0)
+        separations, still = separations + apart[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
     rung = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
     rung = largest_replica(jnp.where(meets, rung, 0))
 
@@ -357,7 +359,8 @@ def _collide(
             moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
             shift = None
             if delays is not None:
-                delayed = impulses * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
+                own = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
+                delayed = own * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
                 shift = -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
             return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, still))
 
@@ -369,12 +372,25 @@ def _collide(
 def _delays(pairs: _Pairs, reach: Array, approaching: Array, timestep: float | Array) -> Float[Array, " pairs"]:
     """Zero, with the derivative of the time at which each contact of this step began.
 
-    Contacts that began long before are clusters at rest: theirs is not a moment, and moves nothing.
+    Contacts that began long before are those of clusters: theirs is not a moment, and moves nothing.
     """
     time, _ = first_contact_time(pairs.separations(), pairs.velocities(), reach)
     begins = approaching & (jnp.abs(time) <= timestep)
     time = jnp.where(begins, time, 0)
     return time - lax.stop_gradient(time)
+
+
+def _alone(near: PairList, contact: Array, grains: Grains) -> Array:
+    """Which pairs are contacts of two grains that have no other one."""
+    met = contact.astype(jnp.int32)
+    degree = jnp.zeros(grains.radii.size, jnp.int32).at[near.i].add(met).at[near.j].add(met)
+    return contact & (degree[near.i] == 1) & (degree[near.j] == 1)
+
+
+def _binary_impulses(network: Contacts, bounce: Array | float) -> Float[Array, " contacts"]:
+    """The impulses if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻)."""
+    reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
+    return bounce * reduced_mass * jnp.maximum(0, -network.approach)
 
 
 def _shifted(
@@ -418,8 +434,7 @@ def _impulses(
     bounce = 1 + flow.restitution
     impulses = bounce * solution.impulses
     approach, (nx, ny), length = network.approach, network.normals.T, network.distances
-    reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
-    binary = bounce * reduced_mass * jnp.maximum(0, -approach)
+    binary = _binary_impulses(network, bounce)
     loss = -(approach + bounce / 2 * solution.response)
     overlaps = jnp.where(network.used, jnp.maximum(grains.radii[network.i] + grains.radii[network.j] - length, 0), 0)
     deepest = jnp.max(overlaps)

@@ -1,0 +1,183 @@
+"""What derivatives of a flow cost, and how fast they grow with strain.
+
+    python benchmarks/gradients.py           # both parts
+    python benchmarks/gradients.py --quick   # one flow, fewer runs
+
+The first part times an advance of 100 steps and its derivatives, on one core, and counts the memory of the gradient of
+1000 steps. The second follows ∂(state)/∂α with and without contacts that move in time, beside the difference of two
+neighbouring runs, and fits the exponent of its growth.
+"""
+
+import argparse
+import json
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+if __name__ == "__main__":
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from hardware import hardware
+
+import jaxgran as jg
+from jaxgran.cell import displacement
+from jaxgran.sensitivity import growth, lyapunov_exponent
+
+FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packing fraction
+GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-4, 1.2, 48, 6
+DIFFERENCE = 1e-4  # between the restitutions of two neighbouring runs
+HORIZON = 100.0  # |∂(state)/∂α| at which a change of α by 0.01 moves the grains by a diameter
+STEPS, MANY_STEPS, REPEATS = 100, 1000, 15
+COSTS = ((64, 0.6, 0.7), (256, 0.6, 0.7), (64, 0.3, 0.75))  # grains, restitution, packing fraction; dt = 1e-3
+
+
+def prepared(grains: int, alpha: float, nu: float, timestep: float, seed: int = 0):
+    """A flow for derivatives and a state of it."""
+    state = jg.prepare(jg.ShearFlow(grains, alpha, nu, 1e-3), jax.random.key(seed), 2.0)
+    return jg.ShearFlow(grains, alpha, nu, timestep, tolerance=1e-9, max_iterations=20_000), state
+
+
+def cost(grains: int, alpha: float, nu: float) -> dict:
+    """Median seconds of an advance and of its derivatives in turn, and bytes of the gradient of a long one."""
+    flow, state = prepared(grains, alpha, nu, 1e-3)
+    events = int(jax.jit(jg.count_events)(flow, state, jnp.int32(STEPS)))
+
+    def energy(restitution, velocities, number: int | None, steps: int = STEPS):
+        start = replace(state, velocities=velocities)
+        end, _ = jg.advance(replace(flow, restitution=restitution), start, jnp.int32(steps), True, number)
+        return jnp.sum(end.velocities**2)
+
+    at = (jnp.asarray(alpha), state.velocities)
+    one = (jnp.ones(()), jnp.zeros_like(state.velocities))
+    gradient = jax.value_and_grad(energy, argnums=(0, 1))
+    routes = {
+        "advance": jax.jit(lambda *x: energy(*x, None)),
+        "advance of fixed length": jax.jit(lambda *x: energy(*x, events)),
+        "tangent": jax.jit(lambda *x: jax.jvp(lambda *y: energy(*y, None), x, one)),
+        "gradient": jax.jit(lambda *x: gradient(*x, events)),
+    }
+    compile_seconds = {name: elapsed(route, *at) for name, route in routes.items()}
+    times = {name: [] for name in routes}
+    for _ in range(REPEATS):
+        for name, route in routes.items():
+            times[name].append(elapsed(route, *at))
+    long = jax.jit(lambda *x: gradient(*x, MANY_STEPS + 1, MANY_STEPS)).lower(*at).compile().memory_analysis()
+    return {
+        "grains": grains,
+        "restitution": alpha,
+        "packing_fraction": nu,
+        "steps": STEPS,
+        "events": events,
+        "median_seconds": {name: float(np.median(values)) for name, values in times.items()},
+        "first_call_seconds": compile_seconds,
+        "gradient_of_1000_steps_bytes": long.temp_size_in_bytes,
+    }
+
+
+def elapsed(function, *arguments) -> float:
+    start = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - start
+
+
+def followed(alpha: float, nu: float, runs: int) -> dict:
+    """Growth of the derivatives of a flow and of the difference of two runs, (runs, points) each."""
+    rows = {"moving": [], "fixed": [], "difference": []}
+    for seed in range(runs):
+        flow, state = prepared(GRAINS, alpha, nu, TIMESTEP, seed)
+        for name, moving in (("moving", True), ("fixed", False)):
+            grown = growth(flow, state, STRAIN, POINTS, moving)
+            rows[name].append(np.asarray(grown.derivative).tolist())
+        rows["difference"].append(np.asarray(differences(flow, state)).tolist())
+    strain = np.asarray(grown.strain)
+    exponents = {name: exponent(strain, np.array(values)) for name, values in rows.items() if name != "difference"}
+    typical = np.exp(np.mean(np.log(rows["moving"]), axis=0))
+    beyond = np.flatnonzero(typical > HORIZON)
+    return {
+        "restitution": alpha,
+        "packing_fraction": nu,
+        "strain": strain.tolist(),
+        "exponents": exponents,
+        "horizon_strain": float(strain[beyond[0]]) if beyond.size else None,
+        **rows,
+    }
+
+
+def exponent(strain: np.ndarray, derivative: np.ndarray) -> list[float]:
+    """The exponent of growth and its standard error; none of a single run."""
+    return list(lyapunov_exponent(strain, derivative)) if len(derivative) > 1 else []
+
+
+@jax.jit
+def differences(flow, state):
+    """Distance of two runs whose restitutions differ, over the difference, at the points of the growth."""
+    steps = jnp.int32(round(STRAIN / POINTS / TIMESTEP))
+
+    def part(states, _):
+        pair = [
+            jg.advance(replace(flow, restitution=flow.restitution + sign * DIFFERENCE / 2), each, steps)[0]
+            for sign, each in zip((1, -1), states, strict=True)
+        ]
+        moved = displacement(pair[0].positions, pair[1].positions, pair[0].side, pair[0].tilt)
+        squares = jnp.sum(moved**2 + (pair[0].velocities - pair[1].velocities) ** 2, axis=-1)
+        return tuple(pair), jnp.sqrt(jnp.mean(squares)) / DIFFERENCE
+
+    return jax.lax.scan(part, (state, state), length=POINTS)[1]
+
+
+def draw(flows: list[dict], file: Path) -> None:
+    """A panel for each flow: geometric means over its runs, with the scatter of the moving derivative as a band."""
+    figure, axes = plt.subplots(1, len(flows), figsize=(3.1 * len(flows) + 0.6, 3.3), sharey=True, layout="constrained")
+    for axis, flow in zip(np.atleast_1d(axes), flows, strict=True):
+        strain = np.array(flow["strain"])
+        logs = {name: np.log(np.array(flow[name])) for name in ("moving", "fixed", "difference")}
+        middle, spread = logs["moving"].mean(0), logs["moving"].std(0)
+        axis.fill_between(strain, np.exp(middle - spread), np.exp(middle + spread), color="0.85", lw=0)
+        axis.plot(strain, np.exp(middle), "-", color="0.1", label="contacts move in time")
+        axis.plot(strain, np.exp(logs["fixed"].mean(0)), "--", color="0.35", label="contacts at fixed steps")
+        axis.plot(
+            strain[::3], np.exp(logs["difference"].mean(0))[::3], "o", ms=4, mfc="none", color="0.1",
+            label=rf"two runs, $\delta\alpha={DIFFERENCE:g}$",
+        )  # fmt: skip
+        axis.axhline(HORIZON, color="0.6", lw=0.8, ls=":")
+        rate = flow["exponents"]["moving"]
+        words = rf", $\lambda={rate[0]:.1f}\pm{rate[1]:.1f}$" if rate else ""
+        axis.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}${words}", fontsize=10)
+        axis.set_yscale("log")
+        axis.set_xlabel("strain")
+    first = np.atleast_1d(axes)[0]
+    first.set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ per grain  [$\sigma$, $\sigma\dot\gamma$]")
+    first.legend(fontsize=8, frameon=False)
+    figure.savefig(file, dpi=150)
+    plt.close(figure)
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="one flow, two runs")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    flows, runs, costs = (FLOWS[:1], 2, COSTS[:1]) if chosen.quick else (FLOWS, RUNS, COSTS)
+    result = {"hardware": hardware(), "costs": [], "flows": []}
+    for grains, alpha, nu in costs:
+        result["costs"].append(cost(grains, alpha, nu))
+        row = result["costs"][-1]
+        print({name: f"{1e3 * value:.2f} ms" for name, value in row["median_seconds"].items()}, flush=True)
+        print(f"gradient of {MANY_STEPS} steps: {row['gradient_of_1000_steps_bytes'] / 2**20:.0f} MiB", flush=True)
+    for alpha, nu in flows:
+        result["flows"].append(followed(alpha, nu, runs))
+        row = result["flows"][-1]
+        print(f"({alpha}, {nu}): exponents {row['exponents']}, horizon {row['horizon_strain']}", flush=True)
+    name = "gradients_quick" if chosen.quick else "gradients"
+    (chosen.output / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(result["flows"], chosen.output / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main()
