@@ -29,7 +29,7 @@ from jaxgran.cell import displacement
 from jaxgran.sensitivity import growth, lyapunov_exponent
 
 FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packing fraction
-GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-4, 1.2, 48, 6
+GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-6, 1.2, 48, 6
 DIFFERENCE = 1e-4  # between the restitutions of two neighbouring runs
 HORIZON = 100.0  # |∂(state)/∂α| at which a change of α by 0.01 moves the grains by a diameter
 STEPS, MANY_STEPS, REPEATS = 100, 1000, 15

@@ -6,12 +6,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import run_chart
 import timestep_study
 
 BENCHMARKS = Path(run_chart.__file__).parent
 
 
+@pytest.mark.charts
 def test_quick_charts_are_made_by_one_command(tmp_path: Path) -> None:
     words = [sys.executable, str(BENCHMARKS / "speed_vs_accuracy.py"), "--quick", "--output", str(tmp_path)]
     made = subprocess.run(words, capture_output=True, text=True)
