@@ -13,7 +13,7 @@ import timestep_study
 BENCHMARKS = Path(run_chart.__file__).parent
 
 
-@pytest.mark.charts
+@pytest.mark.slow
 def test_quick_charts_are_made_by_one_command(tmp_path: Path) -> None:
     words = [sys.executable, str(BENCHMARKS / "speed_vs_accuracy.py"), "--quick", "--output", str(tmp_path)]
     made = subprocess.run(words, capture_output=True, text=True)

@@ -228,6 +228,7 @@ def test_restitution_of_exact_stresses_is_found() -> None:
     assert np.all(found.determined) and np.all(found.chi_squared < 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.95])
 def test_restitutions_scatter_by_their_standard_error(correlation: float) -> None:
     count, random, errors = 600, np.random.default_rng(4), np.array([0.03, 0.03])

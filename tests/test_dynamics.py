@@ -75,6 +75,7 @@ def test_free_flight_repeats_the_trajectory_of_every_step(run, flowing, activati
     assert_same_tally(tally, all_steps, 1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
 def test_all_methods_give_the_same_trajectory(run, flowing, packing_fraction):
     flow, state = flow_of(packing_fraction), flowing(packing_fraction)

@@ -212,6 +212,7 @@ def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, na
     np.testing.assert_allclose(other, exact, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative):
     flow, state, events = tilting
     _, slopes, _, score = derivative

@@ -79,6 +79,7 @@ def test_sample_of_a_batch_is_the_sample_of_each(batch, measured) -> None:
     assert_agree(replica(both, 0), measured[1])
 
 
+@pytest.mark.slow
 def test_vmap_applies(batch, state, measured) -> None:
     shear = jax.jit(jax.vmap(partial(sample, strain=STRAIN), axis_name="replica"))
     _, both = shear(batch.flow, batch.state)
@@ -164,6 +165,7 @@ def test_float32_is_refused_where_it_cannot_resolve_the_time_step(state) -> None
     check_precision(replace(FLOWS[0], timestep=1e-5), state)  # float64 resolves it
 
 
+@pytest.mark.slow
 def test_float32_measures_what_float64_does_at_a_time_step_it_resolves(state) -> None:
     # A tenth of a per cent: a hundred steps in which rounding has little time to grow.
     flow = replace(FLOWS[0], timestep=1e-4)

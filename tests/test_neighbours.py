@@ -151,6 +151,7 @@ def test_set_bit_is_the_place_of_the_bit_of_that_rank():
         assert row[: len(places)].tolist() == places
 
 
+@pytest.mark.slow
 def test_a_flow_is_the_same_with_cell_lists_as_with_all_pairs(monkeypatch):
     count, key = 1024, jax.random.key(0)
     diameters = jnp.linspace(0.9, 1.1, count)[jax.random.permutation(key, count)]

@@ -152,6 +152,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert record == []
 
 
+@pytest.mark.slow
 def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -28,6 +28,7 @@ def test_growth_is_that_of_two_neighbouring_runs(flowing, run) -> None:
     assert np.all(grown.status <= 3) and np.all(np.isfinite(grown.derivative))
 
 
+@pytest.mark.slow
 def test_unit_of_time_does_not_matter(flowing) -> None:
     state = flowing(0.6)
     slow = replace(state, velocities=state.velocities / 50)

@@ -20,7 +20,7 @@ from jaxgran.status import Status
 PAIRS = stability.GRAINS // 2
 
 
-@pytest.mark.charts
+@pytest.mark.slow
 def test_quick_chart_is_written_and_nothing_fails_where_a_map_is_accepted(tmp_path: Path) -> None:
     cells = stability.chart(quick=True, output=tmp_path)
     assert json.loads((tmp_path / "stability_quick.json").read_text())["cells"]

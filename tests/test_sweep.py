@@ -160,6 +160,7 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
 
 
+@pytest.mark.slow
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
     both = dict(replicas(some, batch=8))
