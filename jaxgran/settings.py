@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class MapSettings:
         if not isinstance(self.timestep, tuple):
             require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
         require_number("tolerance", self.tolerance, lambda x: x > 0, "between 1e-12 and 0.1")
-        flows = stack(self.flows())
+        flows = stack(self._made_flows())
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
             raise InputError(
@@ -108,7 +109,11 @@ class MapSettings:
         return self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
 
     def flows(self) -> list[ShearFlow]:
-        """One flow a point, in the order of ``axes``; raises ValueError where a number is out of range."""
+        """One flow a point, in the order of ``axes``."""
+        return list(_flows(self))
+
+    def _made_flows(self) -> list[ShearFlow]:
+        """The same, made anew; raises ValueError where a number is out of range."""
         return [
             ShearFlow(
                 grains=self.grains,
@@ -123,6 +128,12 @@ class MapSettings:
             for nu in self.packing_fraction
             for alpha in self.restitution
         ]
+
+
+@lru_cache(maxsize=4)
+def _flows(settings: MapSettings) -> tuple[ShearFlow, ...]:
+    """The flows of a map, made once for all its batches: thousands of points have hundreds of batches."""
+    return tuple(settings._made_flows())
 
 
 def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str, Any], str]:
