@@ -26,15 +26,12 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     Returns:
       Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks.
     """
-    value = _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)))
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    unknown = {name: np.full(x.shape, np.nan) for name, x in value.items()}
-    errors = [
-        _jackknife_error(estimate, jax.tree.map(lambda x, m=m: _merged(x, m), sums))
-        for m in BLOCK_MERGES
-        if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)
-    ]
-    return value, {name: np.fmax.reduce([error[name] for error in [unknown, *errors]]) for name in value}
+    merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]
+    edges = np.cumsum([1, *(seeds * (blocks // m) for m in merges)])
+    flat, named = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
+    spreads = [np.full_like(flat[0], np.nan), *(_spread(part) for part in np.split(flat, edges)[1:-1])]
+    return named(flat[0]), named(np.fmax.reduce(spreads))
 
 
 def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> Estimates:
@@ -53,10 +50,8 @@ def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) 
       Lengths in blocks, NaN with fewer than four blocks a seed.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    without = _leave_one_out(estimate, jax.tree.map(lambda x: _merged(x, 1), sums))
-    flat = np.concatenate([x.reshape(seeds, blocks, -1) for x in without.values()], axis=2)
-    lengths = np.split(_inefficiency(flat), np.cumsum([x[0].size for x in without.values()])[:-1])
-    return {name: one.reshape(x.shape[1:]) for (name, x), one in zip(without.items(), lengths, strict=True)}
+    flat, named = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_merged(x, 1)), sums)))
+    return named(_inefficiency(flat.reshape(seeds, blocks, -1)))
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
@@ -85,15 +80,32 @@ def _merged(x: np.ndarray, merge: int) -> np.ndarray:
     return x[:, : groups * merge].reshape(seeds * groups, merge, *x.shape[2:]).sum(axis=1)
 
 
-def _jackknife_error(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) -> Estimates:
-    count = len(jax.tree.leaves(groups)[0])
-    without = _leave_one_out(estimate, groups)
-    return {name: np.sqrt((count - 1) * np.mean((x - x.mean(axis=0)) ** 2, axis=0)) for name, x in without.items()}
+def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
+    """The sum over all blocks, then for each merge those over all groups but one, (1 + groups + groups + ..., ...)."""
+    return np.concatenate([x.sum(axis=(0, 1))[None], *(_all_but_one(_merged(x, m)) for m in merges)])
 
 
-def _leave_one_out(estimate: Callable[[Any], Mapping[str, Any]], groups: Any) -> Estimates:
-    """Estimates from all groups but one, (groups, ...)."""
-    return _to_numpy(estimate(jax.tree.map(lambda x: x.sum(axis=0) - x, groups)))
+def _all_but_one(groups: np.ndarray) -> np.ndarray:
+    """Sums over all groups but one, (groups, ...)."""
+    return groups.sum(axis=0) - groups
+
+
+def _spread(without: np.ndarray) -> np.ndarray:
+    """Standard errors (n,) of n estimates from those without one group, (groups, n)."""
+    return np.sqrt((len(without) - 1) * np.mean((without - without.mean(axis=0)) ** 2, axis=0))
+
+
+def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:
+    """All estimates with a leading axis as one array (rows, n), and what names the parts of a row (n,) of it."""
+    arrays = {name: np.asarray(x) for name, x in estimates.items()}
+    rows = len(next(iter(arrays.values())))
+    edges = np.cumsum([x[0].size for x in arrays.values()])[:-1]
+
+    def named(row: np.ndarray) -> Estimates:
+        parts = zip(arrays.items(), np.split(row, edges), strict=True)
+        return {name: part.reshape(x.shape[1:]) for (name, x), part in parts}
+
+    return np.concatenate([x.reshape(rows, -1) for x in arrays.values()], axis=1), named
 
 
 def _inefficiency(series: np.ndarray) -> np.ndarray:
@@ -110,7 +122,3 @@ def _inefficiency(series: np.ndarray) -> np.ndarray:
     counted = np.logical_and.accumulate(pairs > 0, axis=0)
     length = 2 * np.sum(np.where(counted, pairs, 0), axis=0) - 1
     return np.where(np.isfinite(products[0]) & (products[0] > 0), np.maximum(length, 1), np.nan)
-
-
-def _to_numpy(estimates: Mapping[str, Any]) -> Estimates:
-    return {name: np.asarray(x) for name, x in estimates.items()}

@@ -3,9 +3,10 @@
 A file is written under a temporary name in the folder where it belongs, synced, and renamed to its place. A process
 that is killed leaves the old file or the new one, never half of one.
 
-Arrays are kept as NetCDF with the SHA-256 of the whole behind it, which other readers pass over. A file is put together
-and taken apart in memory: a full disc is then an ``OSError`` with a number, and the HDF5 library, which does not always
-survive it, never sees a damaged one.
+Arrays are kept as HDF5, which NetCDF programs read too, with the SHA-256 of the whole behind it, which other readers
+pass over. A file is put together and taken apart in memory: a full disc is then an ``OSError`` with a number, and the
+HDF5 library, which does not always survive it, never sees a damaged one. Dimensions have no names: naming them would
+take ten times as long as all the rest.
 """
 
 import hashlib
@@ -18,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5netcdf
 import h5py
 import numpy as np
 
@@ -70,13 +70,11 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
-    """Write named arrays, and what JSON can hold about them, as a NetCDF file with a checksum of it all."""
+    """Write named arrays, and what JSON can hold about them, as an HDF5 file with a checksum of it all."""
     memory = io.BytesIO()
-    with h5netcdf.File(memory, "w") as file:
+    with h5py.File(memory, "w") as file:
         for name, array in arrays.items():
-            dimensions = tuple(f"{name}_{axis}" for axis in range(array.ndim))
-            file.dimensions.update(zip(dimensions, array.shape, strict=True))
-            file.create_variable(name, dimensions, array.dtype, data=array)
+            file.create_dataset(name, data=array)
         file.attrs["names"] = json.dumps(list(arrays))
         file.attrs["about"] = json.dumps(about, sort_keys=True)
     content = memory.getvalue()
