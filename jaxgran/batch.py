@@ -2,6 +2,10 @@
 
 A batch carries a leading (replicas,) axis on everything. All that changes its states is a ``Drive``; what is wrapped
 around the plain one tells of its progress or keeps a journal.
+
+Where JAX sees several devices, of this host or of all those that ``jax.distributed`` has brought together, each of them
+takes its share of the replicas, with loops of its own: devices wait for each other at the end of a call only, and all
+hosts hold the results of all.
 """
 
 from collections.abc import Callable
@@ -10,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Int
 
 from jaxgran.dynamics import State, advance
@@ -20,6 +25,7 @@ from jaxgran.tally import Tally
 Report = Callable[[float], None]  # told the replica-steps done since the last call
 Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances a batch, each replica by its own steps
 Wrap = Callable[[Drive], Drive]  # adds to what a drive does, and changes no state
+_DEVICES = "devices"
 
 
 def stack(flows: list[ShearFlow]) -> ShearFlow:
@@ -35,10 +41,35 @@ def stack(flows: list[ShearFlow]) -> ShearFlow:
 
 
 def replicated(function: Callable) -> Callable:
-    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere."""
+    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere.
+
+    On several devices every one does so with its share of the replicas.
+    """
     if jax.default_backend() == "cpu":
-        return lambda *arguments: lax.map(lambda one: function(*one), arguments)
-    return jax.vmap(function, axis_name=AXIS)
+        together = lambda *arguments: lax.map(lambda one: function(*one), arguments)  # noqa: E731
+    else:
+        together = jax.vmap(function, axis_name=AXIS)
+    return together if jax.device_count() == 1 else _shared_out(together, jax.devices())
+
+
+def _shared_out(together: Callable, devices: list[jax.Device]) -> Callable:
+    """A function of a batch that hands every device an equal share, the last one in part copies of others."""
+    mesh = Mesh(np.asarray(devices), (_DEVICES,))
+
+    def share(*arguments):
+        return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), together(*arguments))
+
+    shares = jax.shard_map(
+        share, mesh=mesh, in_specs=PartitionSpec(_DEVICES), out_specs=PartitionSpec(), check_vma=False
+    )
+
+    def shared_out(*arguments):
+        count = len(jax.tree.leaves(arguments)[0])
+        places = np.arange(-(-count // len(devices)) * len(devices)) % count
+        filled = jax.tree.map(lambda x: x[places], arguments)
+        return jax.tree.map(lambda x: x[:count], shares(*filled))
+
+    return shared_out
 
 
 @jax.jit
