@@ -241,13 +241,13 @@ def _tasks(
 
 
 def _batch_size(grains: int, count: int, workers: int) -> int:
-    device = jax.devices()[0]
+    devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
-        largest = max(1, min(_LARGEST_CPU_BATCH, count // (8 * workers)))
+        largest = max(1, min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
         return next(size for size in range(largest, 0, -1) if count % size == 0)  # a smaller last one compiles again
     memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
     per_replica = _GRAIN_BYTES * grains + _SEARCH_BYTES * min(grains, 512) ** 2
-    return int(max(1, min(count, _SHARE_OF_MEMORY * memory / per_replica)))
+    return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
 
 
 def _configure(x64: bool, cache: str | None) -> None:

@@ -1,0 +1,72 @@
+"""A replica has the same results wherever its batch runs: on one device, on several, or on those of several hosts."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.batch import advance_batch, stack
+from jaxgran.flow import ShearFlow
+
+PROGRAM = Path(__file__).with_name("devices.py")
+RESTITUTIONS = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)  # more than four devices, and not a multiple
+STEPS = (120, 90, 60, 0, 120, 30)
+
+
+@pytest.fixture
+def batch(flowing, tmp_path: Path) -> Path:
+    """A folder with the states of a batch and its results on the one device of this process."""
+    states = [flowing(nu) for nu in (0.6, 0.75, 0.6, 0.75, 0.6, 0.75)]
+    state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    flow = stack([ShearFlow(pytest.GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
+    assert jax.device_count() == 1
+    _save(tmp_path / "start.npz", (flow, state, np.asarray(STEPS, np.int32)))
+    _save(tmp_path / "one device.npz", advance_batch(flow, state, jnp.asarray(STEPS, jnp.int32)))
+    return tmp_path
+
+
+def test_results_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> None:
+    _run(batch, "four devices.npz", 4)
+    _assert_same(batch / "four devices.npz", batch / "one device.npz")
+
+
+@pytest.mark.slow
+def test_results_on_two_hosts_are_those_on_one_to_the_bit_and_both_hold_all(batch: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    hosts = [_start(batch, f"host {k}.npz", 2, address, str(k)) for k in (0, 1)]
+    for k, host in enumerate(hosts):
+        _, error = host.communicate(timeout=300)
+        assert host.returncode == 0, error
+        _assert_same(batch / f"host {k}.npz", batch / "one device.npz")
+
+
+def _save(path: Path, tree) -> None:
+    np.savez(path, *[np.asarray(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def _assert_same(one: Path, other: Path) -> None:
+    with np.load(one) as these, np.load(other) as those:
+        assert these.files == those.files
+        for name in these.files:
+            np.testing.assert_array_equal(these[name], those[name])
+
+
+def _start(folder: Path, output: str, devices: int, *host: str) -> subprocess.Popen:
+    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    command = [sys.executable, str(PROGRAM), "start.npz", output, str(pytest.GRAINS), *host]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=folder, env=environment, **streams)
+
+
+def _run(folder: Path, output: str, devices: int) -> None:
+    process = _start(folder, output, devices)
+    _, error = process.communicate(timeout=300)
+    assert process.returncode == 0, error
