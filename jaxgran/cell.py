@@ -10,19 +10,37 @@ from jaxtyping import Array, Float
 
 
 def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
-    """Side L of the square cell in which the discs have the given packing fraction."""
+    """Side L of the square cell in which the discs have the given packing fraction.
+
+    Examples:
+      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))  # four discs of diameter one, each in a square of its own
+      2.0
+    """
     return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
 
 
 def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
-    """The same lattice with its tilt in [−½, ½)."""
+    """The same lattice with its tilt in [−½, ½).
+
+    Examples:
+      >>> float(remap_tilt(jnp.asarray(0.75)))
+      -0.25
+    """
     return tilt - jnp.floor(tilt + 0.5)
 
 
 def displacement(
     to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array
 ) -> Float[Array, "*n 2"]:
-    """Minimum-image separation ``to − origin``; exact for separations shorter than half the side."""
+    """Minimum-image separation ``to − origin``; exact for separations shorter than half the side.
+
+    Examples:
+      The image below a grain at the top of a cell of side 10 has slid by a quarter of the side:
+
+      >>> top, bottom = jnp.array([0.5, 9.5]), jnp.array([0.5, 0.5])
+      >>> displacement(top, bottom, jnp.asarray(10.0), jnp.asarray(0.25)).tolist()
+      [-2.5, -1.0]
+    """
     d = to - origin
     rows = jnp.round(d[..., 1] / side)
     x = d[..., 0] - rows * tilt * side

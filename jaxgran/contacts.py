@@ -55,6 +55,13 @@ def is_contact(
       velocities: relative velocities in the laboratory frame, (pairs, 2) in σγ̇.
       reach: sums of the radii, (pairs,).
       look_ahead: θ·dt.
+
+    Examples:
+      Discs of diameter one, a diameter apart, that close at unit speed:
+
+      >>> apart, closing, reach = jnp.array([[2.0, 0.0]]), jnp.array([[-1.0, 0.0]]), jnp.array([1.0])
+      >>> [bool(is_contact(apart, closing, reach, time)[0][0]) for time in (0.9, 1.1)]
+      [False, True]
     """
     squared_speed, closing = _dot(velocities, velocities), _dot(separations, velocities)
     approaching = closing < 0
@@ -71,6 +78,11 @@ def first_contact_time(
     """Time at which free flight makes a pair touch, and time of its closest approach.
 
     The time is negative for an approaching pair that overlaps already and infinite for a pair that never touches.
+
+    Examples:
+      >>> time, closest = first_contact_time(jnp.array([[2.0, 0.0]]), jnp.array([[-1.0, 0.0]]), jnp.array([1.0]))
+      >>> float(time[0]), float(closest[0])
+      (1.0, 2.0)
     """
     squared_speed, closing = _dot(velocities, velocities), _dot(separations, velocities)
     excess = _dot(separations, separations) - reach**2

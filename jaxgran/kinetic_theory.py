@@ -63,6 +63,10 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
     ================  ====  =======================================================
 
     Source: D. Henderson, Mol. Phys. 30, 971 (1975).
+
+    Examples:
+      >>> [round(float(contact_value(nu)), 3) for nu in (0.0, 0.5, 0.75)]
+      [1.0, 3.125, 10.75]
     """
     nu = jnp.asarray(packing_fraction)
     return (1 - 7 * nu / 16) / (1 - nu) ** 2
@@ -118,6 +122,13 @@ def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scala
 
     Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko, Phys. Rev. E 72,
     021306 (2005).
+
+    Examples:
+      Bagnold's scaling: no other time scale than 1/γ̇, so stresses grow with its square.
+
+      >>> slow, fast = garzo_dufty(0.9, 0.4), garzo_dufty(0.9, 0.4, shear_rate=2.0)
+      >>> round(float(fast.pressure / slow.pressure), 6)
+      4.0
     """
     alpha, nu, rate = _as_floats(restitution, packing_fraction, shear_rate)
     chi = contact_value(nu)

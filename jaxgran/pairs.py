@@ -156,6 +156,10 @@ def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
 
     Rank and select on words of 32 bits: the word that holds the k-th True entry follows from the running number of
     set bits, its place in the word by halving. An order of magnitude cheaper than ``jnp.nonzero`` inside a step.
+
+    Examples:
+      >>> first_true(jnp.array([False, True, True, False, True]), 4).tolist()
+      [1, 2, 4, 5]
     """
     return set_bits(bit_words(mask), size, mask.size)
 

@@ -25,6 +25,14 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
 
     Returns:
       Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks.
+
+    Examples:
+      Eight blocks that drift. Were they independent the error would be 0.87; joined in pairs they show a larger one.
+
+      >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
+      >>> value, error = jackknife(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
+      >>> float(value["mean"]), round(float(error["mean"]), 2)
+      (4.5, 1.29)
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]

@@ -4,7 +4,12 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Outcome of a replica; a larger value is worse. Compiled code carries it as an int32."""
+    """Outcome of a replica; a larger value is worse. Compiled code carries it as an int32.
+
+    Examples:
+      >>> max(Status.ok, Status.not_steady, Status.iteration_limit).name
+      'not_steady'
+    """
 
     ok = 0
     iteration_limit = 1  # some solve ended above the tolerance
