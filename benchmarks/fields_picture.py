@@ -20,14 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from hardware import hardware
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 import jaxgran as jg
 from jaxgran.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
+from jaxgran.drawing import force_lines
 from jaxgran.fields import Fields, fields_at, grid
+from jaxgran.force_chains import loaded_contacts
 from jaxgran.snapshots import Snapshot, snapshot
 
 RESTITUTION, PACKING_FRACTION, TIMESTEP = 0.2, 0.78, 1e-3
@@ -135,15 +136,11 @@ def draw(seen: Snapshot, fields: Fields, count: int) -> Figure:
 
 def draw_forces(axes: Axes, seen: Snapshot) -> None:
     """Branches of the loaded contacts and their images, in widths proportional to the forces."""
-    loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
-    start = np.asarray(seen.state.positions)[np.asarray(seen.contacts.j)[loaded]]
-    branch = (np.asarray(seen.contacts.normals) * np.asarray(seen.contacts.distances)[:, None])[loaded]
-    force = np.asarray(seen.impulses)[loaded]
-    side, tilt = float(seen.state.side), float(seen.state.tilt)
-    lattice = [((a + tilt * b) * side, b * side) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-    lines = [np.stack([start, start + branch], axis=1) + np.array(shift) for shift in lattice]
-    widths = np.tile(_WIDEST_LINE * force / force.max(), len(lattice))
-    axes.add_collection(LineCollection(np.concatenate(lines), linewidths=widths, colors="black"), autolim=False)
+    load, side, tilt = loaded_contacts(seen), float(seen.state.side), float(seen.state.tilt)
+    starts, branches = np.asarray(seen.state.positions)[load.j], load.normals * load.distances[:, None]
+    shifts = side * np.array([(a + tilt * b, b) for a in (-1, 0, 1) for b in (-1, 0, 1)])
+    widths = _WIDEST_LINE * load.force / load.force.max()
+    axes.add_collection(force_lines(starts, branches, shifts, widths, color="black"), autolim=False)
 
 
 if __name__ == "__main__":

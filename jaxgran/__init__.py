@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaxgran.fields import Fields, fields_at
     from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
+    from jaxgran.flow_figures import flow_figure
     from jaxgran.grains import Grains, polydisperse
     from jaxgran.measure import Sample, sample
     from jaxgran.packing import pack
@@ -74,6 +75,7 @@ _HOME = {
     "fit_restitution": "calibrate",
     "count_events": "dynamics",
     "friction_figure": "rheology_figures",
+    "flow_figure": "flow_figures",
     "theory_errors": "theory_figures",
     "cluster_shares": "theory_figures",
     "ratio_against_timestep": "figures",
@@ -99,6 +101,7 @@ __all__ = [
     "fields_at",
     "fit_closure",
     "fit_restitution",
+    "flow_figure",
     "friction_figure",
     "friction_law",
     "gaussian",

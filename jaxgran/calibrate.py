@@ -98,7 +98,9 @@ def fit_restitution(
         residuals, slopes, collisions, status = _compared(flow, *windows, jnp.asarray(alpha, float))
         worst = Status(int(np.max(status)))
         if worst > Status.deep_overlap:
-            raise RuntimeError(f"the runs from the frames ended as {worst.name}: are positions and radii in one unit?")
+            raise RuntimeError(
+                f"the runs from the frames ended as {worst.name}; positions and radii must be in one unit."
+            )
         return _Comparison(alpha, np.asarray(residuals), np.asarray(slopes), float(np.sum(collisions)))
 
     at = min((compare(alpha) for alpha in TRIALS), key=lambda at: at.loss(least_noise))

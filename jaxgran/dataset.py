@@ -225,7 +225,7 @@ def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
 
 
-def _commit() -> str:
+def commit() -> str:
     """The commit of the checkout that this package runs from, empty where it is none."""
     folder = Path(__file__).parents[1]
     if not (folder / ".git").exists():
@@ -271,6 +271,6 @@ def _attributes(settings: MapSettings) -> dict[str, Any]:
         "device": f"{device.platform}: {device.device_kind}",
         "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
-        "commit": _commit(),
+        "commit": commit(),
         **{f"version_{name.replace('-', '_')}": version(name) for name in packages},
     }

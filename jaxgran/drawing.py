@@ -17,6 +17,7 @@ import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -161,6 +162,18 @@ def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside uppe
     """Explain the ring above the axes, where a status is not `ok`."""
     if suspect(data).any():
         figure.legend(handles=[ring_key()], loc=place, fontsize=SMALL_SIZE, frameon=False)
+
+
+# ---------------------------------------------------------------------------------------------- forces
+
+
+def force_lines(
+    starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray, widths: np.ndarray, **style: Any
+) -> LineCollection:
+    """Return lines from centre to centre, (pairs, 2), with widths in points, and their images by lattice vectors."""
+    segments = np.stack([starts, starts + branches], axis=1)
+    images = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
+    return LineCollection(list(images), linewidths=np.tile(widths, len(shifts)), **style)
 
 
 # ------------------------------------------------------------------------------------- frame and text

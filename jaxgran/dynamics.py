@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.delassus import grain_impulses, in_clusters
+from jaxgran.display import OF_STATE
 from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number, require_whole
 from jaxgran.grains import Grains
 from jaxgran.pairs import (
@@ -68,6 +69,8 @@ class State:
     velocities: Float[Array, "grains 2"]
     side: Float[Array, ""]
     tilt: Float[Array, ""]
+
+    __repr__, _repr_html_ = OF_STATE
 
 
 def require_state(flow: ShearFlow, state: State) -> None:

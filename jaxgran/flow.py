@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from jaxgran.display import OF_FLOW
+
 Activation = Literal["midpoint", "touching"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
@@ -66,6 +68,8 @@ class ShearFlow:
     relaxation: float | jax.Array = 1.8
     activation: Activation = field(default="midpoint", metadata=_STATIC)
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
+
+    __repr__, _repr_html_ = OF_FLOW
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")

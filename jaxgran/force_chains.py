@@ -54,6 +54,24 @@ class Loaded(NamedTuple):
         return (self.force * self.distances)[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
 
 
+class PairForces(NamedTuple):
+    """The pairs of grains that push each other at some time of a series, and their mean forces over all its times.
+
+    =============  ========  =====  ===================================================================
+    field          shape     unit   meaning
+    =============  ========  =====  ===================================================================
+    i, j           (pairs,)  –      grains, i < j
+    force          (pairs,)  mσγ̇²   mean over the times of p/dt, zero at times without a load
+    cluster_share  (pairs,)  –      share of the force that acts within clusters of three or more grains
+    =============  ========  =====  ===================================================================
+    """
+
+    i: Int[np.ndarray, " pairs"]
+    j: Int[np.ndarray, " pairs"]
+    force: Float[np.ndarray, " pairs"]
+    cluster_share: Float[np.ndarray, " pairs"]
+
+
 class Clusters(NamedTuple):
     """Clusters of each time; labels are unique in the series.
 
@@ -136,6 +154,17 @@ def clusters(seen: Snapshot) -> Clusters:
     labels = connected_components(graph, directed=False)[1]
     sizes = np.bincount(labels)[labels]
     return Clusters(labels.reshape(times, grains), sizes.reshape(times, grains))
+
+
+def pair_forces(seen: Snapshot) -> PairForces:
+    """Mean force between each two grains over a series: with one snapshot a time step, impulse over elapsed time."""
+    load, sizes = loaded_contacts(seen), clusters(seen).sizes
+    times, grains = sizes.shape
+    keys = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
+    pairs, pair = np.unique(keys, return_inverse=True)
+    in_cluster = sizes[load.time, load.i] > 2
+    total, clustered = (np.bincount(pair, load.force * w, minlength=pairs.size) for w in (1, in_cluster))
+    return PairForces(pairs // grains, pairs % grains, total / times, ratio(clustered, total))
 
 
 def cluster_sizes(seen: Snapshot, edges: ArrayLike | None = None) -> Curve:

@@ -11,6 +11,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxgran.display import OF_SAMPLE
 from jaxgran.dynamics import State, advance, require_state
 from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, two_digits
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
@@ -44,6 +45,8 @@ class Sample:
     area: Float[Array | np.ndarray, "*replicas"]
     shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
+
+    __repr__, _repr_html_ = OF_SAMPLE
 
     @property
     def averages(self) -> dict[str, Array]:

@@ -1,13 +1,15 @@
 """Progress of a map on standard error: points done, replica-steps per second, time left."""
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 _PLAIN_SECONDS = 10  # between two lines where there is no terminal
+_T = TypeVar("_T")
 
 
 class Meter:
@@ -64,6 +66,14 @@ def progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[Meter]:
         meter.console.print(f"0/{len(costs)} points, compiling", highlight=False)
         yield meter
         meter.console.print(meter._line(), highlight=False)
+
+
+def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
+    """The items one by one, and on a terminal a bar of how many are done, called ``words``."""
+    console = Console(stderr=True)
+    columns = TextColumn(words), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield from bar.track(items)
 
 
 def _duration(seconds: float) -> str:

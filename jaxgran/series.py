@@ -68,6 +68,12 @@ def minimum_image(separations: Float[np.ndarray, "n 2"], side: float, tilt: floa
     return np.stack([x - side * np.round(x / side), separations[:, 1] - rows * side], axis=-1)
 
 
+def centred(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "grains 2"]:
+    """The images of positions in [0, L) that lie in the sheared cell around the origin, the old centre of the cell."""
+    x, y = (positions - side / 2).T
+    return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)
+
+
 def all_pairs(frames: Any) -> Iterator[tuple[np.ndarray, np.ndarray, Float[np.ndarray, "pairs 2"]]]:
     """For each time of a series: grains i < j of every pair, and the minimum-image separation from j to i."""
     i, j = np.triu_indices(frames.state.positions.shape[1], 1)

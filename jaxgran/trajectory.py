@@ -29,26 +29,22 @@ log/jaxgran/restitution        (1,)            –       α
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial, reduce
 from importlib import import_module
-from operator import add
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from jaxgran.batch import Drive
 from jaxgran.cell import remap_tilt, wrap
 from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow, shown
+from jaxgran.flow import InputError, shown
 from jaxgran.grains import Grains
-from jaxgran.snapshots import Snapshot, snapshot
-from jaxgran.status import Status
+from jaxgran.series import centred
+from jaxgran.snapshots import Snapshot
 from jaxgran.store import replaced, require_place
-from jaxgran.tally import Tally
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd refuse
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
@@ -93,65 +89,6 @@ class Trajectory:
     packing_fraction: Float[np.ndarray, ""]
 
 
-class Recorder:
-    """Records a replica frame by frame while it is driven; the file is whole after every frame.
-
-    A frame is taken at the start and after every so many time steps. Where a frame falls within what would have been
-    advanced at once, that is done in two parts, whose sum differs by rounding; and a flow of many collisions makes of
-    rounding another course of the same flow. Where all frames fall on the ends, every bit stays the same.
-
-    Args:
-      path: GSD file. One that is there is replaced by the first frame.
-      every: strain from frame to frame, rounded to whole time steps, at least one.
-    """
-
-    def __init__(self, path: Path, every: float):
-        self.path, self.every = path, every
-        self.frames = self.steps = 0
-
-    def recording(self, drive: Drive) -> Drive:
-        """A drive of a batch of one that records; the file begins anew with its first call."""
-        self.frames = self.steps = 0
-        return partial(self._driven, drive)
-
-    def _driven(self, drive: Drive, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-        every = max(1, round(self.every / (np.asarray(flow.shear_rate) * np.asarray(flow.timestep)).item()))
-        if self.frames == 0:
-            self._record(flow, state)
-        tallies = []
-        for part in _parts(self.steps, np.asarray(steps).item(), every):
-            state, tally = drive(flow, state, jnp.full_like(steps, part))
-            tallies.append(tally)
-            self.steps += part
-            if part > 0 and self.steps % every == 0 and np.asarray(tally.status).item() < Status.nonfinite:
-                self._record(flow, state)
-        return state, reduce(add, tallies)
-
-    def _record(self, flow: ShearFlow, state: State) -> None:
-        seen = _snapshot_of_one(flow, state)
-        if self.frames == 0:
-            start_trajectory(self.path, seen)
-        else:
-            append_frame(self.path, seen, self.steps)
-        self.frames += 1
-
-
-def _parts(done: int, steps: int, every: int) -> Iterator[int]:
-    """The steps in parts that end where a multiple of ``every`` steps is done, and where all are; one part of none."""
-    end = done + steps
-    while True:
-        part = min(every - done % every, end - done)
-        yield part
-        done += part
-        if done >= end:
-            return
-
-
-@jax.jit
-def _snapshot_of_one(flow: ShearFlow, state: State) -> Snapshot:
-    return snapshot(*jax.tree.map(lambda x: x[0], (flow, state)))
-
-
 def check_trajectory(path: Path) -> None:
     """Raise a ValueError in one sentence where a trajectory could not be written to ``path``."""
     require_place(path, "trajectory", ".gsd")
@@ -174,6 +111,14 @@ def append_frame(path: Path, seen: Snapshot, step: int) -> None:
       step: time steps since the first frame.
     """
     _write(path, "r+", seen, step)
+
+
+def write_frame(path: Path, seen: Snapshot, step: int) -> None:
+    """Write a frame to a trajectory, which begins with that of step 0 and is whole after every one."""
+    if step == 0:
+        start_trajectory(path, seen)
+    else:
+        append_frame(path, seen, step)
 
 
 def _library() -> tuple[Any, Any]:
@@ -202,7 +147,7 @@ def _frame(seen: Snapshot, step: int):
     frame.configuration.dimensions = 2
     frame.configuration.box = [side, side, 0, tilt, 0, 0]
     frame.particles.N = len(state.positions)
-    frame.particles.position = _in_space(_centred(state.positions, side, tilt))
+    frame.particles.position = _in_space(centred(state.positions, side, tilt))
     frame.particles.velocity = _in_space(state.velocities)
     frame.particles.diameter = 2 * state.grains.radii
     frame.particles.mass = state.grains.masses
@@ -230,12 +175,6 @@ def _frame(seen: Snapshot, step: int):
 
 def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grains 3"]:
     return np.pad(vectors, ((0, 0), (0, 1)))
-
-
-def _centred(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "grains 2"]:
-    """The images of the positions in the sheared cell whose centre is the origin."""
-    x, y = (positions - side / 2).T
-    return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)
 
 
 def read_trajectory(path: str | os.PathLike) -> Trajectory:

@@ -1,26 +1,34 @@
 """The command line does what it says, and says in one sentence what it cannot do."""
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import jax
 import numpy as np
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_replica
+from PIL import Image
+from synthetic import one_sentence, random_replica
+from test_closure import made_up_map
 
-from jaxgran import cli, sweep
+from jaxgran import calibrate, cli, cli_fit, cli_info, cli_map, cli_measure, cli_run, movie, sweep
+from jaxgran.cli_options import FIRST_STRAIN, number_list
 from jaxgran.dataset import NOT_RUN, read_dataset, write_dataset
 from jaxgran.flow import InputError
 from jaxgran.status import Status
+from jaxgran.terminal import print_table
 from jaxgran.trajectory import read_trajectory
 
 SMALL_MAP = (
@@ -29,6 +37,7 @@ SMALL_MAP = (
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "solver", "activation", "precision")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
+MOVIE = ["--movie", "flow.gif", "--every", "0.02"]
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
 
 
@@ -48,7 +57,8 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
     ):
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
-        patch.setattr(cli, "_configured_jax", lambda: jax)
+        for module in (cli_fit, cli_info, cli_map, cli_measure, cli_run):
+            patch.setattr(module, "configured_jax", lambda: jax)
         cli.main()
     return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
 
@@ -87,19 +97,19 @@ def files(folder: Path) -> set[str]:
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=8))
 def test_list_of_numbers_is_those_numbers(numbers: list[float]) -> None:
-    assert cli.number_list(",".join(map(repr, numbers)), "restitution") == tuple(numbers)
+    assert number_list(",".join(map(repr, numbers)), "restitution") == tuple(numbers)
 
 
 @given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
 def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, count: int) -> None:
-    numbers = cli.number_list(f"{start / 100}:{stop / 100}:{count}", "restitution")
+    numbers = number_list(f"{start / 100}:{stop / 100}:{count}", "restitution")
     assert len(numbers) == count
     assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
 
 
 def test_range_has_no_noise_in_its_last_digits() -> None:
-    assert cli.number_list("0.1:0.9:9", "restitution") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    assert number_list("0.1:0.9:9", "restitution") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 @pytest.mark.parametrize("text", ["", ",", "0.1,", "a", "0.1;0.5", "0.1:0.9", "0.1:0.9:1", "0.1:0.9:x", "0:1:2:3"])
@@ -107,13 +117,13 @@ def test_what_is_no_list_is_refused(text: str) -> None:
     with pytest.raises(
         InputError, match=r"restitution must be a number, a list like 0\.1,0\.5,0\.9 or start:stop:count"
     ):
-        cli.number_list(text, "restitution")
+        number_list(text, "restitution")
 
 
 @given(st.text("0123456789.,:e-+ nainf", max_size=8))
 def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
     try:
-        numbers = cli.number_list(text, "restitution")
+        numbers = number_list(text, "restitution")
     except InputError:
         return
     assert numbers
@@ -129,9 +139,9 @@ MISTAKES = {
     "map --restitution ''": "restitution must be a number, a list",
     "map --restitution 0.5,0.1,0.9": "restitution must be sorted",
     "map --restitution 0.5,0.5": "without repetition",
-    "map --packing-fraction 0,0.5": "packing_fraction must be above 0 and at most 0.83",
-    "map --packing-fraction 0.5,0.84": "packing_fraction must be above 0 and at most 0.83",
-    "map --packing-fraction 0.7,0.5,0.6": "packing_fraction must be sorted",
+    "map --packing-fraction 0,0.5": "--packing-fraction must be above 0 and at most 0.83",
+    "map --packing-fraction 0.5,0.84": "--packing-fraction must be above 0 and at most 0.83",
+    "map --packing-fraction 0.7,0.5,0.6": "--packing-fraction must be sorted",
     "map --grains 15": "grains must be a whole number of at least 16",
     "map --grains 20.5": "--grains",
     "map --seeds 0": "seeds must be a whole number of at least 1",
@@ -152,9 +162,9 @@ MISTAKES = {
     "map --tolerance loose": "tolerance must be a number",
     "map --error 0": "error must be between 1e-3 and 0.5",
     "map --error small": "--error",
-    "map --error 0.02 --strain 5": "strain and error exclude each other",
-    "run --restitution 0.5 --packing-fraction 0.6 --strain 5 --error 0.02": "strain and error exclude each other",
-    "map --timestep auto --target-error 1": "target_error must be between 1e-4 and 0.1",
+    "map --error 0.02 --strain 5": "--strain and --error exclude each other",
+    "run --restitution 0.5 --packing-fraction 0.6 --strain 5 --error 0.02": "--strain and --error exclude each other",
+    "map --timestep auto --target-error 1": "--target-error must be between 1e-4 and 0.1",
     "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
     "map --activation always": "'midpoint', 'touching'",
@@ -166,25 +176,54 @@ MISTAKES = {
     "map --output none/map.nc": "a folder that exists",
     "map --output folder.nc": "is a folder",
     "map --output picture.nc": "picture_timestep.png' is a folder",
-    "map --scheduler tcp://127.0.0.1:9 --workers 2": "scheduler and workers exclude each other",
+    "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --like none.nc": "there is no file",
     "map --like text.nc": "not a NetCDF file",
     "map --wrong": "--wrong",
     "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
-    "run --restitution 0.5 --packing-fraction 0.9": "packing_fraction must be above 0 and at most 0.83",
+    "run --restitution 0.5 --packing-fraction 0.9": "--packing-fraction must be above 0 and at most 0.83",
     "run --restitution 0.5 --packing-fraction 0.5 --grains 3": "grains must be a whole number of at least 16",
     "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.xyz": "trajectory must be a file name that ends in",
     "run --restitution 0.5 --packing-fraction 0.5 --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 0": "every must be at least 5e-05 and",
+    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 0": "every must be at least 5e-05, for",
     "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 6": "at most the sampled strain, 5",
     "run --restitution 0.5 --packing-fraction 0.5 --every 1": "add --trajectory FILE.gsd",
-    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.gif": "--movie is not available yet",
+    "run --restitution 0.5 --packing-fraction 0.5 --every 2": "or --movie FILE.gif",
+    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.avi": "--movie must be a file name that ends in .gif or",
+    "run --restitution 0.5 --packing-fraction 0.5 --movie none/flow.gif": "--movie must be in a folder that exists",
+    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.gif --every 0.001": "at least 0.01, for 500",
     "run --restitution 0.5 --packing-fraction 0.5 --output flow.csv": "ends in .nc",
     "run --restitution 0.5": "--packing-fraction",
     "plot none.nc": "there is no file",
     "plot folder.nc": "there is no file",
     "plot text.nc": "not a NetCDF file",
-    "draw": "draw",
+    "plot": "FILE must be given: see jaxgran plot --help",
+    "fit": "FILE must be given: see jaxgran fit --help",
+    "fit none.gsd": "there is no file 'none.gsd'",
+    "fit none.nc": "there is no file 'none.nc'",
+    "fit text.nc": "not a NetCDF file",
+    "fit text.gsd": "not a GSD file",
+    "fit text.gsd --pressure 3": "--pressure goes with a map, and 'text.gsd' is a trajectory",
+    "fit text.nc --timestep 1e-3": "--timestep goes with a trajectory, and 'text.nc' is a map",
+    "fit text.nc --pressure 3": "--packing-fraction must be given too",
+    "fit text.nc --packing-fraction 0.7 --pressure 3": "--shear-stress must be given too",
+    "fit text.nc --relative-error -1": "--relative-error must be between 0 and 1, not -1.0",
+    # as they slip in
+    "draw": "there is no command 'draw': see jaxgran --help",
+    "mpa": "there is no command 'mpa', perhaps map is meant",
+    "run": "--restitution must be given: see jaxgran run --help",
+    "run --alpha 0.5": "there is no option --alpha, perhaps --restitution is meant",
+    "run --restitution 0.5 --nu 0.7": "there is no option --nu, perhaps --packing-fraction is meant",
+    "map --dt 1e-4": "there is no option --dt, perhaps --timestep is meant",
+    "map --outptu map.nc": "there is no option --outptu, perhaps --output is meant",
+    "map -x 3": "there is no option -x: see jaxgran map --help",
+    "map map.nc": "'map.nc' stands alone",
+    "map --restitution 0.1 0.5 0.9": "'0.5 0.9' stands alone, and values follow their options; a list has commas",
+    "map --grains 1e3": "--grains must be a whole number, not '1e3'",
+    "map --grains=many": "--grains must be a whole number, not 'many'",
+    "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
+    "map --seeds": "'--seeds' requires an argument",
+    "map --preset fast": "--preset must be one of 'quick', 'paper', not 'fast'",
 }
 
 
@@ -194,6 +233,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "folder.nc").mkdir()
     (tmp_path / "picture_timestep.png").mkdir()
     (tmp_path / "text.nc").write_text("not a map")
+    (tmp_path / "text.gsd").write_text("not a trajectory")
     return tmp_path
 
 
@@ -313,14 +353,29 @@ def test_plot_into_a_folder_that_is_not_there_is_one_sentence(small_map) -> None
     assert_one_sentence(jaxgran(folder, "plot", "small.nc", "--output", "none"))
 
 
-def test_run_prints_every_average_with_its_error_and_unit(tmp_path: Path) -> None:
-    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep auto --strain 4 --output flow.nc"
-    outcome = jaxgran(tmp_path, *words.split(), "--trajectory", "flow.gsd", "--every", "0.5")
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    folder = tmp_path_factory.mktemp("run")
+    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --timestep auto --strain 1 --output flow.nc"
+    return folder, jaxgran(folder, *words.split(), "--trajectory", "flow.gsd", *MOVIE)
+
+
+def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
+    folder, outcome = small_run
     assert outcome.status in (0, 3)
-    assert files(tmp_path) == {"flow.nc", "flow.gsd"}
-    assert "wrote flow.gsd: 9 frames\n" in outcome.err
-    np.testing.assert_allclose(read_trajectory(tmp_path / "flow.gsd").strain, 0.5 * np.arange(9), atol=5e-3)
-    data = read_dataset(tmp_path / "flow.nc")
+    assert files(folder) == {"flow.nc", "flow.gsd", "flow.gif"}
+    strain = read_trajectory(folder / "flow.gsd").strain
+    frames = len(strain)
+    assert 48 <= frames <= 51  # blocks are of whole time steps
+    np.testing.assert_allclose(strain, 0.02 * np.arange(frames), atol=2.5e-3)
+    assert f"wrote flow.gsd: {frames} frames\n" in outcome.err and f"wrote flow.gif: {frames} frames\n" in outcome.err
+    with Image.open(folder / "flow.gif") as film:
+        assert film.n_frames == frames
+
+
+def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
+    folder, outcome = small_run
+    data = read_dataset(folder / "flow.nc")
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
     data = data.isel(restitution=0, packing_fraction=0)
@@ -340,7 +395,7 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     for name in ("force_ratio", "pressure", "shear_stress"):
         assert np.all(data[f"{name}_stderr"] <= 0.1 * data[name])
     strain = data.strain_by_seed.item()
-    assert np.log2(strain / cli.FIRST_STRAIN) == pytest.approx(round(np.log2(strain / cli.FIRST_STRAIN)), abs=1e-3)
+    assert np.log2(strain / FIRST_STRAIN) == pytest.approx(round(np.log2(strain / FIRST_STRAIN)), abs=1e-3)
     assert "relative standard errors: 0.1 asked for" in outcome.err
 
 
@@ -349,14 +404,206 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert (outcome.status, outcome.err) == (0, "")
     lines = dict(line.split(maxsplit=1) for line in outcome.out.splitlines() if "compilation" not in line)
     assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
+    assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
     assert lines["precision"] == "float64"
+    assert lines["jaxgran"].startswith(version("jaxgran"))
+    assert float(lines["memory"].removesuffix(" GiB")) > 0.1
+    assert str(sweep.usable_cores()) in lines["cores"]
     assert "jaxgran" in outcome.out.splitlines()[-1]  # the folder of the compilation cache
+
+
+def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent() -> NoReturn:
+        raise RuntimeError("Unable to initialize backend 'cuda':\n no driver.")
+
+    monkeypatch.setattr(jax, "devices", silent)
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu,made-up")
+    outcome = jaxgran(tmp_path, "info")
+    assert outcome.status == 0
+    assert "none: Unable to initialize backend 'cuda': no driver.\n" in outcome.out
+    assert "JAX_PLATFORMS=cpu,made-up" in outcome.out
+    checkout = (Path(cli.__file__).resolve().parent.parent / ".git").exists()
+    assert (", commit " in outcome.out.splitlines()[0]) == checkout
+
+
+# Trajectories and maps that are fitted
+
+
+def test_fit_finds_the_restitution_of_a_trajectory(small_run, tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
+    assert (outcome.status, outcome.err) == (0, "")
+    rows = dict(re.split(r"\s{2,}", line.strip()) for line in outcome.out.splitlines() if "  " in line.strip())
+    found, error = map(float, rows["restitution ± standard error"].split(" ± "))
+    assert abs(found - 0.7) < max(0.02, 4 * error)
+    assert rows["recorded restitution"] == "0.7"
+    assert int(rows["windows, collisions"].split(",")[0]) >= 47
+
+
+def test_fit_that_fails_says_so_in_one_sentence(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sentences of what the fit raises end as sentences do."""
+    monkeypatch.setattr(calibrate, "_MOST_STEPS", 1)
+    monkeypatch.setattr(calibrate, "_SETTLED", 0.0)
+    monkeypatch.setattr(calibrate, "_LEAST_STEP", 0.0)
+    outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
+    assert (outcome.status, outcome.out) == (3, "")
+    assert outcome.err.startswith("jaxgran: the restitution did not settle: it was last 0.")
+    assert one_sentence(outcome.err.rstrip("\n"))
+
+
+@pytest.fixture(scope="module")
+def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("known") / "known.nc"
+    data = made_up_map()
+    flags = {"flag_values": [0], "flag_meanings": "ok"}
+    write_dataset(data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags)), path)
+    return path
+
+
+def test_fit_tells_how_well_a_law_describes_a_map(known_map: Path, tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "fit", str(known_map))
+    assert (outcome.status, outcome.err) == (0, "")
+    for name in ("pressure", "shear stress", "force ratio"):
+        (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
+        assert row.count("%") == 3
+        assert 0 < float(row[len(name.split())]) < 20
+
+
+def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
+    point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
+    stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")
+    outcome = jaxgran(tmp_path, "fit", str(known_map), "--packing-fraction", "0.7", *stresses)
+    assert outcome.status == 0
+    found, error = outcome.out.splitlines()[-1].removeprefix("restitution ").split(",")[0].split(" ± ")
+    assert abs(float(found) - 0.65) < max(0.05, 4 * float(error))
+
+
+def test_fit_of_a_map_without_such_a_flow_prints_no_table(known_map: Path, tmp_path: Path) -> None:
+    stresses = ("--packing-fraction", "7", "--pressure", "3", "--shear-stress", "1")
+    assert_one_sentence(jaxgran(tmp_path, "fit", str(known_map), *stresses))
+
+
+# Help, completion, colours
+
+
+HELPS = {"": cli.EXAMPLES, **{f"{name} ": shown for name, (_, _, shown) in cli.COMMANDS.items()}}
+
+
+@pytest.mark.parametrize("command", HELPS)
+def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, *command.split(), "--help")
+    assert outcome.status == 0 and "\x1b" not in outcome.out
+    assert jaxgran(tmp_path, *command.split(), "-h") == outcome
+    group = typer.main.get_command(cli.app)
+    assert HELPS[command]
+    for does, example in HELPS[command].items():
+        assert f"  {does}:\n    {example}\n".replace(" ", "") in outcome.out.replace(" ", "")
+        first, name, *words = shlex.split(example)
+        assert first == "jaxgran"
+        if "--help" not in words:
+            context = group.commands[name].make_context(name, list(words))
+            assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
+
+
+def test_examples_of_map_plot_and_run_do_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With made-up replicas in place of runs."""
+
+    def every(settings, *_) -> Iterator:
+        rng = np.random.default_rng(0)
+        for point in range(len(settings.flows())):
+            for seed in range(settings.seeds):
+                yield (point, seed), random_replica(rng, settings)
+
+    monkeypatch.setattr(sweep, "replicas", every)
+    (tmp_path / "figures").mkdir()
+    plane, again = list(cli_map.MAP_EXAMPLES.values())[1], list(cli_map.PLOT_EXAMPLES.values())[1]
+    for example in (plane, again, *cli_run.RUN_EXAMPLES.values()):
+        assert jaxgran(tmp_path, *shlex.split(example)[1:]).status == 0, example
+    assert {"ratio.nc", "ratio_contours.png", "figures"} <= files(tmp_path)
+    assert "ratio_curves.png" in files(tmp_path / "figures")
 
 
 def test_no_command_at_all_is_the_help(tmp_path: Path) -> None:
     outcome = jaxgran(tmp_path)
     assert outcome.status == 0
     assert all(command in outcome.out for command in ("map", "plot", "run", "info"))
+
+
+def test_version_is_printed(tmp_path: Path) -> None:
+    assert jaxgran(tmp_path, "--version") == (0, f"jaxgran {version('jaxgran')}\n", "")
+
+
+@pytest.mark.parametrize("words", [["--show-completion", "bash"], ["--help"]])
+def test_completion_is_offered_and_its_script_calls_the_command(words: list[str], tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    outcome = in_a_process(tmp_path, *words)
+    assert outcome.status == 0
+    assert (
+        "complete -o default -F _jaxgran_completion jaxgran" if words[1:] else "--install-completion"
+    ) in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    {
+        "jaxgran ": {"map", "plot", "run", "fit", "info"},
+        "jaxgran p": {"plot"},
+        "jaxgran run --m": {"--movie"},
+        "jaxgran map --preset ": {"quick", "paper"},
+    }.items(),
+)
+def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {
+        "_JAXGRAN_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split(" ")) - 1),
+    }.items():
+        monkeypatch.setenv(name, value)
+    assert set(in_a_process(tmp_path).out.split()) == expected
+
+
+def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colour_is_asked_for(
+    small_map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = cli_map._ratio_table(read_dataset(small_map[0] / "small.nc"))
+
+    class Terminal(StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    def printed(out: StringIO) -> str:
+        with redirect_stdout(out):
+            print_table(table)
+        return out.getvalue()
+
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert "\x1b[" not in printed(StringIO())
+    assert "\x1b[" in printed(Terminal())
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert not re.search(r"\x1b\[[\d;]*3\d", printed(Terminal()))  # no colour, whatever else is set off
+
+
+def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
+    words = "run --restitution 0.5 --packing-fraction 0.6 --movie flow.mp4"
+    outcome = jaxgran(tmp_path, *words.split())
+    assert_one_sentence(outcome)
+    assert "use .gif, or install ffmpeg" in outcome.err
+    assert not files(tmp_path)
+
+
+def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupts(_) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli_map, "say_written", interrupts)
+    monkeypatch.setattr("jaxgran.dataset.read_dataset", interrupts)
+    outcome = jaxgran(tmp_path, "plot", "map.nc")
+    assert (outcome.status, outcome.out) == (130, "")
+    assert outcome.err.strip() == "jaxgran: interrupted."
 
 
 def test_quiet_has_no_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,16 @@ import pytest
 from jaxgran.batch import stack
 from jaxgran.cell import displacement
 from jaxgran.flow import InputError, ShearFlow
+from jaxgran.recorder import Recorder
 from jaxgran.snapshots import snapshot
-from jaxgran.trajectory import Recorder, Trajectory, append_frame, check_trajectory, read_trajectory, start_trajectory
+from jaxgran.trajectory import (
+    Trajectory,
+    append_frame,
+    check_trajectory,
+    read_trajectory,
+    start_trajectory,
+    write_frame,
+)
 
 GRAINS = pytest.GRAINS
 TILTS = (-0.4, 0.0, 0.3)
@@ -55,7 +63,7 @@ def drive(flow, run):
 def recorded(flow, flowing, drive, tmp_path_factory):
     """A file of five frames, ten steps apart, that were driven in blocks of 25 and 15 steps; and the last state."""
     path = tmp_path_factory.mktemp("trajectory") / "flow.gsd"
-    recorder = Recorder(path, 0.0101)
+    recorder = Recorder(0.0101, partial(write_frame, path))
     end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15))
     assert (recorder.frames, recorder.steps) == (5, 40)
     return path, end, tallies
@@ -144,25 +152,27 @@ def test_recording_changes_no_sum_beyond_rounding(flow, flowing, drive, recorded
 
 @pytest.mark.parametrize("every", [0.01, 0.02], ids=["every block", "every other block"])
 def test_frames_at_the_ends_of_blocks_change_no_bit(flow, flowing, drive, every: float, tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flow.gsd", every)
+    recorder = Recorder(every, partial(write_frame, tmp_path / "flow.gsd"))
     recorded = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (10, 10, 10, 10))
     assert_same_bits(recorded, driven_in_blocks(drive, flow, flowing(0.78), (10, 10, 10, 10)))
     assert recorder.frames == 1 + round(0.04 / every)
 
 
 def test_a_replica_that_waits_has_no_frames(flow, flowing, drive, tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flow.gsd", 0.01)
+    path = tmp_path / "flow.gsd"
+    recorder = Recorder(0.01, partial(write_frame, path))
     end, tallies = driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (10, 0, 0))
     assert [float(tally.steps) for tally in tallies] == [10, 0, 0]
     assert recorder.frames == 2
-    assert_same_bits(frame_of(read_trajectory(recorder.path), 1), end)
+    assert_same_bits(frame_of(read_trajectory(path), 1), end)
 
 
 def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path / "flow.gsd", 0.01)
+    path = tmp_path / "flow.gsd"
+    recorder = Recorder(0.01, partial(write_frame, path))
     for steps in (30, 20):
         driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (steps,))
-        assert len(read_trajectory(recorder.path).step) == recorder.frames == 1 + steps // 10
+        assert len(read_trajectory(path).step) == recorder.frames == 1 + steps // 10
 
 
 # What other programs see
@@ -432,10 +442,11 @@ class Interrupted:
 
 def test_a_file_is_whole_after_every_frame(flow, flowing, drive, tmp_path: Path) -> None:
     """Whoever is killed leaves the frames before."""
-    recorder, seen_frames = Recorder(tmp_path / "flow.gsd", 0.002), []
+    path, seen_frames = tmp_path / "flow.gsd", []
+    recorder = Recorder(0.002, partial(write_frame, path))
 
     def watched(*arguments):
-        seen_frames.append(len(read_trajectory(recorder.path).step))
+        seen_frames.append(len(read_trajectory(path).step))
         return drive(*arguments)
 
     driven_in_blocks(recorder.recording(watched), flow, flowing(0.78), (8,))

@@ -1,0 +1,93 @@
+"""Picture of two flows of one packing fraction: grains that bounce, and grains that hardly do.
+
+Both flows are sheared to their steady state and on to the same tilt of the cell. Of the next steps every one is a
+snapshot, and a line shows the mean force between two grains over that short time: at α = 0.9 pairs collide one after
+the other, at α = 0.1 chains of grains push at once.
+
+    python benchmarks/flow_picture.py            # about 2 minutes
+    python benchmarks/flow_picture.py --quick    # about a minute: 100 grains, a longer time step
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from hardware import hardware
+
+import jaxgran as jg
+from jaxgran.drawing import LABEL_SIZE, empty_figure, write
+from jaxgran.flow_figures import Colour, Scene, common_scale, draw_picture, scene_of
+from jaxgran.force_chains import cluster_share, cluster_sizes
+from jaxgran.snapshots import Snapshot
+
+RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
+TILT = 0.15  # of the cell at the first snapshot
+
+
+class Choice(NamedTuple):
+    grains: int
+    timestep: float
+    steps: int  # over which forces are averaged
+    equilibrate: float | None  # strain, or None until the flow is steady
+
+
+FULL, QUICK = Choice(324, 1e-4, 20, None), Choice(100, 5e-4, 8, 0.5)
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="fewer grains, a longer time step")
+    arguments.add_argument("--colour", choices=("speed", "pressure"), default="speed", help="of the grains")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    choice = QUICK if chosen.quick else FULL
+    flows = [window(restitution, choice) for restitution in RESTITUTIONS]
+
+    rows = [described(restitution, seen) for restitution, seen in zip(RESTITUTIONS, flows, strict=True)]
+    for row in rows:
+        print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
+    chosen.output.mkdir(parents=True, exist_ok=True)
+    stem = chosen.output / ("flow_quick" if chosen.quick else "flow")
+    head = {"hardware": hardware(), "nu": PACKING_FRACTION, **choice._asdict()}
+    stem.with_suffix(".json").write_text(json.dumps({**head, "flows": rows}, indent=1) + "\n")
+    write(draw([scene_of(seen) for seen in flows], chosen.colour), stem.with_suffix(".png"))
+
+
+def window(restitution: float, choice: Choice) -> Snapshot:
+    """A snapshot for each of some successive time steps of a steady flow."""
+    flow = jg.ShearFlow(choice.grains, restitution, PACKING_FRACTION, choice.timestep)
+    state = jg.prepare(flow, jax.random.key(0), equilibrate=choice.equilibrate)
+    step = choice.timestep
+    state, _ = jg.sample(flow, state, strain=(TILT - float(state.tilt)) % 1 + 100 * step)
+    return jg.snapshot_series(flow, state, choice.steps * step, choice.steps)[1]
+
+
+def described(restitution: float, seen: Snapshot) -> dict[str, float]:
+    """What the picture shows, in numbers."""
+    scene, share, sizes = scene_of(seen), cluster_share(seen), cluster_sizes(seen)
+    return {
+        "alpha": restitution,
+        "pairs": len(scene.force),
+        "pairs_mostly_in_clusters": int(scene.clustered.sum()),
+        "force_share_of_clusters": share.force.value.item(),
+        "largest_cluster": float(sizes.at[np.nonzero(sizes.value)[0].max()]),
+        "mean_speed": float(scene.speed.mean()),
+        "largest_force": float(scene.force.max()),
+    }
+
+
+def draw(scenes: list[Scene], colour: Colour):
+    """The flows beside each other, each in its own scale."""
+    figure = empty_figure(11.0, 5.2)
+    for axes, scene, letter in zip(figure.subplots(1, len(scenes)), scenes, "ab", strict=True):
+        draw_picture(axes, scene, colour, common_scale([scene], colour))
+        axes.text(0.0, 1.02, f"({letter})", transform=axes.transAxes, fontsize=LABEL_SIZE, weight="bold")
+    return figure
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,264 @@
+"""Pictures of a flow show its grains, its forces and its cell; movies are whole, and their frames differ."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from matplotlib import animation
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.patches import Polygon
+from PIL import Image, ImageSequence
+from synthetic import one_sentence, snapshot_of
+
+import jaxgran as jg
+from jaxgran import flow_figures, movie
+from jaxgran.drawing import empty_figure
+from jaxgran.flow import InputError
+from jaxgran.flow_figures import Scale, common_scale, draw_scene, flow_figure, scene_of
+from jaxgran.force_chains import pair_forces
+from jaxgran.movie import Frames, check_movie, write_movie
+
+SIDE, GRAINS = 8.0, 40
+
+
+def seen(tilt: float = 0.0, times: int = 1, contacts=((0, 1, 2.0), (1, 2, 1.0), (3, 4, 0.5)), seed: int = 0, **more):
+    """A snapshot: a cluster of three, and a binary collision."""
+    random = np.random.default_rng(seed)
+    positions = random.uniform(0, SIDE, (1, GRAINS, 2)).repeat(times, axis=0)
+    velocities = random.normal(size=(1, GRAINS, 2)).repeat(times, axis=0)
+    return snapshot_of(positions, [list(contacts)] * times, velocities, side=SIDE, tilt=tilt, **more)
+
+
+def drawn(scene, scale: Scale | None = None):
+    axes = empty_figure(4, 4).subplots()
+    draw_scene(axes, scene, "speed", scale or common_scale([scene], "speed"))
+    (grains,) = (artist for artist in axes.collections if isinstance(artist, EllipseCollection))
+    clusters, binaries = (artist for artist in axes.collections if isinstance(artist, LineCollection))
+    (cell,) = (artist for artist in axes.patches if isinstance(artist, Polygon))
+    return grains, clusters, binaries, cell
+
+
+def area_within(grains: EllipseCollection, cell: Polygon, points: int = 400) -> float:
+    """Share of the cell that is covered, where grains do not overlap the sum over them of the area inside."""
+    corners = cell.get_xy()[:-1]
+    u = (np.arange(points) + 0.5) / points
+    mesh = corners[0] + u[:, None, None] * (corners[1] - corners[0]) + u[:, None] * (corners[3] - corners[0])
+    centres, radii = grains.get_offsets(), grains.get_widths() / 2
+    inside = [np.sum((mesh - centre) ** 2, axis=-1) < radius**2 for centre, radius in zip(centres, radii, strict=True)]
+    return float(np.mean(np.sum(inside, axis=0)))
+
+
+@pytest.mark.parametrize("tilt", [-0.5, -0.3, 0.0, 0.2, 0.499])
+def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float) -> None:
+    """The parts of the images within the cell sum up to the area of all grains: none is missing, none twice there."""
+    scene = scene_of(seen(tilt))
+    grains, *_, cell = drawn(scene)
+    assert area_within(grains, cell) == pytest.approx(GRAINS * np.pi / 4 / SIDE**2, rel=2e-3)
+
+
+@pytest.mark.parametrize("tilt", [-0.4, 0.0, 0.25])
+def test_cell_is_the_sheared_one_around_the_origin(tilt: float) -> None:
+    corners = drawn(scene_of(seen(tilt)))[-1].get_xy()[:4]
+    np.testing.assert_allclose(corners.mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(corners[1] - corners[0], [SIDE, 0])
+    np.testing.assert_allclose(corners[3] - corners[0], [tilt * SIDE, SIDE])
+
+
+def test_a_picture_does_not_jump_where_the_tilt_begins_anew() -> None:
+    """At a tilt of 1/2 and at one of −1/2 the lattice is the same: so is all that lies in both cells."""
+    before, after = (scene_of(seen(tilt)) for tilt in (0.5, -0.5))
+    for one, other in zip(before.centres, after.centres, strict=True):
+        apart = (one - other) / SIDE
+        assert apart[1] == 0 and apart[0] == pytest.approx(round(apart[0]))
+
+
+def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -> None:
+    scene = scene_of(seen(0.2))
+    _, clusters, binaries, _ = drawn(scene, Scale(1.0, 2.0))
+    assert len(clusters.get_segments()) == 2 * 9 and len(binaries.get_segments()) == 9
+    widths = {*clusters.get_linewidths(), *binaries.get_linewidths()}
+    assert max(widths) == flow_figures._WIDEST
+    np.testing.assert_allclose(sorted(widths), flow_figures._WIDEST * np.array([0.25, 0.5, 1.0]))
+    middle = binaries.get_segments()[4]  # the image that is not shifted
+    start, end = (scene.centres[k] for k in (4, 3))
+    np.testing.assert_allclose(middle[0], start)
+    lattice = np.linalg.solve(np.array([[SIDE, 0.2 * SIDE], [0, SIDE]]), middle[1] - end)
+    np.testing.assert_allclose(lattice, np.round(lattice), atol=1e-9)
+    assert np.linalg.norm(middle[1] - middle[0]) < SIDE
+
+
+def test_clusters_and_binary_collisions_differ_in_grey() -> None:
+    def grey(colour) -> float:
+        return float(np.dot(np.asarray(colour)[0, :3], [0.299, 0.587, 0.114]))
+
+    _, clusters, binaries, _ = drawn(scene_of(seen()))
+    deepest = [np.asarray(colours(1.0))[None] for colours in flow_figures.COLOURS.values()]
+    dark, light, grains = grey(clusters.get_edgecolor()), grey(binaries.get_edgecolor()), min(map(grey, deepest))
+    assert dark + 0.3 < light < grains - 0.2
+
+
+def test_colours_are_the_speed_and_the_pressure_of_the_contacts() -> None:
+    one = seen()
+    scene = scene_of(one)
+    np.testing.assert_allclose(scene.speed, np.linalg.norm(one.state.velocities[0], axis=-1))
+    pushed = np.zeros(GRAINS)
+    pushed[:5] = 2.0, 3.0, 1.0, 0.5, 0.5
+    np.testing.assert_allclose(scene.pressure, pushed * 0.5 / (2 * np.pi * 0.25))
+    grains = drawn(scene)[0]
+    assert set(grains.get_array()) == set(scene.speed)
+
+
+def test_pressures_of_grains_of_one_size_sum_up_to_the_contact_stress() -> None:
+    """Σ A p of the grains is tr/2 of Σ r F over the contacts where grains touch."""
+    positions = np.zeros((1, GRAINS, 2))
+    positions[0, :, 0] = np.arange(GRAINS) % 8 * 1.0
+    positions[0, :, 1] = np.arange(GRAINS) // 8 * 1.5
+    scene = scene_of(snapshot_of(positions, [[(0, 1, 2.0), (2, 1, 3.0)]], side=SIDE))
+    assert np.sum(np.pi * scene.radii**2 * scene.pressure) == pytest.approx((2.0 + 3.0) * 1.0 / 2)
+
+
+def test_forces_of_a_series_are_means_over_its_times() -> None:
+    """A pair counts to the clusters where most of its force acts within them."""
+    contacts = [[(0, 1, 3.0)], [(1, 0, 1.0), (2, 1, 4.0)], [(5, 6, 2.0)], []]
+    positions = np.random.default_rng(0).uniform(0, SIDE, (1, GRAINS, 2)).repeat(4, axis=0)
+    series = snapshot_of(positions, contacts, side=SIDE)
+    found = pair_forces(series)
+    np.testing.assert_array_equal(np.stack([found.i, found.j], axis=-1), [[0, 1], [1, 2], [5, 6]])
+    np.testing.assert_allclose(found.force, [1.0, 1.0, 0.5])
+    np.testing.assert_allclose(found.cluster_share, [0.25, 1.0, 0.0])
+    np.testing.assert_array_equal(scene_of(series).clustered, [False, True, False])
+
+
+def test_figure_names_what_without_which_it_means_nothing() -> None:
+    figure = flow_figure(seen(), "pressure", strain=1.25)
+    axes = figure.axes[0]
+    for words in (r"\alpha=0.5", r"\nu=", f"N={GRAINS}", r"\mathrm{d}t", "strain 1.250", "forces of one time step"):
+        assert words in axes.get_title()
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert texts[:2] == ["in clusters of 3 or more grains", "binary collisions"] and "F" in texts[2]
+    bar = axes.child_axes[0]
+    assert r"m\dot\gamma^2" in bar.get_ylabel()
+    assert any(text.get_text() == r"2 $\sigma$" for text in axes.texts)
+    several = seen(times=3)
+    assert "mean forces over 3 snapshots" in flow_figure(several).axes[0].get_title()
+    every = seen(times=3)
+    every.state.tilt[:] = [0.0, 1e-3, 2e-3]
+    every.timestep[:] = 1e-3
+    assert "mean forces over 3 time steps, a strain of 0.003" in flow_figure(every).axes[0].get_title()
+
+
+@pytest.mark.parametrize("contacts", [(), ((0, 1, 0.0),)], ids=["no contacts", "no forces"])
+def test_flow_without_forces_or_motion_is_drawn(contacts, tmp_path: Path) -> None:
+    still = seen(contacts=contacts)
+    still.state.velocities[:] = 0
+    for colour in ("speed", "pressure"):
+        flow_figure(still, colour).savefig(tmp_path / "still.png")
+
+
+def without_positions():
+    lost = seen()
+    lost.state.positions[0, 3] = np.nan
+    return lost
+
+
+BAD = {
+    "no snapshot": lambda: jg.flow_figure(3),
+    "a state": lambda: jg.flow_figure(seen().state),
+    "another colour": lambda: jg.flow_figure(seen(), "mass"),
+    "no colour": lambda: jg.flow_figure(seen(), ["speed"]),
+    "not finite": lambda: jg.flow_figure(without_positions()),
+    "another movie": lambda: check_movie(Path("flow.avi")),
+    "no folder": lambda: check_movie(Path("none/flow.gif")),
+}
+
+
+@pytest.mark.parametrize("mistake", BAD)
+def test_mistakes_end_with_one_sentence(mistake: str) -> None:
+    with pytest.raises(InputError) as caught:
+        BAD[mistake]()
+    assert one_sentence(str(caught.value))
+
+
+# Movies
+
+
+def kept(count: int) -> Frames:
+    frames = Frames()
+    for k in range(count):
+        frames.keep(seen_once(k), k)
+    return frames
+
+
+def seen_once(k: int):
+    """A snapshot without an axis of times, at a tilt that begins anew."""
+    return jax.tree.map(lambda x: np.asarray(x[0]), seen(tilt=(0.1 * k + 0.5) % 1 - 0.5, seed=k))
+
+
+def test_gif_has_all_frames_and_they_differ_in_the_flow_alone(tmp_path: Path) -> None:
+    path = tmp_path / "flow.gif"
+    path.write_bytes(b"old")
+    write_movie(path, kept(6))
+    assert [file.name for file in tmp_path.iterdir()] == ["flow.gif"]
+    with Image.open(path) as film:
+        assert film.n_frames == 6 and film.info["duration"] == 50 and film.info.get("loop") == 0
+        pictures = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    assert {picture.shape for picture in pictures} == {pictures[0].shape}
+    for one, other in pairwise(pictures):
+        assert np.mean(one != other) > 0.02
+    right, low = int(0.9 * pictures[0].shape[1]), int(0.93 * pictures[0].shape[0])
+    for other in pictures[1:]:
+        np.testing.assert_array_equal(other[:, right:], pictures[0][:, right:])  # the colour bar
+        np.testing.assert_array_equal(other[low:], pictures[0][low:])  # the legend
+    assert path.stat().st_size < 60_000 * 6
+
+
+def test_colours_of_a_gif_are_those_of_the_picture(tmp_path: Path) -> None:
+    """White is white, and the few pixels of a binary collision keep their red."""
+    write_movie(tmp_path / "flow.gif", kept(2))
+    with Image.open(tmp_path / "flow.gif") as film:
+        picture = np.asarray(film.convert("RGB")).astype(int)
+    assert (picture[0, 0] == 255).all()
+    red = np.abs(picture - np.array([0xE0, 0x55, 0x2F])).sum(axis=-1) < 12
+    assert red.sum() > 20
+
+
+def test_too_many_frames_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(movie, "MOST_FRAMES", 8)
+    frames = Frames()
+    one = seen_once(0)
+    for step in range(50):
+        frames.keep(one, step)
+    assert 4 <= len(frames.strains) <= 8
+    assert len(set(np.diff(frames.strains))) == 1 and frames.strains[0] == 0
+    frames.keep(one, 0)
+    assert frames.strains == [0.0]
+
+
+def test_a_movie_that_is_interrupted_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "flow.gif"
+    path.write_bytes(b"old")
+
+    def interrupts(items):
+        yield items[0]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_movie(path, kept(3), follow=interrupts)
+    assert path.read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["flow.gif"]
+
+
+@pytest.mark.skipif(not animation.FFMpegWriter.isAvailable(), reason="ffmpeg is not installed")
+def test_mp4_is_written_where_there_is_ffmpeg(tmp_path: Path) -> None:
+    check_movie(tmp_path / "flow.mp4")
+    write_movie(tmp_path / "flow.mp4", kept(4))
+    content = (tmp_path / "flow.mp4").read_bytes()
+    assert content[4:8] == b"ftyp" and len(content) > 2000
+
+
+def test_mp4_is_refused_where_there_is_no_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
+    with pytest.raises(InputError, match=r"no ffmpeg to write \.mp4: use \.gif, or install ffmpeg\.$"):
+        check_movie(tmp_path / "flow.mp4")
