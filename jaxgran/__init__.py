@@ -28,10 +28,11 @@ if TYPE_CHECKING:
     from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
     from jaxgran.flow_figures import flow_figure
-    from jaxgran.grains import Grains, polydisperse
+    from jaxgran.free_cooling import Cooling, cooling
+    from jaxgran.grains import Grains, own_grains, polydisperse
     from jaxgran.measure import Sample, sample
     from jaxgran.packing import pack
-    from jaxgran.protocol import prepare
+    from jaxgran.protocol import prepare, start
     from jaxgran.rheology import friction_law
     from jaxgran.rheology_figures import friction_figure
     from jaxgran.snapshots import Snapshot, snapshot_series
@@ -48,6 +49,7 @@ _HOME = {
     "ShearFlow": "flow",
     "Grains": "grains",
     "polydisperse": "grains",
+    "own_grains": "grains",
     "State": "dynamics",
     "advance": "dynamics",
     "pack": "packing",
@@ -56,6 +58,9 @@ _HOME = {
     "Sample": "measure",
     "sample": "measure",
     "prepare": "protocol",
+    "start": "protocol",
+    "Cooling": "free_cooling",
+    "cooling": "free_cooling",
     "ratio_map": "sweep",
     "Snapshot": "snapshots",
     "snapshot_series": "snapshots",
@@ -85,6 +90,7 @@ _HOME = {
 }
 __all__ = [
     "Closure",
+    "Cooling",
     "Fields",
     "Grains",
     "RestitutionFit",
@@ -97,6 +103,7 @@ __all__ = [
     "Trajectory",
     "advance",
     "cluster_shares",
+    "cooling",
     "count_events",
     "fields_at",
     "fit_closure",
@@ -107,6 +114,7 @@ __all__ = [
     "gaussian",
     "heaviside",
     "lucy",
+    "own_grains",
     "pack",
     "polydisperse",
     "predict",
@@ -120,6 +128,7 @@ __all__ = [
     "sample",
     "save_figures",
     "snapshot_series",
+    "start",
     "theory_errors",
 ]
 

@@ -14,7 +14,8 @@ where a grain strikes a cluster, only the impulse that its own approach accounts
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from jaxgran.delassus import grain_impulses, in_clusters
 from jaxgran.display import OF_STATE
 from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number, require_whole
 from jaxgran.grains import Grains
+from jaxgran.observer import Look, nothing_observed, with_contacts, with_flight
 from jaxgran.pairs import (
     Frame,
     Neighbourhood,
@@ -98,11 +100,15 @@ class _Pairs(NamedTuple):
         return jnp.stack([self.ux, self.uy], axis=-1)
 
 
-class _Derivative(NamedTuple):
+Observe = Callable[[State, Contacts, Array], Any]  # of a time step: the state, its contacts and their impulses
+
+
+class _Purpose(NamedTuple):
     """What an advance is made for besides its values: fewer contact buffers are compiled sooner."""
 
     rungs: int | None = None  # contact buffers, the largest; None for all of them
     moving_contacts: bool = False
+    observe: Observe | None = None
 
 
 class _Carry(NamedTuple):
@@ -151,13 +157,27 @@ def advance(
       the status ``nonfinite``.
     """
     rungs = None if events is None and not moving_contacts else _FEW_RUNGS
-    how = _Derivative(rungs, moving_contacts)
+    how = _Purpose(rungs, moving_contacts)
     start, body, unfinished = _event_loop(flow, state, steps, free_flight, how)
     if events is None:
         end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
     else:
         require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
         end = _scanned(start, body, unfinished, events)
+    return _ended(state, end, unfinished)
+
+
+def advance_observed(
+    flow: ShearFlow, state: State, steps: Int[Array, ""], observe: Observe
+) -> tuple[State, Tally, Any]:
+    """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
+    start, body, unfinished = _event_loop(flow, state, steps, True, _Purpose(observe=observe))
+    end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
+    return *_ended(state, end, unfinished), end.sums.own.sums
+
+
+def _ended(state: State, end: _Carry, unfinished: Callable) -> tuple[State, Tally]:
+    """The state and the tally at the end of an advance from a state."""
     positions, tilt = present(end.hood, state.side)
     status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
     status = jnp.maximum(status, jnp.where(unfinished(end), Status.capacity, Status.ok)).astype(jnp.int32)
@@ -171,17 +191,21 @@ def advance(
 
 def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:
     """Evaluations that an advance takes: the ``events`` that it needs in a loop of fixed length."""
-    start, body, unfinished = _event_loop(flow, state, steps, free_flight, _Derivative())
+    start, body, unfinished = _event_loop(flow, state, steps, free_flight, _Purpose())
     counted = jnp.int32(0), start
     return lax.while_loop(lambda at: any_replica(unfinished(at[1])), lambda at: (at[0] + 1, body(at[1])), counted)[0]
 
 
-def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, how: _Derivative):
+def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, how: _Purpose):
     """Start and body of the loop of an advance, and whether it has to go on."""
     require_state(flow, state)
     words = f"a whole number of 0 to {MAX_STEPS}"
     require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
+
+    def look_at(hood: Neighbourhood, velocities: Array) -> Look | None:
+        """The user's view of the flow as it is; None where nobody looks."""
+        return None if how.observe is None else partial(_seen, how.observe, hood, grains, velocities, side)
 
     def unfinished(now: _Carry):
         return (now.step < steps) & (now.sums.status < Status.nonfinite)
@@ -192,19 +216,22 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
 
         least = now.solved.astype(jnp.int32)
         jump = _steps_to_contact(pairs, hood.near.reach, flow, least)
-        jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, _LONGEST_FLIGHT / shear_rate) / dt))
+        jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, jnp.divide(_LONGEST_FLIGHT, shear_rate)) / dt))
         jump = jump if free_flight else jnp.zeros_like(jump)
         remaining = steps - now.step
         jump = jnp.clip(jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining)
         flight = jump.astype(slack.dtype) * dt
 
         sums = _add_flight(now.sums, now.velocities, grains, jump, flight, shear_rate)
+        look = look_at(hood, now.velocities)
+        sums = sums if look is None else sums._replace(own=with_flight(sums.own, look, jump))
         frame, velocities = _fly(hood.frame, now.velocities, flight, shear_rate)
         hood, slack = replace(hood, frame=frame), slack - loss * flight
         pairs = pairs._replace(x=pairs.x + flight * pairs.ux, y=pairs.y + flight * pairs.uy)
         step = now.step + jump
         meets = go & (step < steps)
-        velocities, pairs, sums, shift = _collide(flow, hood.near, grains, velocities, pairs, sums, meets, how)
+        look = look_at(hood, velocities)
+        velocities, pairs, sums, shift = _collide(flow, hood.near, grains, velocities, pairs, sums, meets, how, look)
         if shift is not None:
             frame, velocities, pairs = _shifted(shift, shear_rate, hood, velocities, pairs)
             hood = replace(hood, frame=frame)
@@ -219,8 +246,19 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     pairs = _pairs_now(hood, state.velocities, shear_rate)
     sums = empty_sums(state.positions.dtype)
     sums = sums._replace(status=_status_if_finite(state.positions, state.velocities))
+    look = look_at(hood, state.velocities)
+    if look is not None:
+        sums = sums._replace(own=nothing_observed(look, contact_capacities(flow.grains)[-1], state.positions.dtype))
     start = _Carry(hood, pairs, hood.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
     return start, body, unfinished
+
+
+def _seen(
+    observe: Observe, hood: Neighbourhood, grains: Grains, velocities: Array, side: Array, contacts: Contacts, p: Array
+) -> Any:
+    """What is observed of one time step with the given contacts and impulses p."""
+    positions, tilt = present(hood, side)
+    return observe(State(grains, positions, velocities, side, tilt), contacts, p)
 
 
 def _scanned(start: _Carry, body: Callable, unfinished: Callable, events: int) -> _Carry:
@@ -329,7 +367,8 @@ def _collide(
     pairs: _Pairs,
     sums: Sums,
     meets: Array,
-    how: _Derivative,
+    how: _Purpose,
+    look: Look | None,
 ) -> tuple[Array, _Pairs, Sums, Array | None]:
     """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches.
 
@@ -356,6 +395,7 @@ def _collide(
             index = set_bits(words, capacity, contact.size)
             network = contact_network(index, near, separations, pairs.velocities(), grains)
             impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
+            new = new if look is None else new._replace(own=with_contacts(sums.own, look, network, impulses))
             change = _velocity_changes(network, impulses, grains)
             (xi, yi), (xj, yj) = change(near.i), change(near.j)
             kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)

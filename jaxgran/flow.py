@@ -43,8 +43,8 @@ class ShearFlow:
     restitution       –                  α in [0, 1], ratio of normal velocities after and before
     packing_fraction  –                  ν in (0, 0.83], area of the grains over the area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
-    shear_rate        1/time             γ̇ > 0
-    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ
+    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where time has any unit, see ``cooling``
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; unused with grains of one's own
     tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
     max_iterations    –                  cap of one contact solve
     activation        –                  "midpoint": contact if half a step of free flight overlaps;
@@ -123,7 +123,7 @@ _RANGES = {
         f"above 0 and at most {MAX_PACKING_FRACTION}",
     ),
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
-    "shear_rate": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
+    "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
     "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
     "relaxation": (lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded"),
@@ -168,6 +168,15 @@ def require(name: str, value, accepts, words: str) -> None:
         raise InputError(f"{name} must be {words}, not {shown(value)}.")
 
 
+def listed(values: Any) -> Any:
+    """A list of numbers as the array it stands for; anything else, to be judged, as it is."""
+    numbers = isinstance(values, (list, tuple)) and all(
+        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
+        for x in values
+    )
+    return np.asarray(values, float) if numbers else values
+
+
 def require_number(name: str, value, accepts, words: str) -> None:
     """The same for what must be a single number."""
     require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
@@ -183,12 +192,19 @@ def require_whole(name: str, value: Any, least: int, most: int, why: str) -> Non
 
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
     """Raise an InputError unless a strain is at least a time step for each part, and no more than can be counted."""
+    require_sheared(flow)
     require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
         step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         least, most = parts * step, MAX_STEPS * step
         require("strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}")
         require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
+
+
+def require_sheared(flow: ShearFlow) -> None:
+    """Raise an InputError where the flow is not sheared, for what counts in strain."""
+    words = "above 0 where strain is counted (for a flow without shear there is cooling)"
+    require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
 
 
 def require_flow(flow: Any) -> None:

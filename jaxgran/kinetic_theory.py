@@ -5,7 +5,8 @@ order at any restitution, one size), and the moments of an anisotropic Gaussian 
 the shear rate). All neglect correlations of velocity between neighbours, so all fail near jamming and at small
 restitution in dense flow.
 
-Lengths are in mean diameters, masses in the mass of a grain of mean diameter; a grain of diameter d weighs d².
+Lengths are in mean diameters, masses in the mass of a grain of mean diameter; a grain of diameter d weighs d², unless
+its mass is given (``mixture_moments``).
 Everything here is differentiable and works on one flow; `jax.vmap` adds a leading `(replicas,)`.
 """
 
@@ -181,13 +182,45 @@ def gaussian_moments(
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
     alpha, nu, rate, width = _as_floats(restitution, packing_fraction, shear_rate, polydispersity)
-    mixture = _mixture(nu, width, size_classes)
+    return _steady(alpha, rate, _mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature))
+
+
+@jax.jit
+def mixture_moments(
+    restitution: Scalar,
+    packing_fraction: Scalar,
+    shear_rate: Scalar,
+    diameters: Float[Array, " classes"],
+    masses: Float[Array, " classes"],
+) -> SteadyShear:
+    """``gaussian_moments`` of a mixture of as many grains of each of some diameters and masses.
+
+    ================  =======  ====================================================
+    name              unit     meaning
+    ================  =======  ====================================================
+    restitution       –        0 ≤ α < 1
+    packing_fraction  –        0 < ν < 1
+    shear_rate        1/t      γ̇ > 0
+    diameters         σ        (classes,), of mean one
+    masses            m        (classes,)
+    returns                    SteadyShear
+    ================  =======  ====================================================
+    """
+    alpha, nu, rate = _as_floats(restitution, packing_fraction, shear_rate)
+    fractions = jnp.full(diameters.shape, 1 / diameters.size, nu.dtype)
+    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.mean(masses))
+    return _steady(alpha, rate, _mixture_of(nu, diameters, masses, fractions), guess)
+
+
+def _steady(
+    alpha: Float[Array, ""], rate: Float[Array, ""], mixture: "_Mixture", guess: Float[Array, ""]
+) -> SteadyShear:
+    """The balance of the moments of a mixture, from a guess of the logarithm of its temperature."""
 
     def imbalance(unknowns):
         temperatures = _temperatures(unknowns)
         return _moment_balance(temperatures, _collisions(temperatures, alpha, mixture))
 
-    guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature)
     start = jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])[:, None] * jnp.ones_like(mixture.diameters)[None, :]
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_linear_solve)
 
@@ -209,17 +242,15 @@ class _Mixture(NamedTuple):
     """A law of diameters as a few classes.
 
     diameters         (classes,)
+    masses            (classes,)
     number_densities  (classes,)          grains per unit area
     encounters        (classes, classes)  number density of the partners times the contact diameter and χ
     """
 
     diameters: Float[Array, " classes"]
+    masses: Float[Array, " classes"]
     number_densities: Float[Array, " classes"]
     encounters: Float[Array, "classes classes"]
-
-    @property
-    def masses(self) -> Float[Array, " classes"]:
-        return self.diameters**2
 
     @property
     def contact_diameters(self) -> Float[Array, "classes classes"]:
@@ -232,14 +263,19 @@ class _Mixture(NamedTuple):
 
 
 def _mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes: int) -> _Mixture:
+    """The uniform law of diameters."""
     nodes, weights = np.polynomial.legendre.leggauss(size_classes)
-    fractions = jnp.asarray(weights / 2, nu.dtype)
     diameters = 1 + width * jnp.asarray(nodes, nu.dtype)
+    return _mixture_of(nu, diameters, diameters**2, jnp.asarray(weights / 2, nu.dtype))
+
+
+def _mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> _Mixture:
+    """Classes of grains with their diameters, masses and fractions of the number, (classes,) each."""
     mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
     densities = fractions * nu / (jnp.pi / 4 * mean_square)
     own, other = diameters[:, None], diameters[None, :]
     chi = 1 / (1 - nu) + 9 / 8 * own * other / (own + other) * nu * mean / mean_square / (1 - nu) ** 2
-    return _Mixture(diameters, densities, densities[None, :] * (own + other) / 2 * chi)
+    return _Mixture(diameters, masses, densities, densities[None, :] * (own + other) / 2 * chi)
 
 
 class _Collisions(NamedTuple):

@@ -1,8 +1,9 @@
 """Sample: what is measured of a flow over a strain, in blocks, so that every average has an error."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +12,14 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxgran.contacts import Contacts
 from jaxgran.display import OF_SAMPLE
-from jaxgran.dynamics import State, advance, require_state
-from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, two_digits
+from jaxgran.dynamics import State, advance, advance_observed, require_state
+from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, shown, two_digits
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
+from jaxgran.snapshots import Snapshot, snapshot_of
 from jaxgran.statistics import Estimates, correlation_length, jackknife
+from jaxgran.status import Status
 from jaxgran.tally import Tally
 
 BLOCKS, MOST_BLOCKS = 32, 10**6
@@ -35,6 +39,8 @@ class Sample:
     area        ()         σ²    area of the cell
     shear_rate  ()         1/t   γ̇
     grains      static     –     number of grains
+    own         (blocks,)  –     sums over the steps of what ``observe`` found
+                                 in each, a pytree; None without it
     ==========  =========  ====  ============================================
 
     The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
@@ -45,6 +51,7 @@ class Sample:
     area: Float[Array | np.ndarray, "*replicas"]
     shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
+    own: Any = None
 
     __repr__, _repr_html_ = OF_SAMPLE
 
@@ -108,6 +115,34 @@ class Sample:
             raise InputError("errors are those of one replica, and this sample holds a batch: index it first.")
         return estimates([self])[1]
 
+    def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
+        """Means over all time steps of what was observed in one replica, and their standard errors (see ``jackknife``).
+
+        Args:
+          estimate: what to make of the means, a function of arrays: a ratio of two of them, say. The errors are those
+            of its result.
+
+        Returns:
+          Two pytrees of arrays, as the estimate returns them.
+        """
+        if self.own is None or jnp.ndim(self.area):
+            raise InputError(
+                "what was observed is that of one replica, sampled with observe and indexed if in a batch."
+            )
+
+        def one(sums: Any, steps: Array) -> Any:
+            return estimate(jax.tree.map(lambda x: x / steps, sums))
+
+        def named(part: tuple[Any, Array]) -> dict[str, Array]:
+            found = jax.tree.leaves((jax.vmap(one) if np.ndim(part[1]) else one)(*part))
+            return {str(k): leaf for k, leaf in enumerate(found)}
+
+        sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.own, self.tally.steps))
+        total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
+        structure = jax.tree.structure(jax.eval_shape(one, *total))
+        values, errors = jackknife(named, sums)
+        return structure.unflatten(values.values()), structure.unflatten(errors.values())
+
 
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """Averages over all blocks of some replicas of one flow, and their standard errors by the jackknife.
@@ -149,35 +184,125 @@ def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array
     return partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
 
 
-def sample(flow: ShearFlow, state: State, strain: float | Array, blocks: int = BLOCKS) -> tuple[State, Sample]:
+def sample(
+    flow: ShearFlow,
+    state: State,
+    strain: float | Array,
+    blocks: int = BLOCKS,
+    observe: Callable[[Snapshot], Any] | None = None,
+    callback: Callable[[State, Sample], Any] | None = None,
+) -> tuple[State, Sample]:
     """Shear a flow and measure it; ``jit``, ``vmap`` and ``lax.map`` apply.
+
+    What ``observe`` returns is averaged over **every** time step, in the same pass (see ``observer``), since what
+    contacts do cannot be had from a few instants: at a short time step most instants of a collisional flow have no
+    contact that pushes. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and
+    velocities are seen once a flight, so they are averaged up to the strain of a flight, about 1e-3. The means of two
+    kinds of grains' temperature and of the contacts' fabric, as an example:
+
+        def observe(seen):
+            kinetic = seen.state.grains.masses * jnp.sum(seen.state.velocities**2, axis=1) / 2
+            small, n = seen.state.grains.radii < 0.5, seen.contacts.normals
+            pushes = (seen.impulses > 0).astype(n.dtype)
+            return {
+                "small": jnp.sum(jnp.where(small, kinetic, 0)) / jnp.sum(small),
+                "large": jnp.sum(jnp.where(small, 0, kinetic)) / jnp.sum(~small),
+                "fabric": jnp.einsum("c,ca,cb->ab", pushes, n, n),
+                "contacts": jnp.sum(pushes),
+            }
+
+        state, measured = jg.sample(flow, state, 5.0, observe=observe)
+        means, errors = measured.observed()
+        fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
 
     Args:
       flow: parameters, those of the state.
       state: the flow at the beginning, best from ``prepare``.
       strain: strain γ̇t to sample, rounded to whole time steps. A change of it compiles nothing anew.
       blocks: number of equal parts that the tallies are kept for, static.
+      observe: what else to average, a function of a ``Snapshot`` that returns a pytree of arrays; static, so that a new
+        function compiles anew. The contacts of a snapshot are those of a step in which some approach, before they act,
+        in buffers of several sizes: sum over them. A step without has none, so a mean over steps counts zero for it.
+      callback: called after each block with the state and the sample so far; where it returns something true, the
+        sample ends there. A block is then compiled instead of all of them, and no transformation applies.
 
     Returns:
       The state at the end and the sample.
 
     Raises:
-      ValueError: the strain is not a positive number, shorter than a time step for each block or longer than 2**31 - 1
-        of them, or positions in float32 cannot resolve the time step.
+      ValueError: the flow is not sheared, the strain is not a positive number, shorter than a time step for each block
+        or longer than 2**31 - 1 of them, positions in float32 cannot resolve the time step, or what is observed is no
+        sums over the contacts.
     """
     require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
     require_strain(flow, strain, blocks)
     check_precision(flow, state)
-    return _sample(flow, state, strain, blocks)
+    for name, function in (("observe", observe), ("callback", callback)):
+        if function is not None and not callable(function):
+            raise InputError(f"{name} must be a function or None, not {shown(function)}.")
+    if callback is None:
+        return _sample(flow, state, strain, blocks, observe)
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, state, strain))):
+        raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
+    return _told_sample(flow, state, strain, blocks, observe, callback)
 
 
-@partial(jax.jit, static_argnames="blocks")
-def _sample(flow: ShearFlow, state: State, strain: Array, blocks: int) -> tuple[State, Sample]:
+@partial(jax.jit, static_argnames=("blocks", "observe"))
+def _sample(
+    flow: ShearFlow, state: State, strain: Array, blocks: int, observe: Callable[[Snapshot], Any] | None = None
+) -> tuple[State, Sample]:
+    return _measured(flow, state, _steps_of_blocks(flow, strain, blocks), observe)
+
+
+def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks)
-    state, tally = lax.scan(lambda now, n: advance(flow, now, n), state, jnp.diff(edges).astype(jnp.int32))
-    return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains)
+    return jnp.diff(edges).astype(jnp.int32)
+
+
+def _measured(
+    flow: ShearFlow, state: State, steps: Int[Array, " blocks"], observe: Callable[[Snapshot], Any] | None
+) -> tuple[State, Sample]:
+    """The sample of blocks of so many time steps."""
+
+    def block(now: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
+        if observe is None:
+            now, tally = advance(flow, now, steps)
+            return now, (tally, None)
+        now, tally, own = advance_observed(flow, now, steps, partial(_look, observe, flow))
+        return now, (tally, own)
+
+    state, (tally, own) = lax.scan(block, state, steps)
+    return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains, own)
+
+
+def _look(
+    observe: Callable[[Snapshot], Any], flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
+) -> Any:
+    return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
+
+
+_one_block = jax.jit(_measured, static_argnames="observe")
+
+
+def _told_sample(
+    flow: ShearFlow, state: State, strain: float | Array, blocks: int, observe: Any, callback: Callable
+) -> tuple[State, Sample]:
+    """The sample, block by block, each of which a callback is told of."""
+    parts: list[Sample] = []
+    for steps in np.asarray(_steps_of_blocks(flow, strain, blocks)):
+        state, part = _one_block(flow, state, jnp.asarray([steps]), observe)
+        parts.append(part)
+        if callback(state, _joined(parts)):
+            break
+    return state, _joined(parts)
+
+
+def _joined(parts: list[Sample]) -> Sample:
+    """One sample of all blocks of some of one flow that follow each other."""
+    blocks = jax.tree.map(lambda *x: jnp.concatenate(x), *((part.tally, part.own) for part in parts))
+    return replace(parts[-1], tally=blocks[0], own=blocks[1])
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:

@@ -72,6 +72,12 @@ def cell_list_pairs(
     return i, j, overfull | crowded | ~cells_suffice
 
 
+def largest_cutoff(count: int, side: Array, capacity: int) -> Float[Array, ""]:
+    """Largest cutoff, in σ, that the grid of ``cell_list_pairs`` serves at any tilt."""
+    share = 1 / (_cells_per_side(count, capacity) * math.hypot(1, _LARGEST_TILT))
+    return side * (share - 16 * jnp.finfo(side.dtype).eps)
+
+
 def _cells_per_side(count: int, capacity: int) -> int:
     """As many cells along each side as the cutoff allows, but at least 3 and on average a grain or more in each."""
     reach = math.sqrt(2 * _MARGIN * capacity / (math.pi * count**2))  # cutoff/L

@@ -10,16 +10,27 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.cell import cell_side
 from jaxgran.dynamics import State
-from jaxgran.flow import ShearFlow, require_flow, require_key
-from jaxgran.grains import Grains, polydisperse
-from jaxgran.pairs import Frame, Neighbourhood, consumed_skin, neighbourhood, present, refresh, separations_now
+from jaxgran.flow import InputError, ShearFlow, require_flow, require_key
+from jaxgran.grains import Grains, polydisperse, require_grains
+from jaxgran.pairs import (
+    Frame,
+    Neighbourhood,
+    consumed_skin,
+    neighbourhood,
+    present,
+    refresh,
+    separations_now,
+    widest_skin,
+)
 from jaxgran.replica import any_replica, where_active
 
 INFLATION = 5e-4
+_NARROWEST_SKIN = 0.2  # σ, of the lists of near pairs
 _ATTEMPTS = 10
 _ITERATIONS = 20_000
 _SHORTEST_STEP, _LONGEST_STEP = 0.1, 0.5  # FIRE's time step; overlap stiffness and masses are one
@@ -36,21 +47,31 @@ class _Fire(NamedTuple):
     attempts: Array
 
 
-def pack(flow: ShearFlow, key: Array) -> tuple[State, Bool[Array, ""]]:
+def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[State, Bool[Array, ""]]:
     """A random packing of discs at rest without overlap, and whether it was found.
 
     Args:
       flow: number of grains, polydispersity and packing fraction.
       key: JAX random key.
+      grains: discs of one's own, in mean diameters (see ``own_grains``); None for those of ``polydisperse``.
 
     Returns:
       The state, with zero velocities and no tilt, and False where ten random starts all got stuck, which below
       the largest accepted packing fraction 0.83 is not expected.
+
+    Raises:
+      InputError: (a ValueError) the grains are not as many as the flow's, not in mean diameters, or one is too large
+        for the cell.
     """
     require_flow(flow)
     require_key(key)
     size_key, place_key = jax.random.split(key)
-    grains = polydisperse(flow.grains, flow.polydispersity, size_key)
+    generated = grains is None
+    if grains is None:
+        grains = polydisperse(flow.grains, flow.polydispersity, size_key)
+    else:
+        require_room(flow, grains)
+        grains = Grains(*(jnp.asarray(x, float) for x in (grains.radii, grains.masses)))
     side = cell_side(grains.radii, flow.packing_fraction)
     inflated = Grains(grains.radii * (1 + INFLATION), grains.masses)
     allowed = INFLATION * 2 * jnp.min(grains.radii)
@@ -73,7 +94,29 @@ def pack(flow: ShearFlow, key: Array) -> tuple[State, Bool[Array, ""]]:
 
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start(jnp.int32(0)))
     positions, tilt = present(end.hood, side)
-    return State(grains, positions, still, side, tilt), end.overlap < allowed
+    found = end.overlap < allowed
+    return State(grains, positions, still, side, tilt), found if generated else found & (widest_skin(grains, side) > 0)
+
+
+def require_room(flow: ShearFlow, grains: Grains) -> None:
+    """Raise an InputError unless these are the grains of the flow, and none is too large for the lists of near pairs.
+
+    Nearest images are unique where the cell is two largest diameters wide; and the search of more than 512 grains is
+    made for grains of similar size: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more in
+    looser flows. Traced numbers are not judged here: ``pack`` then says that no packing was found.
+    """
+    require_grains(grains, flow.grains)
+    if any(isinstance(x, Tracer) for x in (grains.radii, flow.packing_fraction)):
+        return
+    radii = jnp.asarray(grains.radii, float)
+    room = float(widest_skin(Grains(radii, radii), cell_side(radii, flow.packing_fraction)))
+    if room < _NARROWEST_SKIN:
+        largest, typical = 2 * float(jnp.max(radii)), 2 * float(jnp.sqrt(jnp.mean(radii**2)))
+        raise InputError(
+            f"the largest diameter must be at most {(largest + room - _NARROWEST_SKIN) / typical:.3g} times the root "
+            f"mean square of all in a flow of {flow.grains} grains at packing fraction "
+            f"{float(flow.packing_fraction):g}, not {largest / typical:.3g}."
+        )
 
 
 def _overlap_forces(hood: Neighbourhood, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxgran.cell import displacement, remap_tilt, sheared, wrap
 from jaxgran.grains import Grains
-from jaxgran.neighbours import cell_list_pairs, set_bit
+from jaxgran.neighbours import cell_list_pairs, largest_cutoff, set_bit
 from jaxgran.replica import any_replica, where_active
 
 ALL_PAIRS_LIMIT = 512  # above this number of grains the search uses a cell list
@@ -196,7 +196,15 @@ def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Ar
     """The skin at which a homogeneous flow fills a buffer to its expected share; at most half the cell."""
     density = grains.radii.size / side**2
     reach = jnp.sqrt(2 * _FILL * pairs_per_grain / (jnp.pi * density))
-    return jnp.minimum(reach - 1, side / 2 - 2 * jnp.max(grains.radii))
+    return jnp.minimum(reach - 1, widest_skin(grains, side))
+
+
+def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
+    """The largest skin that lists of these grains can have: nearest images are unique, and the grid of cells serves."""
+    count, reach = grains.radii.size, side / 2
+    if count > ALL_PAIRS_LIMIT:
+        reach = jnp.minimum(reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count)))
+    return reach - 2 * jnp.max(grains.radii)
 
 
 def _capacity(pairs_per_grain: int, count: int) -> int:

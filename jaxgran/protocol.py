@@ -13,7 +13,7 @@ flow says.
 
 from dataclasses import replace
 from functools import partial
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
 import jax
@@ -23,11 +23,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.batch import Drive, advance_batch, replicated, stack
 from jaxgran.dynamics import State
-from jaxgran.flow import SHORTEST_TIMESTEP, InputError, ShearFlow, require_flow, require_key, require_number, two_digits
-from jaxgran.kinetic_theory import SteadyShear, gaussian_moments
+from jaxgran.flow import (
+    SHORTEST_TIMESTEP,
+    InputError,
+    ShearFlow,
+    require_flow,
+    require_key,
+    require_number,
+    require_sheared,
+    two_digits,
+)
+from jaxgran.grains import Grains
+from jaxgran.kinetic_theory import SteadyShear, gaussian_moments, mixture_moments
 from jaxgran.measure import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.observables import averages
-from jaxgran.packing import pack
+from jaxgran.packing import pack, require_room
 from jaxgran.statistics import drift
 from jaxgran.status import Status
 from jaxgran.tally import Tally
@@ -45,6 +55,7 @@ _SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
 _SAMPLE_SIGNIFICANT, _SAMPLE_LEVEL = 4.0, 0.2  # a sample drifts that exceeds both, in errors and in ln P or ln T
 _CLUSTER_STRAIN = 1.0  # in which the clusters of a dissipative flow wander: blocks of a sample that are closer, agree
 _DRIFT_BLOCKS = 16
+_SIZE_CLASSES = 8  # of grains of one's own, for kinetic theory
 _ELASTIC = 0.99  # above it theory's temperature diverges; the start is taken from here
 
 
@@ -57,7 +68,7 @@ class Batch(NamedTuple):
     strain: Float[np.ndarray, " replicas"]  # sheared before the sample
 
 
-def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> State:
+def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grains: Grains | None = None) -> State:
     """A flow in its steady state at its time step, ready to be sampled.
 
     Args:
@@ -65,13 +76,14 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
       key: JAX random key; the same key gives the same state.
       equilibrate: strain to shear at the coarse time step, or None to shear until the flow is steady. A given
         strain is taken as it is, though a map calls a point whose strain is shorter than its memory not steady.
+      grains: discs of one's own, see ``own_grains``; None for diameters uniform in σ ± ``polydispersity``.
 
     Returns:
       The state after packing, heating, shearing and relaxing.
 
     Raises:
-      ValueError: a grain of thermal speed would cross more than a tenth of a diameter in one step, or float32
-        positions cannot resolve the step.
+      ValueError: the flow is not sheared, a grain of thermal speed would cross more than a tenth of a diameter in one
+        step, float32 positions cannot resolve the step, or the grains are not as ``pack`` accepts them.
       RuntimeError: the flow did not become steady, or ended with a bad status.
     """
     require_flow(flow)
@@ -79,7 +91,11 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None) -> St
     if equilibrate is not None:
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
-    batch = prepare_batch(stack([flow]), key[None], equilibrate)
+    require_sheared(flow)
+    if grains is not None:
+        require_room(flow, grains)
+        grains = jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
+    batch = prepare_batch(stack([flow]), key[None], equilibrate, grains=grains)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
@@ -92,14 +108,18 @@ def prepare_batch(
     equilibrate: float | None = None,
     drive: Drive = advance_batch,
     coarse_timestep: float = COARSE_TIMESTEP,
+    grains: Grains | None = None,
 ) -> Batch:
-    """``prepare`` for a batch of flows: problems are statuses of single replicas, never exceptions."""
-    theory = predicted(flow)
-    check_timestep(flow, theory)
-    state, packed = _start(flow, keys, theory.granular_temperature)
+    """``prepare`` for a batch of flows: problems are statuses of single replicas, never exceptions.
+
+    Grains of one's own have a leading (replicas,) axis like all else.
+    """
+    theory = predicted(flow, grains)
+    check_timestep(flow, theory, grains)
+    state, packed = _start(flow, keys, theory.granular_temperature, grains)
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
-    coarse = replace(flow, timestep=_coarse_timestep(flow, theory, coarse_timestep))
+    coarse = replace(flow, timestep=_coarse_timestep(flow, theory, coarse_timestep, grains))
     batch = Batch(coarse, state, status, np.zeros(len(status)))
     if equilibrate is None:
         batch = _until_steady(batch, theory, drive)
@@ -145,19 +165,37 @@ def sample_batch(
 
 
 @jax.jit
-def predicted(flow: ShearFlow) -> SteadyShear:
-    """Kinetic theory's prediction for every flow of a batch, with α held below 0.99 (where T diverges)."""
+def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
+    """Kinetic theory's prediction for every flow of a batch, with α held below 0.99 (where T diverges).
+
+    Grains of one's own are taken as a mixture of eight classes, by diameter and then by mass.
+    """
     alpha = jnp.minimum(flow.restitution, _ELASTIC)
-    return jax.vmap(gaussian_moments)(alpha, flow.packing_fraction, flow.shear_rate, flow.polydispersity)
+    if grains is None:
+        return jax.vmap(gaussian_moments)(alpha, flow.packing_fraction, flow.shear_rate, flow.polydispersity)
+    return jax.vmap(mixture_moments)(alpha, flow.packing_fraction, flow.shear_rate, *jax.vmap(_classes)(grains))
 
 
-def check_timestep(flow: ShearFlow, theory: SteadyShear) -> None:
-    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step."""
+def _classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
+    """Mean diameters and masses of equal shares of the grains, in the order of their diameters and masses."""
+    order = jnp.lexsort((grains.masses, grains.radii))
+    edges = np.arange(_SIZE_CLASSES + 1) * order.size // _SIZE_CLASSES
+    members = [order[first:last] for first, last in pairwise(edges)]
+    diameters = jnp.stack([2 * jnp.mean(grains.radii[one]) for one in members])
+    return diameters / jnp.mean(diameters), jnp.stack([jnp.mean(grains.masses[one]) for one in members])
+
+
+def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
+    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step.
+
+    Of the default grains it is the mean diameter and the speed of a mean grain; of one's own, those of the grain that
+    is the fastest to cross its own diameter.
+    """
     if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < 0.49 * SHORTEST_TIMESTEP):
         raise InputError(
             f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
         )
-    longest = _CROSSING / _thermal_speed(theory)
+    longest = _CROSSING / _crossing_rate(theory, grains)
     too_long = np.asarray(flow.timestep) > longest
     if np.any(too_long):
         worst = np.argmax(np.asarray(flow.timestep) / longest)
@@ -168,29 +206,61 @@ def check_timestep(flow: ShearFlow, theory: SteadyShear) -> None:
         )
 
 
-def _thermal_speed(theory: SteadyShear) -> np.ndarray:
-    return np.sqrt(2 * np.asarray(theory.granular_temperature))
+def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
+    """Diameters that a grain of thermal speed crosses in a unit of time."""
+    speed = np.sqrt(2 * np.asarray(theory.granular_temperature))
+    return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
 
 
-def _coarse_timestep(flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP) -> Array:
-    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _thermal_speed(theory))
+def _coarse_timestep(
+    flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
+) -> Array:
+    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
     return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 
+def start(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
+    """A random packing with Gaussian velocities of a granular temperature: the beginning of a free cooling, or of any
+    flow that one equilibrates oneself.
+
+    Args:
+      flow: parameters of one flow, sheared or not.
+      key: JAX random key; the same key gives the same state.
+      temperature: Σ m c²/(2N) in mσ²/t², exactly. Grains of all masses have it on average, and no total momentum.
+      grains: discs of one's own, see ``own_grains``; None for diameters uniform in σ ± ``polydispersity``.
+
+    Raises:
+      ValueError: the temperature is not a positive number, or the grains are not as ``pack`` accepts them.
+      RuntimeError: no packing was found.
+    """
+    require_flow(flow)
+    require_key(key)
+    require_number("temperature", temperature, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if grains is not None:
+        require_room(flow, grains)
+        grains = jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
+    state, found = _start(stack([flow]), key[None], jnp.asarray([temperature], float), grains)
+    if not found[0]:
+        raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
+    return jax.tree.map(lambda x: x[0], state)
+
+
 @jax.jit
-def _start(flow: ShearFlow, keys: Array, temperature: Array) -> tuple[State, Bool[Array, " replicas"]]:
+def _start(
+    flow: ShearFlow, keys: Array, temperature: Array, grains: Grains | None = None
+) -> tuple[State, Bool[Array, " replicas"]]:
     """Packings with Gaussian velocities of the given temperature and no total momentum."""
 
-    def one(flow: ShearFlow, key: Array, temperature: Array):
+    def one(flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None):
         pack_key, heat_key = jax.random.split(key)
-        state, found = pack(flow, pack_key)
+        state, found = pack(flow, pack_key, grains)
         masses = state.grains.masses[:, None]
         velocities = jax.random.normal(heat_key, state.positions.shape, masses.dtype) / jnp.sqrt(masses)
         velocities = velocities - jnp.sum(masses * velocities, axis=0, keepdims=True) / jnp.sum(masses)
         now = jnp.sum(masses * velocities**2) / (2 * flow.grains)
         return replace(state, velocities=velocities * jnp.sqrt(temperature / now)), found
 
-    return replicated(one)(flow, keys, temperature)
+    return replicated(one)(flow, keys, temperature, grains)
 
 
 def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally]:

@@ -62,11 +62,16 @@ def snapshot(flow: ShearFlow, state: State) -> Snapshot:
         flow.solver,
         jnp.any(network.approach < 0),
     )
+    restitution = jnp.asarray(flow.restitution, state.side.dtype)
+    return snapshot_of(flow, state, network, (1 + restitution) * solution.impulses, solution.status)
+
+
+def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array) -> Snapshot:
+    """The snapshot of a flow whose contacts have been solved."""
     timestep, shear_rate, restitution = (
         jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
     )
-    impulses = (1 + restitution) * solution.impulses
-    return Snapshot(state, network, impulses, timestep, shear_rate, restitution, solution.status)
+    return Snapshot(state, contacts, impulses, timestep, shear_rate, restitution, status)
 
 
 def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:

@@ -5,7 +5,7 @@ spends its time on them; ``tally`` gives them their names in the end.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +116,7 @@ class Sums(NamedTuple):
     solves           (67,)    networks solved, iterations, unconverged solves, and the counts by residual
     largest          (2,)     (the largest) overlap of a contact and relative residual of a solve
     status           ()       (the worst) status
+    own              pytree   what an observer of the user's has found, see ``observer``; () where there is none
     ===============  =======  =====================================================================================
     """
 
@@ -125,6 +126,7 @@ class Sums(NamedTuple):
     solves: Float[Array, "67"]
     largest: Float[Array, "2"]
     status: Int[Array, ""]
+    own: Any = ()
 
     def tally(self, energy_change: Array, momentum_drift: Array) -> Tally:
         """The tally with its named fields, two of which are known from the ends of the advance."""

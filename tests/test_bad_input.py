@@ -24,7 +24,7 @@ from test_cli import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_
 from test_figures import ratio_dataset, with_timesteps
 
 import jaxgran as jg
-from jaxgran import fields, measure, protocol, snapshots, sweep
+from jaxgran import fields, free_cooling, measure, protocol, snapshots, sweep
 from jaxgran import settings as map_settings
 from jaxgran.flow import InputError
 from jaxgran.status import Status
@@ -59,6 +59,8 @@ def nothing_runs() -> Iterator[None]:
             (snapshots, "_snapshot_series"),
             (fields, "_fields_at"),
             (protocol, "prepare_batch"),
+            (protocol, "_start"),
+            (free_cooling, "_cooling"),
             (sweep, "replicas"),
         ):
             patch.setattr(module, name, would_run)
@@ -110,6 +112,10 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "prepare equilibrate": lambda x: jg.prepare(flow(), KEY, x),
     "sample strain": lambda x: jg.sample(flow(), SEEN.state, x),
     "sample blocks": lambda x: jg.sample(flow(), SEEN.state, 1.0, x),
+    "start temperature": lambda x: jg.start(flow(), KEY, x),
+    "own_grains diameters": jg.own_grains,
+    "own_grains masses": lambda x: jg.own_grains([1.0, 2.0], x),
+    "cooling times": lambda x: jg.cooling(jg.ShearFlow(**FLOW, shear_rate=0.0), SEEN.state, x),
     "snapshot_series strain": lambda x: jg.snapshot_series(flow(), SEEN.state, x, 4),
     "snapshot_series count": lambda x: jg.snapshot_series(flow(), SEEN.state, 1.0, x),
     "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.lucy(1.0)),
@@ -125,6 +131,13 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "pack key": lambda x: jg.pack(flow(), x),
     "prepare flow": lambda x: jg.prepare(x, KEY),
     "prepare key": lambda x: jg.prepare(flow(), x),
+    "prepare grains": lambda x: jg.prepare(flow(), KEY, grains=x),
+    "pack grains": lambda x: jg.pack(flow(), KEY, x),
+    "start grains": lambda x: jg.start(flow(), KEY, grains=x),
+    "cooling flow": lambda x: jg.cooling(x, SEEN.state, [1.0]),
+    "cooling state": lambda x: jg.cooling(flow(), x, [1.0]),
+    "sample observe": lambda x: jg.sample(flow(), SEEN.state, 1.0, observe=x),
+    "sample callback": lambda x: jg.sample(flow(), SEEN.state, 1.0, callback=x),
     "sample flow": lambda x: jg.sample(x, SEEN.state, 1.0),
     "sample state": lambda x: jg.sample(flow(), x, 1.0),
     "advance flow": lambda x: jg.advance(x, SEEN.state, 1),

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran.flow import MAX_PACKING_FRACTION, MIN_GRAINS, ShearFlow
+from jaxgran.flow import MAX_PACKING_FRACTION, MIN_GRAINS, InputError, ShearFlow, require_sheared
 
 FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
 NUMBERS = (
@@ -29,7 +29,7 @@ RANGES = {
     "restitution": "between 0 and 1",
     "packing_fraction": "above 0 and at most 0.83",
     "timestep": "a positive number",
-    "shear_rate": "a positive number",
+    "shear_rate": "a number of at least 0",
     "polydispersity": "between 0 and 0.5",
     "tolerance": "between 1e-12 and 0.1",
     "max_iterations": "a whole number of at least 1",
@@ -52,7 +52,7 @@ def refusal(**change) -> str:
         *[("restitution", value) for value in (-1e-9, 1.1, np.inf)],
         *[("packing_fraction", value) for value in (0.0, -0.5, 0.831, 1.0)],
         *[("timestep", value) for value in (0.0, -1e-3, np.inf)],
-        *[("shear_rate", value) for value in (0.0, -1.0, np.inf)],
+        *[("shear_rate", value) for value in (-1e-9, -1.0, np.inf)],
         *[("polydispersity", value) for value in (-0.1, 0.51)],
         *[("tolerance", value) for value in (0.0, 1e-13, 0.2)],
         *[("max_iterations", value) for value in (0, -1, 2**31, 2.5)],
@@ -96,6 +96,15 @@ def test_every_value_of_the_ranges_is_accepted(grains, restitution, packing_frac
 def test_faster_shear_needs_a_shorter_step():
     replace(FLOW, timestep=0.2, shear_rate=0.5)
     replace(FLOW, timestep=0.1)
+
+
+def test_a_flow_may_be_without_shear():
+    assert replace(FLOW, shear_rate=0.0, timestep=7.0).shear_rate == 0
+    for flow in (FLOW, replace(FLOW, shear_rate=jnp.array([1.0, 2.0]))):
+        require_sheared(flow)
+    for rate in (0.0, np.array([1.0, 0.0])):
+        with pytest.raises(InputError, match="shear_rate must be above 0 where strain is counted"):
+            require_sheared(replace(FLOW, shear_rate=rate))
 
 
 def test_flow_is_a_pytree_of_its_numbers():

@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxgran.grains import polydisperse
+from jaxgran.flow import InputError
+from jaxgran.grains import own_grains, polydisperse
 
 EPS = np.finfo(float).eps
 
@@ -28,3 +29,25 @@ def test_key_permutes_the_sizes_and_nothing_else():
     assert np.mean(one == two) < 0.2
     neighbours = np.corrcoef(one[1:], one[:-1])[0, 1]
     assert abs(neighbours) < 4 / np.sqrt(63)  # standard error of a correlation of independent numbers
+
+
+def test_own_grains_are_in_units_of_their_mean_diameter_and_weigh_what_they_are_given():
+    diameters = np.array([2.0, 4.0, 6.0])
+    grains = own_grains(diameters)
+    np.testing.assert_allclose(2 * grains.radii, [0.5, 1.0, 1.5])
+    np.testing.assert_allclose(grains.masses, [0.25, 1.0, 2.25])
+    np.testing.assert_array_equal(own_grains([2, 4, 6], [7, 8, 9]).masses, [7.0, 8.0, 9.0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([1.0, -1.0],), "diameters must be a list of positive numbers"),
+        (([[1.0, 2.0]],), "diameters must be a list of positive numbers"),
+        (([1.0, 2.0], [1.0, np.inf]), "masses must be a list of positive numbers"),
+        (([1.0, 2.0], [1.0]), "as many masses as diameters, and there are 1 and 2"),
+    ],
+)
+def test_what_can_be_no_grains_is_refused_in_one_sentence(arguments, words):
+    with pytest.raises(InputError, match=words):
+        own_grains(*arguments)

@@ -197,7 +197,7 @@ def test_prepare_refuses_a_time_step_too_long_for_its_flow() -> None:
 
 def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = batch._replace(status=np.array([Status.not_steady]))
-    monkeypatch.setattr(protocol, "prepare_batch", lambda *_: bad)
+    monkeypatch.setattr(protocol, "prepare_batch", lambda *_, **__: bad)
     with pytest.raises(RuntimeError, match="not_steady"):
         prepare(FLOWS[0], jax.random.key(0))
 

@@ -1,0 +1,214 @@
+"""Any sizes and masses: packed without overlap, no contact missed, heated as theory says; masses are but a unit."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import gaps_of
+from scipy.stats import norm
+from synthetic import one_sentence
+from test_pairs import build, listed_pairs, move, pairs_within
+
+from jaxgran.cell import cell_side
+from jaxgran.dynamics import State
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.grains import Grains, own_grains, polydisperse
+from jaxgran.kinetic_theory import gaussian_moments, mixture_moments
+from jaxgran.packing import pack, require_room
+from jaxgran.pairs import widest_skin
+from jaxgran.protocol import _classes, predicted, prepare, start
+from jaxgran.status import Status
+
+GRAINS = pytest.GRAINS
+EVEN = np.arange(GRAINS) % 2 == 0
+LAWS = {
+    "1 to 1.4": np.where(EVEN, 1.0, 1.4),
+    "1 to 3": np.where(EVEN, 1.0, 3.0),
+    "1 to 5": np.where(EVEN, 1.0, 5.0),
+    "one of 2.5": np.where(np.arange(GRAINS) == 7, 2.5, 1.0),
+    "lognormal": np.exp(0.5 * norm.ppf((np.arange(GRAINS) + 0.5) / GRAINS)),
+}
+
+
+def flow_of(packing_fraction: float = 0.7, **change) -> ShearFlow:
+    return replace(ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3, tolerance=1e-10), **change)
+
+
+@pytest.fixture(scope="module")
+def packed_own():
+    """``packed_own(law, packing_fraction)``: a packing at rest; ``packed_own.compiled`` is ``pack``."""
+    compiled = jax.jit(pack)
+
+    @cache
+    def packing(law: str, packing_fraction: float) -> State:
+        state, found = compiled(flow_of(packing_fraction), jax.random.key(0), own_grains(LAWS[law]))
+        assert found
+        return state
+
+    packing.compiled = compiled
+    return packing
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.8])
+def test_packing_has_the_grains_no_overlap_and_the_packing_fraction(packed_own, law, packing_fraction):
+    state = packed_own(law, packing_fraction)
+    side, radii = float(state.side), np.asarray(state.grains.radii)
+    np.testing.assert_allclose(2 * radii, LAWS[law] / LAWS[law].mean(), rtol=1e-14)
+    assert np.min(gaps_of(state.positions, radii, side, 0.0)) >= 0
+    assert np.sum(np.pi * radii**2) / side**2 == pytest.approx(packing_fraction, rel=1e-13)
+
+
+@pytest.mark.parametrize("law", ["1 to 3", "1 to 5", "one of 2.5", "lognormal"])
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.8])
+def test_valid_list_misses_no_touching_pair(packed_own, law, packing_fraction):
+    """Under random motion and shear over several remaps of the tilt, against brute force over all pairs and images."""
+    state, rng = packed_own(law, packing_fraction), np.random.default_rng(1)
+    side, radii = float(state.side), np.asarray(state.grains.radii)
+    hood, touching, rebuilds = build(state.positions, state.grains, state.side, state.tilt), 0, 0
+    for _ in range(80):
+        moves = 0.04 * rng.normal(size=state.positions.shape)
+        hood, rebuilt, positions, tilt = move(hood, state.grains, state.side, moves, jnp.asarray(0.03))
+        assert not (hood.near.overflow | hood.outer.overflow)
+        touch = pairs_within(0, positions, radii, side, tilt)
+        assert touch <= listed_pairs(hood.near)
+        touching, rebuilds = touching + len(touch), rebuilds + bool(rebuilt)
+    assert touching > 20 and rebuilds >= 2
+
+
+@pytest.mark.parametrize("law", ["1 to 3", "1 to 5", "lognormal"])
+def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_own, run, law):
+    state, rng = packed_own(law, 0.8), np.random.default_rng(0)
+    masses = np.where(EVEN, 3.0, 0.05)  # small and heavy, large and hollow
+    velocities = rng.normal(size=(GRAINS, 2)) / np.sqrt(masses)[:, None]
+    velocities -= masses @ velocities / masses.sum()
+    start = replace(state, grains=Grains(state.grains.radii, jnp.asarray(masses)), velocities=jnp.asarray(velocities))
+    end, tally = run(flow_of(0.8, timestep=1e-4), start, 2000)
+    gaps = gaps_of(end.positions, end.grains.radii, float(end.side), float(end.tilt))
+    assert np.min(gaps) > -1e-2 and tally.collisions > 100
+    assert tally.status in (Status.ok, Status.iteration_limit)
+    assert tally.momentum_drift < 1e-12
+    work = -tally.contact_moment[0, 1] - tally.kinetic_moment[0, 1]
+    assert work - tally.dissipation == pytest.approx(float(tally.energy_change), abs=1e-9 * float(tally.dissipation))
+
+
+def test_masses_are_a_unit(packed_own, run):
+    """Twice the masses: the same motion to the bit, and twice the impulses."""
+    state = packed_own("1 to 3", 0.8)
+    state = replace(state, velocities=jnp.asarray(np.random.default_rng(2).normal(size=(GRAINS, 2))))
+    heavy = replace(state, grains=Grains(state.grains.radii, 2 * state.grains.masses))
+    (end, tally), (heavy_end, heavy_tally) = (run(flow_of(0.8), one, 500) for one in (state, heavy))
+    np.testing.assert_array_equal(heavy_end.positions, end.positions)
+    np.testing.assert_array_equal(heavy_end.velocities, end.velocities)
+    np.testing.assert_array_equal(heavy_tally.contact_moment, 2 * tally.contact_moment)
+    assert tally.solves > 50
+
+
+def test_a_small_heavy_disc_throws_a_large_hollow_one(run, scene):
+    before = scene([[5.0, 4.0], [6.0 + 5e-4, 4.0]], [[2.0, 0.0], [0.0, 0.0]], radii=[0.25, 0.75])
+    masses = np.ones(GRAINS)
+    masses[:2] = 3.0, 0.5
+    before = replace(before, grains=Grains(before.grains.radii, jnp.asarray(masses)))
+    after, tally = run(flow_of(0.02), before, 1)
+    laboratory = np.asarray(after.velocities)[:2, 0] + 4.0
+    centre = 6.0 / 3.5  # u⁺ = −α u⁻ about the centre of mass
+    np.testing.assert_allclose(laboratory, [centre - 0.6 * 0.5 / 3.5 * 2, centre + 0.6 * 3.0 / 3.5 * 2], rtol=1e-12)
+    assert tally.collisions == 1
+
+
+def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
+    grains = own_grains(LAWS["1 to 3"], np.where(EVEN, 3.0, 0.05))
+    flow = flow_of(timestep=1e-3)
+    state = start(flow, jax.random.key(1), 0.25, grains)
+    masses, velocities = np.asarray(grains.masses)[:, None], np.asarray(state.velocities)
+    assert np.sum(masses * velocities**2) / (2 * GRAINS) == pytest.approx(0.25, rel=1e-12)
+    np.testing.assert_allclose(np.sum(masses * velocities, axis=0), 0, atol=1e-12)
+    prepared = prepare(flow, jax.random.key(1), equilibrate=0.05, grains=grains)
+    for one in (state, prepared):
+        np.testing.assert_array_equal(one.grains.radii, grains.radii)
+        np.testing.assert_array_equal(one.grains.masses, grains.masses)
+    assert prepared.tilt != 0 and np.all(np.isfinite(prepared.velocities))
+
+
+def test_theory_of_given_grains_is_that_of_their_law():
+    """Eight classes of uniform diameters stand for the law as its quadrature does; masses are a unit."""
+    grains = polydisperse(256, 0.26, jax.random.key(0))
+    diameters, masses = _classes(grains)
+    given = mixture_moments(0.8, 0.6, 1.0, diameters, masses)
+    law = gaussian_moments(0.8, 0.6, 1.0, 0.26)
+    doubled = mixture_moments(0.8, 0.6, 1.0, diameters, 2 * masses)
+    for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
+        assert getattr(given, name) == pytest.approx(float(getattr(law, name)), rel=1e-2)
+        unit = 1 if name == "collision_rate" else 2
+        assert getattr(doubled, name) == pytest.approx(unit * float(getattr(given, name)), rel=1e-6)
+
+
+def test_theory_of_unlike_masses_is_finite_at_every_restitution():
+    batch = jax.tree.map(lambda x: x[None], own_grains(LAWS["1 to 5"], np.where(EVEN, 10.0, 0.01)))
+    for alpha in (0.0, 0.5, 1.0):
+        flow = jax.tree.map(lambda x: jnp.asarray([x], float), flow_of(restitution=alpha))
+        assert np.all(np.asarray(predicted(flow, batch).granular_temperature) > 0)
+
+
+@pytest.mark.parametrize("ratio", [3.0, 5.0])
+def test_cell_lists_of_unlike_grains_are_complete_or_flagged(ratio):
+    """Six hundred grains at random places, found through cells, against brute force."""
+    grains = own_grains(np.where(np.arange(600) % 2, 1.0, ratio))
+    radii = np.asarray(grains.radii)
+    for packing_fraction in (0.1, 0.8):
+        side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
+        positions = np.random.default_rng(0).uniform(0, side, (600, 2))
+        hood = build(jnp.asarray(positions), grains, jnp.asarray(side), jnp.asarray(0.3))
+        for listed in (hood.outer, hood.near):
+            assert not listed.overflow and listed.skin > 0.05
+            assert pairs_within(float(listed.skin) - 1e-12, positions, radii, side, 0.3) == listed_pairs(listed)
+
+
+def test_a_packing_of_grains_too_large_for_the_cell_is_not_found_where_they_are_traced(packed_own):
+    _, found = packed_own.compiled(
+        flow_of(0.8), jax.random.key(0), own_grains(np.where(np.arange(GRAINS) == 7, 5.0, 1.0))
+    )
+    assert not found
+
+
+@pytest.mark.parametrize("count", [256, 1000])
+def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_that_is_accepted(count):
+    def with_one(diameter: float) -> Grains:
+        return own_grains(np.append(np.ones(count - 1), diameter))
+
+    def relative(grains: Grains) -> float:
+        radii = np.asarray(grains.radii)
+        return float(np.max(radii) / np.sqrt(np.mean(radii**2)))
+
+    flow = ShearFlow(count, 0.5, 0.8, 1e-3)
+    with pytest.raises(InputError, match="the largest diameter must be at most") as caught:
+        require_room(flow, with_one(30.0))
+    assert one_sentence(str(caught.value))
+    limit = float(re.search(r"at most ([\d.]+) times", str(caught.value))[1])
+    below = max((with_one(d) for d in np.arange(1.0, 30.0, 0.1) if relative(with_one(d)) < 0.95 * limit), key=relative)
+    require_room(flow, below)
+    assert relative(below) > 0.8 * limit
+    side = cell_side(below.radii, flow.packing_fraction)
+    assert float(widest_skin(below, side)) >= 0.2
+
+
+@pytest.mark.parametrize(
+    ("grains", "words"),
+    [
+        (own_grains(np.ones(GRAINS + 1)), "radii and masses of 32 discs"),
+        (Grains(jnp.full(GRAINS, 0.35), jnp.ones(GRAINS)), "mean diameter must be 1, the unit of length, not 0.7"),
+        (Grains(jnp.full(GRAINS, 0.5), jnp.zeros(GRAINS)), "masses must be a list of positive numbers"),
+        (Grains(jnp.full(GRAINS, jnp.nan), jnp.ones(GRAINS)), "radii must be a list of positive numbers"),
+        (Grains(jnp.full(GRAINS, 0.5), jnp.ones(3)), "of shapes"),
+        (0.5, "grains must be Grains"),
+    ],
+)
+def test_grains_that_are_not_the_flows_are_refused_in_one_sentence(grains, words):
+    for function in (pack, prepare, start):
+        with pytest.raises(InputError, match=words) as caught:
+            function(flow_of(), jax.random.key(0), grains=grains)
+        assert one_sentence(str(caught.value))
