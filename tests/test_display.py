@@ -135,7 +135,11 @@ def test_what_values_hold_is_escaped() -> None:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize("leaf", [None, object(), jax.ShapeDtypeStruct((3,), float), 3, "x"], ids=repr)
+@pytest.mark.parametrize(
+    "leaf",
+    [None, object(), jax.ShapeDtypeStruct((3,), float), 3, "x"],
+    ids=["None", "object", "shape", "number", "text"],
+)
 def test_whatever_stands_in_the_place_of_a_number_is_shown(name: str, leaf) -> None:
     """JAX fills its trees with axes, shapes and placeholders."""
     odd = jax.tree.map(lambda _: leaf, MADE[name]())
