@@ -38,7 +38,7 @@ def main() -> None:
     grains, seeds, latest = (256, 2, 300.0) if chosen.quick else (1600, 3, 3000.0)
     times = np.geomspace(0.2, latest, 40)
     flow = jg.ShearFlow(grains, 1.0, NU, TIMESTEP, shear_rate=0.0, polydispersity=0.0)
-    gases = [jg.cooling(flow, jg.start(flow, jax.random.key(seed)), EQUILIBRATION)[0] for seed in range(seeds)]
+    gases = [jg.cooling(flow, jg.heated(flow, jax.random.key(seed)), EQUILIBRATION)[0] for seed in range(seeds)]
     rows, last = [], None
     for alpha in ALPHAS:
         runs = [jg.cooling(replace(flow, restitution=alpha), gas, times) for gas in gases]

@@ -38,7 +38,6 @@ LARGE_FLOW = (0.8, 0.6)  # restitution, packing fraction
 DENSE_FLOW = (0.5, 0.8)
 STRAIN = 0.1  # of a timing
 LINEAR_FROM = 1000  # grains: smaller flows have steps without a contact, which cost nothing
-LIMITS = {"grains": 1.1}
 
 
 def main() -> None:
@@ -227,8 +226,7 @@ def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
 
 def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str, float]) -> None:
     for name, value in found.items():
-        promised = f" (at most {LIMITS[name]:g} promised)" if name in LIMITS else ""
-        print(f"exponent of the cost against {name}: {value:.3f}{promised}")
+        print(f"exponent of the cost against {name}: {value:.3f}")
     first, last = rows["grains"][0], rows["grains"][-1]
     resident = (last["peak resident MiB"] - first["peak resident MiB"]) * 2**20 / (last["grains"] - first["grains"])
     print(

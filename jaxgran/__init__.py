@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jaxgran.grains import Grains, own_grains, polydisperse
     from jaxgran.measure import Sample, sample
     from jaxgran.packing import pack
-    from jaxgran.protocol import prepare, start
+    from jaxgran.protocol import heated, prepare
     from jaxgran.rheology import friction_law
     from jaxgran.rheology_figures import friction_figure
     from jaxgran.snapshots import Snapshot, snapshot_series
@@ -58,7 +58,7 @@ _HOME = {
     "Sample": "measure",
     "sample": "measure",
     "prepare": "protocol",
-    "start": "protocol",
+    "heated": "protocol",
     "Cooling": "free_cooling",
     "cooling": "free_cooling",
     "ratio_map": "sweep",
@@ -112,6 +112,7 @@ __all__ = [
     "friction_figure",
     "friction_law",
     "gaussian",
+    "heated",
     "heaviside",
     "lucy",
     "own_grains",
@@ -128,7 +129,6 @@ __all__ = [
     "sample",
     "save_figures",
     "snapshot_series",
-    "start",
     "theory_errors",
 ]
 

@@ -65,6 +65,8 @@ def _shared_out(together: Callable, devices: list[jax.Device]) -> Callable:
 
     def shared_out(*arguments):
         count = len(jax.tree.leaves(arguments)[0])
+        if count == 1:
+            return together(*arguments)
         places = np.arange(-(-count // len(devices)) * len(devices)) % count
         filled = jax.tree.map(lambda x: x[places], arguments)
         return jax.tree.map(lambda x: x[:count], shares(*filled))

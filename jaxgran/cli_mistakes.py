@@ -49,7 +49,8 @@ def _words(mistake: Any, arguments: list[str]) -> str:
     parameter, option = getattr(mistake, "param", None), getattr(mistake, "option_name", None)
     if words.startswith("No such option") and option is not None:
         known = [one for one in (mistake.possibilities or []) if one != "--help"]
-        meant = _MEANT.get(option, known[0] if known else None)
+        accepted = {name for one in mistake.ctx.command.params for name in one.opts}
+        meant = _MEANT[option] if _MEANT.get(option) in accepted else next(iter(known), None)
         return f"there is no option {option}" + (f", perhaps {meant} is meant" if meant else "")
     if words.startswith("Missing") and parameter is not None:
         return f"{parameter.opts[0] if parameter.opts[0].startswith('-') else parameter.name.upper()} must be given"

@@ -15,7 +15,7 @@ from jaxgran.flow import InputError, require_number, shown
 from jaxgran.progress import counted
 from jaxgran.terminal import configured_jax, print_table, say, with_error
 
-MOST_FRAMES = 100_000  # of a trajectory
+MOST_RECORDED = 100_000  # of a trajectory
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
@@ -34,7 +34,8 @@ def run_command(
     timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
     every: Annotated[
-        float | None, typer.Option(help="Strain from frame to frame. [default: a hundredth of the sampled strain]")
+        float | None,
+        typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.04 with --error]"),
     ] = None,
     movie: Annotated[
         Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
@@ -46,13 +47,14 @@ def run_command(
     step = numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
+    first = first_strain(strain, error)
     chosen = {
         "restitution": (restitution,),
         "packing_fraction": (packing_fraction,),
         "grains": grains,
         "seeds": 1,
         "timestep": step,
-        "strain": first_strain(strain, error) or 5.0,
+        "strain": 5.0 if first is None else first,
         "error": error,
     }
     recorder, frames = _recorder(trajectory, movie, every, chosen["strain"])
@@ -76,13 +78,12 @@ def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, 
             )
         return None, None
     configured_jax()
-    from jaxgran.movie import MOST_FRAMES as MOST_OF_A_MOVIE
-    from jaxgran.movie import Frames, check_movie
+    from jaxgran.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.recorder import Recorder
     from jaxgran.trajectory import check_trajectory, write_frame
 
     if every is not None:
-        most_frames = MOST_FRAMES if movie is None else MOST_OF_A_MOVIE
+        most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
         least, most = strain / most_frames, strain
         words = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
         require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxgran.status import Status
@@ -77,81 +76,29 @@ def _numbers(value: Any) -> np.ndarray | None:
     return array if array.dtype.kind in "iuf" else None
 
 
-def _methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
+def methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
     """The methods ``__repr__`` and ``_repr_html_`` of a class, from a function that lists the rows of an object."""
     return lambda self: text_of(title, rows(self)), lambda self: html_of(title, rows(self), _UNITS)
 
 
-_UNITS = "σ mean diameter, m mass of a grain of that diameter, γ̇ shear rate"
-_FLOW_UNITS = {"timestep": "1/γ̇", "shear_rate": "1/t", "polydispersity": "σ"}
-_SAMPLE_UNITS = {
-    "force_ratio": "",
-    "pressure": "m/t²",
-    "shear_stress": "m/t²",
-    "granular_temperature": "mσ²/t²",
-    "coordination_number": "",
-    "macroscopic_friction": "",
-    "inertial_number": "",
-}
+_UNITS = (
+    "σ mean diameter, m mass of a grain of that diameter unless grains have their own, t unit of time (1/γ̇ at γ̇ = 1)"
+)
 
 
-def _flow_rows(flow: Any) -> list[Row]:
-    return [Row(name, getattr(flow, name), _FLOW_UNITS.get(name, "")) for name in flow.__dataclass_fields__]
-
-
-def _state_rows(state: Any) -> list[Row]:
-    known = _arrays(state.grains.radii, state.grains.masses, state.velocities)
-    if not known or known[-1].ndim < 2:
-        return [Row("positions", state.positions), Row("side", state.side, "σ"), Row("tilt", state.tilt)]
-    radii, masses, velocities = known
-    *replicas, grains, _ = velocities.shape
-    temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
-    return [
-        *[Row("replicas", count) for count in replicas],
-        Row("grains", grains),
-        Row("packing_fraction", _rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2)),
-        Row("granular_temperature", _rounded(temperature), "mσ²γ̇²"),
-        Row("side", _rounded(state.side), "σ"),
-        Row("tilt", _rounded(state.tilt)),
-        Row("precision", str(velocities.dtype)),
-    ]
-
-
-def _sample_rows(sample: Any) -> list[Row]:
-    known = _arrays(*vars(sample.tally).values(), sample.area, sample.shear_rate)
-    if not known or np.ndim(sample.tally.contact_moment) < 3:
-        return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
-    here = jax.tree.map(np.asarray, sample)
-    averages, one = here.averages, here.area.ndim == 0
-    errors = here.errors() if one else {}
-    sums = here._total
-    return [
-        *[Row("replicas", count) for count in here.area.shape],
-        Row("grains", here.grains),
-        Row("strain", _rounded(sums.duration * here.shear_rate)),
-        *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _SAMPLE_UNITS.items()),
-        Row("status", _statuses(here.status)),
-    ]
-
-
-def _statuses(codes: np.ndarray) -> str:
+def statuses(codes: np.ndarray) -> str:
     """The name of a status, or how many there are of each."""
     names = Counter(Status(int(code)).name for code in np.ravel(codes))
     return ", ".join(name if np.ndim(codes) == 0 else f"{name} ({count})" for name, count in names.most_common())
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """A number to six digits, as no more of a measured one is of interest; many numbers as they are."""
     return float(f"{float(value):.6g}") if np.ndim(value) == 0 else value
 
 
-def _arrays(*leaves: Any) -> list[np.ndarray]:
+def arrays(*leaves: Any) -> list[np.ndarray]:
     """The leaves as arrays; none at all where one is traced or stands in the place of a number."""
     found = [_numbers(leaf) for leaf in leaves]
     known = [x for x in found if x is not None]
     return known if len(known) == len(found) else []
-
-
-OF_FLOW = _methods("ShearFlow", _flow_rows)
-OF_STATE = _methods("State", _state_rows)
-OF_SAMPLE = _methods("Sample", _sample_rows)

@@ -19,13 +19,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.cell import relative_velocity
 from jaxgran.contacts import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.delassus import grain_impulses, in_clusters
-from jaxgran.display import OF_STATE
+from jaxgran.display import Row, arrays, methods, rounded
 from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, require_flow, require_number, require_whole
 from jaxgran.grains import Grains
 from jaxgran.observer import Look, nothing_observed, with_contacts, with_flight
@@ -50,6 +51,24 @@ _FEW_RUNGS = 3  # of the contact buffers, where derivatives are compiled along
 _LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
 
 
+def _rows(state: "State") -> list[Row]:
+    known = arrays(state.grains.radii, state.grains.masses, state.velocities)
+    if not known or known[-1].ndim < 2:
+        return [Row("positions", state.positions), Row("side", state.side, "σ"), Row("tilt", state.tilt)]
+    radii, masses, velocities = known
+    *replicas, grains, _ = velocities.shape
+    temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
+    return [
+        *[Row("replicas", count) for count in replicas],
+        Row("grains", grains),
+        Row("packing_fraction", rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2)),
+        Row("granular_temperature", rounded(temperature), "mσ²/t²"),
+        Row("side", rounded(state.side), "σ"),
+        Row("tilt", rounded(state.tilt)),
+        Row("precision", str(velocities.dtype)),
+    ]
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class State:
@@ -72,7 +91,7 @@ class State:
     side: Float[Array, ""]
     tilt: Float[Array, ""]
 
-    __repr__, _repr_html_ = OF_STATE
+    __repr__, _repr_html_ = methods("State", _rows)
 
 
 def require_state(flow: ShearFlow, state: State) -> None:

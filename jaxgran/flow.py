@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.display import OF_FLOW
+from jaxgran.display import Row, methods
 
 Activation = Literal["midpoint", "touching"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
@@ -26,6 +26,13 @@ class InputError(ValueError):
 
 
 _STATIC = {"static": True}
+
+
+_UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
+
+
+def _rows(flow: "ShearFlow") -> list[Row]:
+    return [Row(name, getattr(flow, name), _UNITS.get(name, "")) for name in flow.__dataclass_fields__]
 
 
 @dataclass(frozen=True)
@@ -69,7 +76,7 @@ class ShearFlow:
     activation: Activation = field(default="midpoint", metadata=_STATIC)
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
 
-    __repr__, _repr_html_ = OF_FLOW
+    __repr__, _repr_html_ = methods("ShearFlow", _rows)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")

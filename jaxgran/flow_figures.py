@@ -66,9 +66,8 @@ class Scene(NamedTuple):
     restitution        ()           –      α
     packing_fraction   ()           –      ν
     timestep           ()           1/γ̇    dt
-    step               ()           –      strain of a time step
     times              ()           –      snapshots in the window
-    window             ()           –      strain that passes in it
+    window             ()           –      strain that passes in it, less whole numbers between two snapshots
     =================  ===========  =====  =======================================================
     """
 
@@ -85,7 +84,6 @@ class Scene(NamedTuple):
     restitution: float
     packing_fraction: float
     timestep: float
-    step: float
     times: int
     window: float
 
@@ -139,22 +137,24 @@ def scene_of(seen: Snapshot) -> Scene:
     side, tilt = state.side[middle].item(), state.tilt[middle].item()
     places = centred(positions, side, tilt)
     pushed = sum(np.bincount(grain, pairs.force, minlength=len(radii)) for grain in (pairs.i, pairs.j))
-    step = (frames.timestep * frames.shear_rate)[middle].item()
+    rate = frames.shear_rate[middle].item()
+    if not rate > 0:
+        raise InputError("seen must be of a sheared flow: its shear rate is the unit of the picture.")
+    step = frames.timestep[middle].item() * rate
     return Scene(
         centres=places,
         radii=radii,
-        speed=np.hypot(*velocities.T),
-        pressure=pushed / (2 * np.pi * radii),
+        speed=np.hypot(*velocities.T) / rate,
+        pressure=pushed / (2 * np.pi * radii) / rate**2,
         starts=places[pairs.j],
         branches=minimum_image(positions[pairs.i] - positions[pairs.j], side, tilt),
-        force=pairs.force,
+        force=pairs.force / rate**2,
         clustered=pairs.cluster_share > 0.5,
         side=side,
         tilt=tilt,
         restitution=frames.restitution[middle].item(),
         packing_fraction=float(np.sum(np.pi * radii**2) / side**2),
-        timestep=frames.timestep[middle].item(),
-        step=step,
+        timestep=step,
         times=times,
         window=times * (step if times == 1 else float(np.mean(np.diff(state.tilt) % 1))),
     )
@@ -279,7 +279,7 @@ def title_of(scene: Scene, strain: float | None = None) -> str:
     ]
     if strain is not None:
         parts.append(f"strain {strain:.3f}")
-    every_step = abs(scene.window / (scene.times * scene.step) - 1) < 1e-3
-    window = f"{scene.times} {'time steps' if every_step else 'snapshots'}, a strain of {scene.window:.3g}"
+    every_step = abs(scene.window / (scene.times * scene.timestep) - 1) < 1e-3
+    window = f"{scene.times} time steps, a strain of {scene.window:.3g}" if every_step else f"{scene.times} snapshots"
     forces = "forces of one time step" if scene.times == 1 else f"mean forces over {window}"
     return f"{', '.join(parts)}\n{forces}"

@@ -22,6 +22,7 @@ from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, listed, require, two_
 from jaxgran.tally import Tally
 
 _CROSSING = 0.1  # of its diameter that a grain of thermal speed may cross in one step
+_ROUNDING_STEPS = 20  # roundings of a position that such a grain must cross in one, at the start
 
 
 @jax.tree_util.register_dataclass
@@ -54,16 +55,16 @@ def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Coo
     """Let a flow without shear go for a while, and record how it cools; ``jit``, ``vmap`` and ``lax.map`` apply.
 
         flow = jg.ShearFlow(256, restitution=0.9, packing_fraction=0.3, timestep=1e-3, shear_rate=0.0)
-        state = jg.start(flow, jax.random.key(0), temperature=1.0)
+        state = jg.heated(flow, jax.random.key(0), temperature=1.0)
         state, _ = jg.cooling(replace(flow, restitution=1.0), state, [10.0])  # a gas in equilibrium
         state, cooled = jg.cooling(flow, state, np.geomspace(0.1, 1000, 40))
 
     The time step stays as it is while the grains slow down; it costs nothing, since steps without a contact are jumped
-    over.
+    over. In float32 a step of slow grains is lost in rounding at last: use float64 for long coolings.
 
     Args:
       flow: parameters, those of the state, with ``shear_rate`` zero.
-      state: the flow at the beginning, best from ``start`` and some collisions at restitution one.
+      state: the flow at the beginning, best from ``heated`` and some collisions at restitution one.
       times: (times,) increasing times since the beginning at which it is looked at, rounded to whole time steps.
 
     Returns:
@@ -122,6 +123,12 @@ def _require_slow(flow: ShearFlow, state: State) -> None:
         return
     diameters, masses = 2 * np.asarray(state.grains.radii), np.asarray(state.grains.masses)
     speeds = np.sqrt(2 * float(_temperature(state)) / masses)
+    rounding = float(np.finfo(state.positions.dtype).eps * np.max(np.asarray(state.side)))
+    if float(np.asarray(flow.timestep) * np.max(speeds)) < _ROUNDING_STEPS * rounding:
+        raise InputError(
+            f"timestep must be longer for positions in {state.positions.dtype}, or a step would be lost in their "
+            'rounding: use a longer one, or float64 (jax.config.update("jax_enable_x64", True)).'
+        )
     with np.errstate(divide="ignore"):
         longest = _CROSSING * float(np.min(diameters / speeds))
     if float(np.asarray(flow.timestep)) > longest:

@@ -54,10 +54,11 @@ def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grain
 
 
 def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
-    """Discs of any diameters and masses, for ``prepare``, ``start`` and ``pack``.
+    """Discs of any diameters and masses, for ``prepare``, ``heated`` and ``pack``.
 
     Lengths are in mean diameters, so the diameters are divided by their mean. Masses stay as they are: what is given is
-    in the unit m of all stresses and temperatures. Half of a bidisperse packing hollow, and its small grains heavy:
+    in the unit m of all stresses and temperatures, which the inertial number and Bagnold's coefficients take for the
+    mass of a grain. Half of a bidisperse packing hollow, and its small grains heavy:
 
         diameters = np.repeat([1.0, 1.4], 128)
         grains = jg.own_grains(diameters, masses=np.where(np.arange(256) % 2, 0.1, 1.0))

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contacts import Contacts
-from jaxgran.display import OF_SAMPLE
+from jaxgran.display import Row, arrays, methods, rounded, statuses
 from jaxgran.dynamics import State, advance, advance_observed, require_state
 from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, shown, two_digits
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
@@ -25,6 +25,34 @@ from jaxgran.tally import Tally
 BLOCKS, MOST_BLOCKS = 32, 10**6
 ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # those that a relative error is asked for
 _ROUNDING_STEPS = 20  # a grain at shear velocity must move by that many roundings of a position in one step
+
+
+_SHOWN = {
+    "force_ratio": "",
+    "pressure": "m/t²",
+    "shear_stress": "m/t²",
+    "granular_temperature": "mσ²/t²",
+    "coordination_number": "",
+    "macroscopic_friction": "",
+    "inertial_number": "",
+}
+
+
+def _rows(sample: "Sample") -> list[Row]:
+    known = arrays(*vars(sample.tally).values(), sample.area, sample.shear_rate)
+    if not known or np.ndim(sample.tally.contact_moment) < 3:
+        return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
+    here = jax.tree.map(np.asarray, sample)
+    averages, one = here.averages, here.area.ndim == 0
+    errors = here.errors() if one else {}
+    sums = here._total
+    return [
+        *[Row("replicas", count) for count in here.area.shape],
+        Row("grains", here.grains),
+        Row("strain", rounded(sums.duration * here.shear_rate)),
+        *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _SHOWN.items()),
+        Row("status", statuses(here.status)),
+    ]
 
 
 @jax.tree_util.register_dataclass
@@ -53,7 +81,7 @@ class Sample:
     grains: int = field(metadata={"static": True})
     own: Any = None
 
-    __repr__, _repr_html_ = OF_SAMPLE
+    __repr__, _repr_html_ = methods("Sample", _rows)
 
     @property
     def averages(self) -> dict[str, Array]:
@@ -134,7 +162,7 @@ class Sample:
             return estimate(jax.tree.map(lambda x: x / steps, sums))
 
         def named(part: tuple[Any, Array]) -> dict[str, Array]:
-            found = jax.tree.leaves((jax.vmap(one) if np.ndim(part[1]) else one)(*part))
+            found = jax.tree.leaves(jax.vmap(one)(*part))
             return {str(k): leaf for k, leaf in enumerate(found)}
 
         sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.own, self.tally.steps))
@@ -301,7 +329,8 @@ def _told_sample(
 
 def _joined(parts: list[Sample]) -> Sample:
     """One sample of all blocks of some of one flow that follow each other."""
-    blocks = jax.tree.map(lambda *x: jnp.concatenate(x), *((part.tally, part.own) for part in parts))
+    every = ((part.tally, part.own) for part in parts)
+    blocks = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *every)
     return replace(parts[-1], tally=blocks[0], own=blocks[1])
 
 

@@ -20,7 +20,7 @@ from jaxgran.flow_figures import BINARY_COLOUR, COLOURS, Colour, Scene, common_s
 from jaxgran.snapshots import Snapshot
 from jaxgran.store import replaced, require_place
 
-MOST_FRAMES = 500  # of a movie: they are held in memory while it is written
+MOST_DRAWN = 500  # of a movie: they are held in memory while it is written
 _WIDTH, _HEIGHT, _DPI = 5.6, 4.4, 90
 _PLACE = (0.01, 0.07, 0.82, 0.83)  # of the axes in the figure
 _WIDEST = 0.755  # sides from the middle of the cell to the edge of the picture, at any tilt
@@ -44,7 +44,7 @@ class Frames:
         """Keep a frame: what a ``Recorder`` hands on. Where they become too many, every other one is dropped."""
         if step == 0:
             self._begin()
-        if len(self.scenes) == MOST_FRAMES:
+        if len(self.scenes) == MOST_DRAWN:
             self.scenes, self.strains, self._of_every = self.scenes[::2], self.strains[::2], 2 * self._of_every
         if self._seen % self._of_every == 0:
             self.scenes.append(scene_of(seen))

@@ -116,7 +116,7 @@ def prepare_batch(
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
-    state, packed = _start(flow, keys, theory.granular_temperature, grains)
+    state, packed = _heated(flow, keys, theory.granular_temperature, grains)
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=_coarse_timestep(flow, theory, coarse_timestep, grains))
@@ -219,7 +219,7 @@ def _coarse_timestep(
     return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 
-def start(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
+def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
     """A random packing with Gaussian velocities of a granular temperature: the beginning of a free cooling, or of any
     flow that one equilibrates oneself.
 
@@ -239,14 +239,14 @@ def start(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains 
     if grains is not None:
         require_room(flow, grains)
         grains = jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
-    state, found = _start(stack([flow]), key[None], jnp.asarray([temperature], float), grains)
+    state, found = _heated(stack([flow]), key[None], jnp.asarray([temperature], float), grains)
     if not found[0]:
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
     return jax.tree.map(lambda x: x[0], state)
 
 
 @jax.jit
-def _start(
+def _heated(
     flow: ShearFlow, keys: Array, temperature: Array, grains: Grains | None = None
 ) -> tuple[State, Bool[Array, " replicas"]]:
     """Packings with Gaussian velocities of the given temperature and no total momentum."""

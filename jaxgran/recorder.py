@@ -54,6 +54,8 @@ class Recorder:
         return state, reduce(add, tallies)
 
     def _record(self, flow: ShearFlow, state: State) -> None:
+        if not np.isfinite(np.asarray(state.velocities)).all():  # the status says so
+            return
         seen = _snapshot_of_one(flow, state)
         for keep in self.keep:
             keep(seen, self.steps)

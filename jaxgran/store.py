@@ -3,10 +3,10 @@
 A file is written under a temporary name in the folder where it belongs, synced, and renamed to its place. A process
 that is killed leaves the old file or the new one, never half of one.
 
-Arrays are kept as HDF5, which NetCDF programs read too, with the SHA-256 of the whole behind it, which other readers
-pass over. A file is put together and taken apart in memory: a full disc is then an ``OSError`` with a number, and the
-HDF5 library, which does not always survive it, never sees a damaged one. Dimensions have no names: naming them would
-take ten times as long as all the rest.
+Arrays are kept as HDF5 with the SHA-256 of the whole behind it, which other readers pass over. A file is put together
+and taken apart in memory: a full disc is then an ``OSError`` with a number, and the HDF5 library, which does not
+always survive it, never sees a damaged one. Dimensions have no names: naming them would take ten times as long as all
+the rest.
 """
 
 import hashlib

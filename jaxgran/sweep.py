@@ -243,7 +243,7 @@ def _tasks(
 def _batch_size(grains: int, count: int, workers: int) -> int:
     devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
-        largest = max(1, min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
+        largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
         return next(size for size in range(largest, 0, -1) if count % size == 0)  # a smaller last one compiles again
     memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
     per_replica = _GRAIN_BYTES * grains + _SEARCH_BYTES * min(grains, 512) ** 2

@@ -1,6 +1,6 @@
 """Advance a batch from a file on all devices of JAX, here or of two hosts, and write what comes out.
 
-python devices.py START.npz OUTPUT.npz GRAINS [COORDINATOR HOST]
+python devices.py START.npz OUTPUT.npz GRAINS [lockstep | COORDINATOR HOST]
 """
 
 import sys
@@ -10,7 +10,9 @@ import numpy as np
 
 start, output, grains, *host = sys.argv[1:]
 jax.config.update("jax_enable_x64", True)
-if host:
+if host == ["lockstep"]:
+    jax.default_backend = lambda: "accelerator"  # pyright: ignore
+elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))
 
@@ -19,7 +21,6 @@ from jaxgran.dynamics import State  # noqa: E402
 from jaxgran.flow import ShearFlow  # noqa: E402
 from jaxgran.grains import Grains  # noqa: E402
 
-assert jax.device_count() == 4
 like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), State(Grains(0, 0), 0, 0, 0, 0), 0)  # pyright: ignore
 with np.load(start) as arrays:
     leaves = [arrays[name] for name in arrays.files]

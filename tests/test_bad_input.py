@@ -59,7 +59,7 @@ def nothing_runs() -> Iterator[None]:
             (snapshots, "_snapshot_series"),
             (fields, "_fields_at"),
             (protocol, "prepare_batch"),
-            (protocol, "_start"),
+            (protocol, "_heated"),
             (free_cooling, "_cooling"),
             (sweep, "replicas"),
         ):
@@ -112,7 +112,7 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "prepare equilibrate": lambda x: jg.prepare(flow(), KEY, x),
     "sample strain": lambda x: jg.sample(flow(), SEEN.state, x),
     "sample blocks": lambda x: jg.sample(flow(), SEEN.state, 1.0, x),
-    "start temperature": lambda x: jg.start(flow(), KEY, x),
+    "heated temperature": lambda x: jg.heated(flow(), KEY, x),
     "own_grains diameters": jg.own_grains,
     "own_grains masses": lambda x: jg.own_grains([1.0, 2.0], x),
     "cooling times": lambda x: jg.cooling(jg.ShearFlow(**FLOW, shear_rate=0.0), SEEN.state, x),
@@ -133,7 +133,7 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "prepare key": lambda x: jg.prepare(flow(), x),
     "prepare grains": lambda x: jg.prepare(flow(), KEY, grains=x),
     "pack grains": lambda x: jg.pack(flow(), KEY, x),
-    "start grains": lambda x: jg.start(flow(), KEY, grains=x),
+    "heated grains": lambda x: jg.heated(flow(), KEY, grains=x),
     "cooling flow": lambda x: jg.cooling(x, SEEN.state, [1.0]),
     "cooling state": lambda x: jg.cooling(flow(), x, [1.0]),
     "sample observe": lambda x: jg.sample(flow(), SEEN.state, 1.0, observe=x),
@@ -299,7 +299,7 @@ def test_a_refusal_says_what_is_accepted(case: str) -> None:
 
 
 def test_prepare_refuses_a_time_step_too_short_to_count_before_it_packs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol, "_start", would_run)
+    monkeypatch.setattr(protocol, "_heated", would_run)
     with pytest.raises(InputError, match="timestep must be at least 1e-08 / shear_rate"):
         protocol.check_timestep(make_flow("timestep", 1e-12), None)
 

@@ -37,6 +37,14 @@ def test_results_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> Non
 
 
 @pytest.mark.slow
+def test_results_in_lockstep_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> None:
+    """As on accelerators: ``vmap`` over the replicas of a device."""
+    _run(batch, "one.npz", 1, "lockstep")
+    _run(batch, "four.npz", 4, "lockstep")
+    _assert_same(batch / "four.npz", batch / "one.npz")
+
+
+@pytest.mark.slow
 def test_results_on_two_hosts_are_those_on_one_to_the_bit_and_both_hold_all(batch: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -59,14 +67,14 @@ def _assert_same(one: Path, other: Path) -> None:
             np.testing.assert_array_equal(these[name], those[name])
 
 
-def _start(folder: Path, output: str, devices: int, *host: str) -> subprocess.Popen:
+def _start(folder: Path, output: str, devices: int, *words: str) -> subprocess.Popen:
     environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
-    command = [sys.executable, str(PROGRAM), "start.npz", output, str(pytest.GRAINS), *host]
+    command = [sys.executable, str(PROGRAM), "start.npz", output, str(pytest.GRAINS), *words]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **streams)
 
 
-def _run(folder: Path, output: str, devices: int) -> None:
-    process = _start(folder, output, devices)
+def _run(folder: Path, output: str, devices: int, *words: str) -> None:
+    process = _start(folder, output, devices, *words)
     _, error = process.communicate(timeout=300)
     assert process.returncode == 0, error

@@ -133,6 +133,8 @@ def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
 # Mistakes
 
 MISTAKES = {
+    "run --restitution 0.5 --packing-fraction 0.6 --strain 0": "strain must be a positive number",
+    "run --restitution 0.5 --packing-fraction 0.6 --seed 3": "there is no option --seed",
     "map --restitution -0.1,0.5": "restitution must be between 0 and 1",
     "map --restitution 0.5,1.1": "restitution must be between 0 and 1",
     "map --restitution nan": "restitution must be between 0 and 1",
@@ -506,7 +508,7 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
             assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
 
 
-def test_examples_of_map_plot_and_run_do_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With made-up replicas in place of runs."""
 
     def every(settings, *_) -> Iterator:
@@ -518,7 +520,7 @@ def test_examples_of_map_plot_and_run_do_what_they_say(tmp_path: Path, monkeypat
     monkeypatch.setattr(sweep, "replicas", every)
     (tmp_path / "figures").mkdir()
     plane, again = list(cli_map.MAP_EXAMPLES.values())[1], list(cli_map.PLOT_EXAMPLES.values())[1]
-    for example in (plane, again, *cli_run.RUN_EXAMPLES.values()):
+    for example in (plane, again):
         assert jaxgran(tmp_path, *shlex.split(example)[1:]).status == 0, example
     assert {"ratio.nc", "ratio_contours.png", "figures"} <= files(tmp_path)
     assert "ratio_curves.png" in files(tmp_path / "figures")

@@ -17,7 +17,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 MODULES = [path.stem for path in sorted(ROOT.glob("jaxgran/*.py")) if ">>> " in path.read_text(encoding="utf-8")]
 _BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-HOW_TO = ("accelerator", "cluster", "own-grains", "own-observable", "trajectories")
+HOW_TO = ("accelerator", "cluster", "free-cooling", "own-grains", "own-observable", "trajectories")
 # the map of the README takes minutes
 SMALLER = {"seeds=2, timestep=1e-4)": "seeds=1, grains=64, strain=2.0, timestep=5e-4)"}
 RUN = ("../README.md", "tutorial.md", *(f"how-to/{name}.md" for name in HOW_TO))

@@ -1,5 +1,6 @@
 """Pictures of a flow show its grains, its forces and its cell; movies are whole, and their frames differ."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -149,6 +150,20 @@ def test_figure_names_what_without_which_it_means_nothing() -> None:
     assert "mean forces over 3 time steps, a strain of 0.003" in flow_figure(every).axes[0].get_title()
 
 
+def test_picture_is_the_same_in_any_unit_of_time() -> None:
+    """Velocities go with the shear rate, forces with its square, time steps with its inverse."""
+    one, other = seen(times=3), seen(times=3)
+    one.shear_rate[:], other.shear_rate[:] = 1.0, 2.0
+    other = replace(
+        other,
+        timestep=other.timestep / 2,
+        impulses=other.impulses * 2,
+        state=replace(other.state, velocities=other.state.velocities * 2),
+    )
+    for this, that in zip(scene_of(one), scene_of(other), strict=True):
+        np.testing.assert_array_equal(this, that)
+
+
 @pytest.mark.parametrize("contacts", [(), ((0, 1, 0.0),)], ids=["no contacts", "no forces"])
 def test_flow_without_forces_or_motion_is_drawn(contacts, tmp_path: Path) -> None:
     still = seen(contacts=contacts)
@@ -225,7 +240,7 @@ def test_colours_of_a_gif_are_those_of_the_picture(tmp_path: Path) -> None:
 
 
 def test_too_many_frames_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(movie, "MOST_FRAMES", 8)
+    monkeypatch.setattr(movie, "MOST_DRAWN", 8)
     frames = Frames()
     one = seen_once(0)
     for step in range(50):

@@ -14,7 +14,7 @@ from jaxgran.flow import InputError, ShearFlow
 from jaxgran.free_cooling import Cooling, _cooling, cooling
 from jaxgran.kinetic_theory import contact_value
 from jaxgran.measure import sample
-from jaxgran.protocol import prepare, start
+from jaxgran.protocol import heated, prepare
 from jaxgran.snapshots import snapshot_series
 from jaxgran.status import Status
 
@@ -27,7 +27,7 @@ TIMES = np.linspace(1.5, 12.0, 8)
 def gases() -> list[State]:
     """Packings at temperature one, after some twelve collisions a grain without loss."""
     elastic = replace(FLOW, restitution=1.0)
-    return [cooling(elastic, start(FLOW, jax.random.key(k)), TIMES / 2)[0] for k in range(SEEDS)]
+    return [cooling(elastic, heated(FLOW, jax.random.key(k)), TIMES / 2)[0] for k in range(SEEDS)]
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_change_of_numbers_compiles_nothing_anew(gases, cooled) -> None:
         (lambda state: cooling(FLOW, state, [1.0, 1.0]), "times must increase by a time step, 0.001, or more"),
         (lambda state: cooling(FLOW, state, [1.0, 1e30]), "at most 2147483647 time steps, 2.14748e\\+06, apart"),
         (lambda state: cooling(FLOW, state, [1.0, -2.0]), "times must be a list of positive times"),
-        (lambda _: start(FLOW, jax.random.key(0), temperature=0.0), "temperature must be a positive number"),
+        (lambda _: heated(FLOW, jax.random.key(0), temperature=0.0), "temperature must be a positive number"),
     ],
 )
 def test_what_makes_no_sense_without_shear_is_refused_in_one_sentence(gases, made, words: str) -> None:

@@ -20,7 +20,7 @@ from jaxgran.grains import Grains, own_grains, polydisperse
 from jaxgran.kinetic_theory import gaussian_moments, mixture_moments
 from jaxgran.packing import pack, require_room
 from jaxgran.pairs import widest_skin
-from jaxgran.protocol import _classes, predicted, prepare, start
+from jaxgran.protocol import _classes, heated, predicted, prepare
 from jaxgran.status import Status
 
 GRAINS = pytest.GRAINS
@@ -123,7 +123,7 @@ def test_a_small_heavy_disc_throws_a_large_hollow_one(run, scene):
 def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
     grains = own_grains(LAWS["1 to 3"], np.where(EVEN, 3.0, 0.05))
     flow = flow_of(timestep=1e-3)
-    state = start(flow, jax.random.key(1), 0.25, grains)
+    state = heated(flow, jax.random.key(1), 0.25, grains)
     masses, velocities = np.asarray(grains.masses)[:, None], np.asarray(state.velocities)
     assert np.sum(masses * velocities**2) / (2 * GRAINS) == pytest.approx(0.25, rel=1e-12)
     np.testing.assert_allclose(np.sum(masses * velocities, axis=0), 0, atol=1e-12)
@@ -208,7 +208,7 @@ def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_
     ],
 )
 def test_grains_that_are_not_the_flows_are_refused_in_one_sentence(grains, words):
-    for function in (pack, prepare, start):
+    for function in (pack, prepare, heated):
         with pytest.raises(InputError, match=words) as caught:
             function(flow_of(), jax.random.key(0), grains=grains)
         assert one_sentence(str(caught.value))

@@ -1,6 +1,7 @@
 """Importing is light, public names resolve, and the modules stand in layers."""
 
 import ast
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -21,6 +22,13 @@ LAYERS = """
     contours theory_figures rheology_figures figures flow_figures movie progress terminal cli_options cli_measure
     cli_map cli_run cli_fit cli_info cli_mistakes cli __main__
 """
+
+
+def test_the_guide_for_contributors_names_every_module_in_its_order() -> None:
+    guide = (Path(jaxgran.__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    table = guide.split("| layer | modules |")[1].split("\n\n")[0]
+    named = [name for row in table.splitlines() for name in re.findall(r"`(\w+)`", row.rpartition("|")[0])]
+    assert named == LAYERS.split()[:-1]
 
 
 def run_python(code: str) -> str:

@@ -54,7 +54,7 @@ def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> N
 
 def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     temperature = jnp.asarray([0.3, 2.0])
-    state, found = protocol._start(stack(FLOWS), keys, temperature)
+    state, found = protocol._heated(stack(FLOWS), keys, temperature)
     masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
     assert np.all(found)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)

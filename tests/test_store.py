@@ -44,7 +44,7 @@ def test_arrays_come_back_bit_for_bit(file: Path) -> None:
     assert reads_as_written(file)
 
 
-def test_a_file_is_netcdf_for_others_too(file: Path) -> None:
+def test_others_can_read_a_file_too(file: Path) -> None:
     data = xr.load_dataset(file, engine="h5netcdf", phony_dims="sort")
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(data[name], array)

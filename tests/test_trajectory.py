@@ -167,6 +167,16 @@ def test_a_replica_that_waits_has_no_frames(flow, flowing, drive, tmp_path: Path
     assert_same_bits(frame_of(read_trajectory(path), 1), end)
 
 
+def test_a_replica_that_is_not_finite_has_no_frames(flow, flowing, drive, tmp_path: Path) -> None:
+    """It is the status that tells, and the retry that records."""
+    path = tmp_path / "flow.gsd"
+    recorder = Recorder(0.01, partial(write_frame, path))
+    state = flowing(0.78)
+    lost = replace(state, velocities=state.velocities.at[..., 0].set(jnp.nan))
+    driven_in_blocks(recorder.recording(drive), flow, lost, (10, 0))
+    assert recorder.frames == 0 and not path.exists()
+
+
 def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
     path = tmp_path / "flow.gsd"
     recorder = Recorder(0.01, partial(write_frame, path))
