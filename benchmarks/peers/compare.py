@@ -1,0 +1,228 @@
+"""Peers on the same flows: seconds of one core for a unit of strain against the errors of pressure and shear stress.
+
+jaxgran, the numba loop, LAMMPS and a plain jax-md program (see the modules beside this one) shear the same discs from
+the same steady state. Contact dynamics is run at several time steps, soft discs at several stiffnesses, whose time step
+is a fixed share of a contact: both trade time for accuracy. Each has a process of its own, all share one core and take
+turns, round after round. Times are medians over the rounds of the processor's time of the process, which is what the
+clock shows on a machine with nothing else to do; those of the clock stand beside them. What a first call takes longer
+(compilation) is reported apart. Errors are relative to a reference, contact dynamics at a time step of 3e-5 and a
+tolerance of 1e-6 over a longer strain.
+
+The time to an error of 3 % is read off the front of error against time, in logarithms (see ``front.py``).
+
+    python benchmarks/peers/compare.py           # about 30 minutes
+    python benchmarks/peers/compare.py --flow 2  # the second flow alone, in the place of that of an earlier result
+    python benchmarks/peers/compare.py --quick   # one flow of 256 discs, under 3 minutes
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+if __name__ == "__main__":
+    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["OMP_NUM_THREADS"] = "1"
+    sys.path[0] = str(Path(__file__).resolve().parents[1])  # so that "lammps" is the program, not the module here
+
+import jax
+import numpy as np
+from hardware import hardware
+
+import jaxgran as jg
+from jaxgran.statistics import jackknife
+from peers import jax_md_dense, jaxgran_itself, lammps, numba_rival
+from peers.front import OBSERVABLES, TARGET, draw, table
+from peers.problem import Discs, Flow, Stress
+from peers.workers import Worker
+
+PEERS = (jaxgran_itself, numba_rival, lammps, jax_md_dense)
+REFERENCE_TIMESTEP = 3e-5
+
+
+class Case(NamedTuple):
+    """A flow, the strain of a round, the rounds of all settings and those of the reference."""
+
+    flow: Flow
+    strain: float
+    rounds: int
+    reference_rounds: int
+
+
+class Plan(NamedTuple):
+    cases: tuple[Case, ...]
+    discs: int
+    most_seconds: float  # for a unit of strain, beyond which a setting is left out
+
+
+CASES = Case(Flow(0.8, 0.6), 4, 12, 150), Case(Flow(0.5, 0.7), 4, 12, 150), Case(Flow(0.5, 0.8), 2, 16, 60)
+FULL = Plan(CASES, 1000, 2.8)
+QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--quick", action="store_true", help="one flow of 256 discs, shorter strains")
+    arguments.add_argument("--flow", type=int, choices=range(1, len(FULL.cases) + 1), help="one flow alone")
+    arguments.add_argument("--output", type=Path, default=Path(__file__).parents[1] / "results")
+    chosen = arguments.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    plan = QUICK if chosen.quick else FULL
+    if chosen.flow and not chosen.quick:
+        plan = plan._replace(cases=plan.cases[chosen.flow - 1 : chosen.flow])
+    compare(plan, chosen.output / ("peers_quick" if chosen.quick else "peers"))
+
+
+def compare(plan: Plan, stem: Path) -> None:
+    """Run the plan, print the tables, and write the JSON and PNG files of the given stem."""
+    left_out = {peer.__name__.rpartition(".")[2]: why for peer in PEERS if (why := peer.missing())}
+    for why in left_out.values():
+        print(why, flush=True)
+    peers = [peer for peer in PEERS if not peer.missing()]
+    flows = []
+    for case in plan.cases:
+        begin, load = time.perf_counter(), os.getloadavg()
+        flows.append(measured(plan, case, peers))
+        flows[-1] |= {"load_averages": [load, os.getloadavg()], "wall_seconds": time.perf_counter() - begin}
+        report(flows[-1])
+    flows = joined(stem.with_suffix(".json"), flows)
+    print(table(flows))
+    result = {
+        "hardware": hardware() | ({"lammps": lammps.version()} if lammps in peers else {}),
+        "discs": plan.discs,
+        "most_seconds": plan.most_seconds,
+        "target": TARGET,
+        "left_out": left_out,
+        "flows": flows,
+    }
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    draw(flows).savefig(stem.with_suffix(".png"), dpi=150)
+
+
+def joined(earlier: Path, flows: list[dict]) -> list[dict]:
+    """Flows now measured, among those of an earlier result that are others of the full plan."""
+    known = {(flow["restitution"], flow["packing_fraction"]): flow for flow in flows}
+    places = [case.flow[:2] for case in FULL.cases]
+    if earlier.is_file() and set(known) < set(places):
+        for flow in json.loads(earlier.read_text())["flows"]:
+            known.setdefault((flow["restitution"], flow["packing_fraction"]), flow)
+    return sorted(known.values(), key=lambda flow: places.index((flow["restitution"], flow["packing_fraction"])))
+
+
+def measured(plan: Plan, case: Case, peers: list) -> dict:
+    """Reference, and errors and times of every setting of every peer, for one flow."""
+    flow = case.flow
+    law = jg.ShearFlow(plan.discs, flow.restitution, flow.packing_fraction, 1e-3)
+    discs = jaxgran_itself.discs_of(jg.prepare(law, jax.random.key(0)))
+    workers = [Worker(peer.__name__.rpartition(".")[2]) for peer in peers]
+    right, seconds = reference(workers[peers.index(numba_rival)] if numba_rival in peers else workers[0], discs, case)
+    runs, rows = {}, []
+    for peer, worker in zip(peers, workers, strict=True):
+        for curve, settings in peer.CURVES.items():
+            for setting in settings:
+                rows.append(first_looks(worker, len(rows), discs, case, curve, setting, plan.most_seconds))
+                if "failure" not in rows[-1]:
+                    runs[len(rows) - 1] = worker
+    stresses, clocks, depths = ({k: [] for k in runs} for _ in range(3))
+    for number in range(case.rounds):
+        order = list(runs) if number % 2 == 0 else list(reversed(runs))
+        for k in order:
+            stress, clock = runs[k].advance(k)
+            stresses[k].append(stress)
+            clocks[k].append(clock)
+            depths[k].append(runs[k].overlaps(k))
+    for k, run in runs.items():
+        wall, cpu = np.median(clocks[k], axis=0) / case.strain
+        mean, largest = np.array(depths[k]).T
+        rows[k] |= {
+            "cpu_seconds_per_strain": float(cpu),
+            "wall_seconds_per_strain": float(wall),
+            "mean_overlap": float(mean.mean()),
+            "largest_overlap": float(largest.max()),
+            "values": (values := averages(stresses[k])),
+            "errors": {name: relative(values[name], right[name]) for name in OBSERVABLES},
+        }
+        run.close(k)
+    for worker in workers:
+        worker.shutdown()
+    plan_of_flow = {"strain": case.strain, "rounds": case.rounds, "reference_rounds": case.reference_rounds}
+    return {
+        **flow._asdict(),
+        **plan_of_flow,
+        "reference": right,
+        "reference_seconds_per_strain": seconds,
+        "rows": rows,
+    }
+
+
+def reference(worker: Worker, discs: Discs, case: Case) -> tuple[dict[str, tuple[float, float]], float]:
+    """The right averages with their errors, and the seconds that a unit of strain of them took."""
+    worker.begin(-1, discs, case.flow, "reference", REFERENCE_TIMESTEP, case.strain)
+    worker.advance(-1)
+    stresses, clocks = zip(*(worker.advance(-1) for _ in range(case.reference_rounds)), strict=True)
+    worker.close(-1)
+    return averages(stresses), float(np.median(clocks, axis=0)[1]) / case.strain
+
+
+def first_looks(
+    worker: Worker, key: int, discs: Discs, case: Case, curve: str, setting: float, most_seconds: float
+) -> dict:
+    """The row of a setting so far, and its run begun, past a round that is left out.
+
+    The first call is that of a short run apart, so that it shows compilation. Where a program fails, or would take
+    longer than the plan allows, the row says so.
+    """
+    row = {"peer": worker.peer, "curve": curve, "setting": setting}
+    try:
+        worker.begin(key, discs, case.flow, curve, setting, 0.1)
+        (first, _), (_, again) = worker.advance(key)[1], worker.advance(key)[1]
+        worker.close(key)
+        row["first_call_seconds"] = first - again
+        if 10 * again > most_seconds:
+            return row | {"failure": f"takes {10 * again:.1f} s for a unit of strain"}
+        worker.begin(key, discs, case.flow, curve, setting, case.strain)
+        worker.advance(key)
+    except Exception as failure:  # of a program that is not ours to mend
+        return row | {"failure": str(failure)}
+    return row
+
+
+def averages(stresses: Sequence[Stress]) -> dict[str, tuple[float, float]]:
+    """Means over the rounds and their standard errors."""
+    rounds = {name: np.array([[getattr(stress, name) for stress in stresses]]) for name in OBSERVABLES}
+    rounds["count"] = np.ones((1, len(stresses)))
+    value, error = jackknife(lambda sums: {name: sums[name] / sums["count"] for name in OBSERVABLES}, rounds)
+    return {name: (float(value[name]), float(error[name])) for name in OBSERVABLES}
+
+
+def relative(value: tuple[float, float], right: tuple[float, float]) -> tuple[float, float]:
+    """Relative error of a mean, and the standard error of it."""
+    return value[0] / right[0] - 1, float(np.hypot(value[1], right[1])) / right[0]
+
+
+def report(flow: dict) -> None:
+    """Print the rows of a flow."""
+    words = ", ".join(f"{name} {value:.4g} ± {error:.2g}" for name, (value, error) in flow["reference"].items())
+    print(f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}: {words}")
+    print(
+        "curve                       setting   cpu s   wall s   pressure          shear stress      overlap: mean, max"
+    )
+    for row in flow["rows"]:
+        head = f"{row['curve']:26s}{row['setting']:9.0e}"
+        if "failure" in row:
+            print(f"{head}  {row['failure']}")
+            continue
+        cells = "".join("{:8.2f} ± {:4.2f} % ".format(*(100 * x for x in row["errors"][name])) for name in OBSERVABLES)
+        times = f"{row['cpu_seconds_per_strain']:8.4f}{row['wall_seconds_per_strain']:9.4f}"
+        print(f"{head}{times}  {cells}   {row['mean_overlap']:.1e} {row['largest_overlap']:.1e}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

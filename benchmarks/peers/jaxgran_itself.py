@@ -1,0 +1,47 @@
+"""jaxgran as a peer of the others: several time steps, at the default tolerance and a coarse one, midpoint rule."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxgran as jg
+from jaxgran.grains import Grains
+from peers.problem import Discs, Flow, Run, Stress
+
+TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
+CURVES = {"jaxgran": TIMESTEPS, "jaxgran, tolerance 1e-2": TIMESTEPS[1:-1]}
+TOLERANCES = {"jaxgran": 1e-4, "jaxgran, tolerance 1e-2": 1e-2, "reference": 1e-6}
+
+
+def missing() -> str | None:
+    return None
+
+
+def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float) -> Run:
+    """A run at one time step; ``curve`` names the tolerance."""
+    law = jg.ShearFlow(
+        grains=len(discs.radii),
+        restitution=flow.restitution,
+        packing_fraction=flow.packing_fraction,
+        timestep=timestep,
+        shear_rate=flow.shear_rate,
+        tolerance=TOLERANCES[curve],
+    )
+    grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
+    arrays = (np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt))
+    state = jg.State(grains, *map(jnp.asarray, arrays))  # no weak types, or the second call would compile again
+
+    def advance() -> Stress:
+        nonlocal state
+        state, sample = jax.block_until_ready(jg.sample(law, state, duration * flow.shear_rate, blocks=1))
+        sample = jax.tree.map(np.asarray, sample)
+        averages = sample.averages
+        return Stress(float(averages["pressure"]), float(averages["shear_stress"]))
+
+    return Run(advance, lambda: discs_of(state))
+
+
+def discs_of(state: jg.State) -> Discs:
+    """The discs of a state of jaxgran."""
+    arrays = (state.positions, state.velocities, state.grains.radii, state.grains.masses)
+    return Discs(*(np.array(x) for x in arrays), float(state.side), float(state.tilt))

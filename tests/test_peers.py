@@ -1,0 +1,136 @@
+"""The peers of the comparison obey the laws that they are compared by, and its table reads right what was measured."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from peers import front, jax_md_dense, jaxgran_itself, lammps, numba_rival
+from peers.problem import Discs, Flow, damping_ratio, overlaps
+
+from jaxgran.dynamics import State
+
+SOFT = {"lammps": lammps, "jax_md_dense": jax_md_dense}
+PEERS = {"jaxgran_itself": jaxgran_itself, "numba_rival": numba_rival, **SOFT}
+SETTINGS = {"jaxgran_itself": 1e-3, "numba_rival": 1e-3, "lammps": 1e4, "jax_md_dense": 1e4}
+
+
+def installed(name: str):
+    peer = PEERS[name]
+    if why := peer.missing():
+        pytest.skip(why)
+    return peer
+
+
+@pytest.fixture(scope="module")
+def sheared(flowing: Callable[..., State]) -> Discs:
+    return jaxgran_itself.discs_of(flowing(0.6))
+
+
+def two_discs(gap: float) -> Discs:
+    """Two unlike discs that meet head on with a relative velocity of one and no momentum."""
+    radii = np.array([0.4, 0.6])
+    masses = 4 * radii**2
+    positions = np.array([[9.0, 10.0], [10.0 + gap, 10.0]])
+    velocities = np.array([[1.0, 0.0], [0.0, 0.0]]) - [masses[0] / masses.sum(), 0.0]
+    return Discs(positions, velocities, radii, masses, 20.0, 0.0)
+
+
+def rebound(peer, restitution: float, setting: float, gap: float) -> float:
+    """Relative velocity after the two discs have met, over the one before; no shear."""
+    run = peer.begin(two_discs(gap), Flow(restitution, 0.01, 0.0), next(iter(peer.CURVES)), setting, 0.25)
+    run.advance()
+    velocities = run.discs().velocities[:, 0]
+    run.close()
+    return float(velocities[1] - velocities[0])
+
+
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+@pytest.mark.parametrize("name", SOFT)
+def test_soft_discs_rebound_with_the_restitution_as_their_steps_get_short(
+    name: str, restitution: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peer = installed(name)
+    at_work = np.mean([rebound(peer, restitution, 1e4, gap) for gap in (0.02, 0.0231, 0.0273, 0.0317)])
+    assert at_work == pytest.approx(restitution, abs=0.04)  # it depends on where a step falls in the contact
+    short = dict.fromkeys(lammps.CURVES, 200) if peer is lammps else 200
+    monkeypatch.setattr(peer, "STEPS_PER_CONTACT", short)
+    assert rebound(peer, restitution, 1e4, 0.02) == pytest.approx(restitution, abs=0.005)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_discs_of_the_numba_loop_rebound_with_the_restitution(restitution: float) -> None:
+    peer = installed("numba_rival")
+    assert rebound(peer, restitution, 1e-3, 0.02) == pytest.approx(restitution, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["numba_rival", *SOFT])
+def test_a_run_begins_with_the_discs_it_was_given(name: str, sheared: Discs) -> None:
+    peer = installed(name)
+    run = peer.begin(sheared, Flow(0.7, 0.6), next(iter(peer.CURVES)), SETTINGS[name], 0.1)
+    now = run.discs()
+    run.close()
+    moved = (now.positions - sheared.positions) / sheared.side
+    moved[:, 0] -= moved[:, 1] * sheared.tilt
+    np.testing.assert_allclose(moved, np.round(moved), atol=1e-12)  # by whole periods
+    for found, given in zip(now[1:], sheared[1:], strict=True):
+        np.testing.assert_allclose(found, given, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["numba_rival", *SOFT])
+def test_momentum_is_conserved_while_the_cell_tilts_over(name: str, sheared: Discs) -> None:
+    peer = installed(name)
+    run = peer.begin(sheared, Flow(0.7, 0.6), next(iter(peer.CURVES)), SETTINGS[name], 2.25)
+    stress = run.advance()
+    now = run.discs()
+    run.close()
+    np.testing.assert_allclose(now.masses @ now.velocities, 0, atol=1e-9)
+    assert (now.tilt - sheared.tilt - 2.25 + 0.5) % 1 == pytest.approx(0.5, abs=1e-9)
+    assert 0 < stress.shear_stress < stress.pressure
+    assert overlaps(now)[1] < 0.1
+
+
+def test_lammps_and_jax_md_move_soft_discs_alike(sheared: Discs, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lammps, "STEPS_PER_CONTACT", dict.fromkeys(lammps.CURVES, 100))
+    monkeypatch.setattr(jax_md_dense, "STEPS_PER_CONTACT", 100)
+    ends, stresses = [], []
+    for name in SOFT:
+        peer = installed(name)
+        run = peer.begin(sheared, Flow(0.7, 0.6), next(iter(peer.CURVES)), 1e4, 0.2)
+        stresses.append(run.advance())
+        ends.append(run.discs().velocities)
+        run.close()
+    speed = np.sqrt(np.mean(ends[0] ** 2))
+    assert np.sqrt(np.mean((ends[0] - ends[1]) ** 2)) < 0.02 * speed
+    np.testing.assert_allclose(*stresses, rtol=0.02)
+
+
+def test_damping_of_a_spring_gives_the_restitution() -> None:
+    for restitution in (0.1, 0.5, 0.9):
+        zeta = damping_ratio(restitution)
+        assert math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2)) == pytest.approx(restitution)
+    assert damping_ratio(1.0) == 0
+
+
+def test_overlaps_are_seen_across_the_sheared_boundary() -> None:
+    radii = np.array([0.5, 0.5, 0.5])
+    positions = np.array([[1.0, 0.1], [1.0 + 0.3 * 8, 7.2], [5.0, 4.0]])
+    discs = Discs(positions, np.zeros((3, 2)), radii, radii, 8.0, 0.3)
+    assert overlaps(discs) == pytest.approx((0.1, 0.1))
+    assert overlaps(discs._replace(tilt=0.0)) == (0.0, 0.0)
+
+
+def row(seconds: float, error: float, noise: float = 0.0) -> dict:
+    return {front.COST: seconds, "errors": {name: (error, noise) for name in front.OBSERVABLES}}
+
+
+def test_time_to_the_target_is_interpolated_along_the_front() -> None:
+    rows = [row(2.0, 0.2), row(1.0, -0.1), row(100.0, 0.001), {"failure": "left out"}]
+    seconds, sign = front.time_to_target(rows, front.OBSERVABLES)
+    share = math.log(0.1 / front.TARGET) / math.log(0.1 / 0.001)
+    assert (seconds, sign) == (pytest.approx(100**share), "=")
+    assert front.time_to_target([row(1.0, 0.01, 0.5)], front.OBSERVABLES) == (1.0, "<")
+    assert front.time_to_target([row(1.0, 0.06), row(3.0, 0.05)], ("pressure",)) == (3.0, ">")
+    by_chance = [row(0.5, 0.002), *rows]  # a finer setting is worse
+    assert front.time_to_target(by_chance, front.OBSERVABLES) == (seconds, sign)
+    assert math.isnan(front.time_to_target([{"failure": "left out"}], ("pressure",))[0])
