@@ -6,7 +6,7 @@ T = T₀/(1 + t/τ)². It holds while the gas is homogeneous. In a cell that is 
 then clusters form: collisions become gentler than the temperature tells, and T lies above the law. The figure marks
 where that exceeds a tenth, and shows the last state of the most dissipative gas.
 
-    python benchmarks/free_cooling.py           # 1600 grains, a few minutes on two cores
+    python benchmarks/free_cooling.py           # 1600 grains, two minutes on one core
     python benchmarks/free_cooling.py --quick   # 256 grains, about a minute
 """
 
