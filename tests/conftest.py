@@ -1,7 +1,9 @@
 """Tests run in float64 with strict promotion, so that no precision or rank changes unnoticed.
 
 The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each. What is
-compiled is kept in a folder of the run, for the processes that share its tests and for those that they start.
+compiled is kept in a folder of the run, for the processes that share its tests and for those that they start. Most of the
+time of a run is compilation, so XLA leaves out the optimisation of machine code; ``XLA_FLAGS=`` with any flag of one's
+own, as ``--xla_backend_optimization_level=3``, tests programs as users have them.
 """
 
 import os
@@ -19,6 +21,7 @@ import pytest
 FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
 if FIRST_PROCESS:
     os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxgran-tests-")
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, and why
 CACHE = Path(os.environ["XDG_CACHE_HOME"])
 

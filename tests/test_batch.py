@@ -68,7 +68,8 @@ def _assert_same(one: Path, other: Path) -> None:
 
 
 def _start(folder: Path, output: str, devices: int, *words: str) -> subprocess.Popen:
-    environment = os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    environment = os.environ | {"XLA_FLAGS": flags}
     command = [sys.executable, str(PROGRAM), "start.npz", output, str(pytest.GRAINS), *words]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **streams)

@@ -463,6 +463,7 @@ def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_fit_tells_how_well_a_law_describes_a_map(known_map: Path, tmp_path: Path) -> None:
     outcome = jaxgran(tmp_path, "fit", str(known_map))
     assert (outcome.status, outcome.err) == (0, "")

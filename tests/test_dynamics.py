@@ -66,7 +66,7 @@ def test_grain_flies_straight_in_the_laboratory(run, scene):
 
 
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.75])
-@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+@pytest.mark.parametrize("activation", ["midpoint", pytest.param("touching", marks=pytest.mark.slow)])
 def test_free_flight_repeats_the_trajectory_of_every_step(run, flowing, activation, packing_fraction):
     flow, state = flow_of(packing_fraction, activation=activation), flowing(packing_fraction)
     (jumped, tally), (stepped, all_steps) = (run(flow, state, 100, free_flight) for free_flight in (True, False))

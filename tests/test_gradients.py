@@ -142,6 +142,7 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
 
 # Through time
 
+QUICK_NAMES = ("restitution", "side", "positions")
 NAMES = ("restitution", "shear_rate", "timestep", "side", "radii", "masses", "positions", "velocities")
 
 
@@ -194,7 +195,9 @@ def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative)
     np.testing.assert_allclose(value, forward(parameters(flow, state)), rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK_NAMES else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
+)
 def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, name):
     """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and nothing else."""
     flow, state, _ = tilting
@@ -260,6 +263,7 @@ def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
     np.testing.assert_allclose((far - near) / change, 0.75, atol=0.02)
 
 
+@pytest.mark.slow
 def test_derivative_of_many_collisions_is_that_of_the_flow_without_time_steps(packed):
     """With respect to the restitution, at a step so short that differences see the limit; fixed steps miss most."""
     state = packed(0.3)
@@ -286,6 +290,7 @@ def test_derivative_of_many_collisions_is_that_of_the_flow_without_time_steps(pa
     assert missed(False) > 0.2
 
 
+@pytest.mark.slow
 def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
     """A disc hits a second one that a third one touches at a right angle: the third contact neither presses nor parts.
 

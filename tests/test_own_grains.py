@@ -154,6 +154,7 @@ def test_theory_of_unlike_masses_is_finite_at_every_restitution():
         assert np.all(np.asarray(predicted(flow, batch).granular_temperature) > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [3.0, 5.0])
 def test_cell_lists_of_unlike_grains_are_complete_or_flagged(ratio):
     """Six hundred grains at random places, found through cells, against brute force."""

@@ -149,6 +149,7 @@ def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
     assert hood.outer.overflow and hood.near.overflow
 
 
+@pytest.mark.slow
 def test_near_list_filtered_after_large_shear_holds_every_pair_within_its_skin():
     """In dilute flow the skin is wider than a grain: shear then brings in pairs from farther than touching ones."""
     rng, count = np.random.default_rng(0), 256

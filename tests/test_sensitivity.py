@@ -16,6 +16,7 @@ def flow_of(restitution) -> ShearFlow:
     return ShearFlow(pytest.GRAINS, restitution, 0.6, 1e-3, tolerance=1e-12, max_iterations=100_000)
 
 
+@pytest.mark.slow
 def test_growth_is_that_of_two_neighbouring_runs(flowing, run) -> None:
     """At fixed time steps, over a strain in which no contact changes its step."""
     state, steps, change = flowing(0.6), 60, 1e-9

@@ -50,6 +50,7 @@ def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
     assert not stability.gains(tally, stability.energy(state) - before, 1e-6 * before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packing_fraction", [0.6, 0.8])
 def test_float32_positions_give_the_pressure_of_float64_at_a_short_timestep(packing_fraction: float) -> None:
     """At dt = 1e-5 a program that adds to absolute positions loses the motion; separations since a rebuild keep it."""
