@@ -2,7 +2,7 @@
 
 The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each. What is
 compiled is kept in a folder of the run, for the processes that share its tests and for those that they start. Most of
-the time of a run is compilation, so XLA leaves out the optimisation of machine code. With an ``XLA_FLAGS`` of one's own,
+the time of a run is compilation, so XLA leaves out optimising machine code. With ``XLA_FLAGS`` of one's own,
 ``--xla_backend_optimization_level=3``, the tests run what users have.
 """
 
