@@ -49,11 +49,12 @@ def replicated(function: Callable) -> Callable:
         together = lambda *arguments: lax.map(lambda one: function(*one), arguments)  # noqa: E731
     else:
         together = jax.vmap(function, axis_name=AXIS)
-    return together if jax.device_count() == 1 else _shared_out(together, jax.devices())
+    return together if jax.device_count() == 1 else _shared_out(together)
 
 
-def _shared_out(together: Callable, devices: list[jax.Device]) -> Callable:
+def _shared_out(together: Callable) -> Callable:
     """A function of a batch that hands every device an equal share, the last one in part copies of others."""
+    devices = jax.devices()
     mesh = Mesh(np.asarray(devices), (_DEVICES,))
 
     def share(*arguments):

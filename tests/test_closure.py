@@ -174,6 +174,7 @@ def test_force_ratio_is_one_in_elastic_flow_and_grows_with_density_and_dissipati
     assert np.all(np.diff(ratio, axis=0) > 0) and np.all(np.diff(ratio, axis=1) < 0)
 
 
+@pytest.mark.slow
 def test_a_point_left_out_does_not_enter_its_own_prediction() -> None:
     data = with_a_bad_point(made_up_map())
     changed = data.copy(deep=True)
@@ -243,6 +244,7 @@ def test_restitutions_scatter_by_their_standard_error(correlation: float) -> Non
     assert np.mean(found.chi_squared) == pytest.approx(1, abs=4 * np.sqrt(2 / count) + 0.05)
 
 
+@pytest.mark.slow
 def test_restitution_is_not_determined_by_stresses_with_large_errors() -> None:
     seen = predict(known_closure(), 0.3, 0.79)
     found = restitution_from_stresses(

@@ -48,7 +48,7 @@ class Lab:
 
     def start(self, output: str, *words: str, fault: str = "", workers: int = 2) -> subprocess.Popen:
         command = [sys.executable, str(DRIVER), *MAP.split(), "--workers", str(workers), "--output", output, *words]
-        environment = os.environ | {"FAULT": fault}
+        environment = os.environ | {"FAULT": fault, "XLA_FLAGS": ""}  # optimised: these maps run more than they compile
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
         return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)
