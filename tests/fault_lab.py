@@ -1,0 +1,93 @@
+"""A folder in which maps run as processes of the real command line, and things are done to them."""
+
+import os
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import xarray as xr
+
+from jaxgran.dataset import read_dataset
+
+DRIVER = Path(__file__).with_name("fault_driver.py")
+MAP = (
+    "map --restitution 0.3,0.7 --packing-fraction 0.6,0.75 --grains 32 --seeds 2 --timestep 1e-3 "
+    "--equilibrate 0.5 --strain 40 --batch 2"
+)
+PATIENCE = 120.0
+
+
+class Lab:
+    """A folder for maps, with a cache of compiled programs and the map that nothing happened to."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        done = self.finish(self.start("whole.nc"))
+        assert done.returncode == 0, done.stderr
+        self.whole = read_dataset(folder / "whole.nc")
+
+    def start(self, output: str, *words: str, fault: str = "", workers: int = 2) -> subprocess.Popen:
+        command = [sys.executable, str(DRIVER), *MAP.split(), "--workers", str(workers), "--output", output, *words]
+        environment = os.environ | {"FAULT": fault, "XLA_FLAGS": ""}  # optimised: these maps run more than they compile
+        environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
+        streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+        return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)
+
+    def finish(self, process: subprocess.Popen) -> subprocess.CompletedProcess:
+        out, err = process.communicate(timeout=PATIENCE)
+        assert "Traceback" not in err, err
+        return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+    def wait_for(self, output: str, pattern: str = "journal-*.nc", process: subprocess.Popen | None = None) -> None:
+        """Wait until a file of the checkpoint is there."""
+        folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
+        while not any(folder.glob(pattern)):
+            assert time.monotonic() < end and (process is None or process.poll() is None)
+            time.sleep(0.02)
+
+    def wait_for_work(self, output: str, process: subprocess.Popen) -> None:
+        """Wait until the process has written or removed a journal or a batch, or ended."""
+        folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
+
+        def now() -> set[tuple[str, int]]:
+            found = set()
+            for path in folder.glob("[dj]o*.nc"):
+                with suppress(FileNotFoundError):
+                    found.add((path.name, path.stat().st_mtime_ns))
+            return found
+
+        before = now()
+        while now() == before and process.poll() is None:
+            assert time.monotonic() < end
+            time.sleep(0.02)
+
+    def assert_whole(self, output: str) -> None:
+        xr.testing.assert_equal(read_dataset(self.folder / output), self.whole)
+        assert not (self.folder / f"{output}.unfinished").exists()
+        assert not list((self.folder / output).parent.glob(".*"))  # no temporary files
+
+
+def children(process: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            text = stat.read_text()
+        except OSError:
+            continue
+        if int(text.rsplit(")", 1)[1].split()[1]) == process:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def workers_of(process: subprocess.Popen) -> list[int]:
+    """The workers of a map, without the process that multiprocessing starts beside them."""
+
+    def words(child: int) -> str:
+        try:
+            return Path(f"/proc/{child}/cmdline").read_text()
+        except OSError:
+            return ""
+
+    return [child for child in children(process.pid) if "spawn_main" in words(child)]
