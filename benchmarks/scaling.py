@@ -178,7 +178,7 @@ def mixed_map(strain: float) -> dict[str, float]:
 
 
 def _mixed_map(strain: float) -> dict[str, float]:
-    options = {"grains": 256, "seeds": 4, "timestep": 1e-3, "equilibrate": 1.0, "strain": strain}
+    options = {"grains": 256, "seeds": 4, "timestep": 5e-4, "equilibrate": 1.0, "strain": strain}
 
     def seconds(*packing_fractions: float) -> float:
         start = time.perf_counter()
