@@ -45,10 +45,11 @@ def replicated(function: Callable) -> Callable:
 
     On several devices every one does so with its share of the replicas.
     """
-    if jax.default_backend() == "cpu":
-        together = lambda *arguments: lax.map(lambda one: function(*one), arguments)  # noqa: E731
-    else:
-        together = jax.vmap(function, axis_name=AXIS)
+
+    def in_turn(*arguments):
+        return lax.map(lambda one: function(*one), arguments)
+
+    together = in_turn if jax.default_backend() == "cpu" else jax.vmap(function, axis_name=AXIS)
     return together if jax.device_count() == 1 else _shared_out(together)
 
 

@@ -36,7 +36,8 @@ def info_command() -> None:
 def _commit() -> str:
     from jaxgran.dataset import commit
 
-    return f", commit {commit()}" if commit() else ""
+    found = commit()
+    return f", commit {found}" if found else ""
 
 
 def _processor() -> str:

@@ -92,10 +92,7 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grain
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
-    if grains is not None:
-        require_room(flow, grains)
-        grains = jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
-    batch = prepare_batch(stack([flow]), key[None], equilibrate, grains=grains)
+    batch = prepare_batch(stack([flow]), key[None], equilibrate, grains=_as_batch(flow, grains))
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
@@ -236,13 +233,18 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     require_flow(flow)
     require_key(key)
     require_number("temperature", temperature, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    if grains is not None:
-        require_room(flow, grains)
-        grains = jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
-    state, found = _heated(stack([flow]), key[None], jnp.asarray([temperature], float), grains)
+    state, found = _heated(stack([flow]), key[None], jnp.asarray([temperature], float), _as_batch(flow, grains))
     if not found[0]:
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
     return jax.tree.map(lambda x: x[0], state)
+
+
+def _as_batch(flow: ShearFlow, grains: Grains | None) -> Grains | None:
+    """Grains of one's own as those of a batch of one, if they suit the flow."""
+    if grains is None:
+        return None
+    require_room(flow, grains)
+    return jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
 
 
 @jax.jit

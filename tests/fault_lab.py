@@ -7,10 +7,15 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import pytest
 import xarray as xr
 
 from jaxgran.dataset import read_dataset
 
+MARKS = [
+    pytest.mark.faults,
+    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
+]
 DRIVER = Path(__file__).with_name("fault_driver.py")
 MAP = (
     "map --restitution 0.3,0.7 --packing-fraction 0.6,0.75 --grains 32 --seeds 2 --timestep 1e-3 "

@@ -14,16 +14,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from fault_lab import Lab, workers_of
+from fault_lab import MARKS, Lab, workers_of
 
 from jaxgran import sweep
 from jaxgran.dataset import read_dataset
 from jaxgran.settings import MapSettings
 
-pytestmark = [
-    pytest.mark.faults,
-    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")

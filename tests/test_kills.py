@@ -3,18 +3,14 @@
 import random
 import re
 import time
-from pathlib import Path
 
 import pytest
 import xarray as xr
-from fault_lab import PATIENCE, Lab
+from fault_lab import MARKS, PATIENCE, Lab
 
 from jaxgran.dataset import read_dataset
 
-pytestmark = [
-    pytest.mark.faults,
-    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
-]
+pytestmark = MARKS
 KILLS = 20
 
 
