@@ -5,7 +5,7 @@ the processor, which do not count what else runs on a machine. The exponent of e
 logarithms.
 
     python benchmarks/scaling.py           # up to 1e5 grains and 4096 replicas; a quarter of an hour
-    python benchmarks/scaling.py --quick   # up to 1e4 grains and 64 replicas; most of it compilation
+    python benchmarks/scaling.py --quick   # up to 1e4 grains and 64 replicas, no mixed map; most of it compilation
     python benchmarks/scaling.py --grains 100000   # one flow, for a strain of 0.1, as JSON
 """
 
@@ -30,9 +30,9 @@ import jaxgran as jg
 from jaxgran.batch import advance_batch, stack
 from jaxgran.sweep import usable_cores
 
-GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000), (128, 1_000, 10_000)
-REPLICAS, QUICK_REPLICAS = (1, 4, 16, 64, 256, 1024, 4096), (1, 8, 64)
-TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
+GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000), (1_000, 10_000)
+REPLICAS, QUICK_REPLICAS = (1, 4, 16, 64, 256, 1024, 4096), (8, 64)
+TIMESTEPS, QUICK_TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5), (1e-2, 1e-3, 1e-4)
 PACKING_FRACTIONS, QUICK_PACKING_FRACTIONS = (0.2, 0.4, 0.6, 0.7, 0.75, 0.78, 0.8, 0.81, 0.82), (0.4, 0.7, 0.8)
 LARGE_FLOW = (0.8, 0.6)  # restitution, packing fraction
 DENSE_FLOW = (0.5, 0.8)
@@ -50,13 +50,18 @@ def main() -> None:
     if chosen.grains:
         print(json.dumps(large_flow(chosen.grains)))
         return
+    sizes, batches, dts, fractions = (
+        (QUICK_GRAINS, QUICK_REPLICAS, QUICK_TIMESTEPS, QUICK_PACKING_FRACTIONS)
+        if chosen.quick
+        else (GRAINS, REPLICAS, TIMESTEPS, PACKING_FRACTIONS)
+    )
     rows = {
-        "grains": [in_a_process_of_its_own(n) for n in (QUICK_GRAINS if chosen.quick else GRAINS)],
-        "replicas": replicas(QUICK_REPLICAS if chosen.quick else REPLICAS),
-        "timestep": timesteps(LARGE_FLOW) + timesteps(DENSE_FLOW),
-        "contacts": contacts(QUICK_PACKING_FRACTIONS if chosen.quick else PACKING_FRACTIONS),
+        "grains": [in_a_process_of_its_own(n) for n in sizes],
+        "replicas": replicas(batches),
+        "timestep": [row for at in (LARGE_FLOW, DENSE_FLOW) for row in timesteps(at, dts)],
+        "contacts": contacts(fractions),
     }
-    mixed = mixed_map(4.0 if chosen.quick else 16.0)
+    mixed = None if chosen.quick else mixed_map(16.0)
     found = exponents(rows)
     report(rows, found, mixed)
     stem = chosen.output / ("scaling_quick" if chosen.quick else "scaling")
@@ -126,13 +131,13 @@ def replicas(sizes: tuple[int, ...]) -> list[dict[str, float]]:
     return rows
 
 
-def timesteps(at: tuple[float, float]) -> list[dict[str, float]]:
+def timesteps(at: tuple[float, float], dts: tuple[float, ...]) -> list[dict[str, float]]:
     """Time of a unit of strain against the time step, 256 grains."""
     flow = jg.ShearFlow(256, *at, 1e-3)
     state = jg.prepare(flow, jax.random.key(1), equilibrate=4.0)
     compiled = jax.jit(jg.advance).lower(flow_of_arrays(flow), state, jnp.int32(1)).compile()
     rows = []
-    for dt in TIMESTEPS:
+    for dt in dts:
         shorter = flow_of_arrays(replace(flow, timestep=dt))
         state, _, _ = timed(compiled, shorter, state, STRAIN)
         state, seconds, tally = timed(compiled, shorter, state, STRAIN)
@@ -224,7 +229,7 @@ def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
     }
 
 
-def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str, float]) -> None:
+def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str, float] | None) -> None:
     for name, value in found.items():
         print(f"exponent of the cost against {name}: {value:.3f}")
     first, last = rows["grains"][0], rows["grains"][-1]
@@ -234,7 +239,8 @@ def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str
         f"{last['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain, {last['bytes per grain']} of them "
         "buffers of the advance"
     )
-    print(f"a map of ν 0.2 and 0.82 loses {100 * mixed['loss of throughput']:.1f} % of throughput against two maps")
+    if mixed:
+        print(f"a map of ν 0.2 and 0.82 loses {100 * mixed['loss of throughput']:.1f} % of throughput against two maps")
 
 
 def draw(rows: dict[str, list[dict]], found: dict[str, float]) -> Figure:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxgran.closure import Closure, predict
     from jaxgran.closure_fit import fit_closure
     from jaxgran.coarse_graining import gaussian, heaviside, lucy
-    from jaxgran.dynamics import State, advance, count_events
+    from jaxgran.dynamics import State, count_events
     from jaxgran.fields import Fields, fields_at
     from jaxgran.figures import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
     from jaxgran.flow import ShearFlow
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from jaxgran.free_cooling import Cooling, cooling
     from jaxgran.grains import Grains, own_grains, polydisperse
     from jaxgran.measure import Sample, sample
+    from jaxgran.native import advance
     from jaxgran.packing import pack
     from jaxgran.protocol import heated, prepare
     from jaxgran.rheology import friction_law
@@ -51,7 +52,7 @@ _HOME = {
     "polydisperse": "grains",
     "own_grains": "grains",
     "State": "dynamics",
-    "advance": "dynamics",
+    "advance": "native",
     "pack": "packing",
     "Tally": "tally",
     "Status": "status",

@@ -17,8 +17,9 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Int
 
-from jaxgran.dynamics import State, advance
+from jaxgran.dynamics import State
 from jaxgran.flow import ShearFlow
+from jaxgran.native import advance
 from jaxgran.replica import AXIS
 from jaxgran.tally import Tally
 

@@ -104,6 +104,13 @@ def require_state(flow: ShearFlow, state: State) -> None:
         )
 
 
+def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
+    """Raise an InputError unless this is one flow, one state of its grains and a number of time steps."""
+    require_state(flow, state)
+    words = f"a whole number of 0 to {MAX_STEPS}"
+    require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
+
+
 class _Pairs(NamedTuple):
     """Near pairs in flight: separations and relative laboratory velocities, (pairs,) each, x and y apart for speed."""
 
@@ -197,15 +204,20 @@ def advance_observed(
 
 def _ended(state: State, end: _Carry, unfinished: Callable) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
-    positions, tilt = present(end.hood, state.side)
-    status = jnp.maximum(end.sums.status, _status_if_finite(positions, end.velocities))
-    status = jnp.maximum(status, jnp.where(unfinished(end), Status.capacity, Status.ok)).astype(jnp.int32)
+    short = jnp.where(unfinished(end), Status.capacity, Status.ok).astype(jnp.int32)
+    sums = end.sums._replace(status=jnp.maximum(end.sums.status, short))
+    return ended(state, *present(end.hood, state.side), end.velocities, sums)
+
+
+def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: Sums) -> tuple[State, Tally]:
+    """The state and the tally of an advance that led from a state to these positions, tilt and velocities."""
     grains = state.grains
-    tally = end.sums.tally(
-        energy_change=_energy(grains, end.velocities) - _energy(grains, state.velocities),
-        momentum_drift=_relative_momentum(grains, end.velocities),
+    tally = sums.tally(
+        energy_change=_energy(grains, velocities) - _energy(grains, state.velocities),
+        momentum_drift=_relative_momentum(grains, velocities),
     )
-    return State(grains, positions, end.velocities, state.side, tilt), replace(tally, status=status)
+    status = jnp.maximum(sums.status, _status_if_finite(positions, velocities))
+    return State(grains, positions, velocities, state.side, tilt), replace(tally, status=status)
 
 
 def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:
@@ -217,9 +229,7 @@ def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flig
 
 def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, how: _Purpose):
     """Start and body of the loop of an advance, and whether it has to go on."""
-    require_state(flow, state)
-    words = f"a whole number of 0 to {MAX_STEPS}"
-    require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
+    require_advance(flow, state, steps)
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
 
     def look_at(hood: Neighbourhood, velocities: Array) -> Look | None:

@@ -17,8 +17,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxgran.dynamics import State, advance, require_state
+from jaxgran.dynamics import State, require_state
 from jaxgran.flow import MAX_STEPS, InputError, ShearFlow, listed, require, two_digits
+from jaxgran.native import advance
 from jaxgran.tally import Tally
 
 _CROSSING = 0.1  # of its diameter that a grain of thermal speed may cross in one step

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contacts import Contacts
 from jaxgran.display import Row, arrays, methods, rounded, statuses
-from jaxgran.dynamics import State, advance, advance_observed, require_state
+from jaxgran.dynamics import State, advance_observed, require_state
 from jaxgran.flow import InputError, ShearFlow, require_strain, require_whole, shown, two_digits
+from jaxgran.native import advance
 from jaxgran.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.snapshots import Snapshot, snapshot_of
 from jaxgran.statistics import Estimates, correlation_length, jackknife

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, Int
 from jaxgran.cell import remap_tilt, wrap
 from jaxgran.contacts import Contacts
 from jaxgran.delassus import grain_impulses
-from jaxgran.dynamics import State, advance, contacts_now, require_state
+from jaxgran.dynamics import State, contacts_now, require_state
 from jaxgran.flow import ShearFlow, require_strain, require_whole
+from jaxgran.native import advance
 from jaxgran.solver import solve
 
 _MOST_SNAPSHOTS = 10**9  # times grains

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Int
 EXTREMES = ("largest_overlap", "worst_residual", "momentum_drift", "status")  # joined by the larger one, not added
 RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
 
+FLAT_SUMS = 5, 40, 43, 110, 112, 113  # where the fields of ``Sums`` after the first begin in its numbers, and its end
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)

@@ -1,0 +1,249 @@
+"""The machine code of a processor is the plain advance: same contacts, same impulses, same sums, same failures."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+
+from jaxgran import dynamics, event_loop, native
+from jaxgran.dynamics import State
+from jaxgran.flow import InputError, ShearFlow
+from jaxgran.grains import Grains
+from jaxgran.replica import AXIS
+from jaxgran.status import Status
+
+GRAINS = pytest.GRAINS
+COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
+
+
+@pytest.fixture(scope="module")
+def native_run():
+    compiled = jax.jit(native.advance)
+    return lambda flow, state, steps: jax.block_until_ready(compiled(flow, state, jnp.int32(steps)))
+
+
+def of(packing_fraction, restitution=0.5, timestep=1e-3, tolerance=1e-12, **others) -> ShearFlow:
+    return ShearFlow(
+        GRAINS, restitution, packing_fraction, timestep, tolerance=tolerance, max_iterations=10**6, **others
+    )
+
+
+def assert_same(ours, plain, side: float, atol: float) -> None:
+    (state, tally), (expected, sums) = ours, plain
+    np.testing.assert_allclose(state.velocities, expected.velocities, atol=atol)
+    apart = np.array(state.positions - expected.positions)
+    rows = np.round(apart[:, 1] / side)
+    apart -= np.stack([rows * float(expected.tilt) * side, rows * side], axis=-1)
+    apart[:, 0] -= np.round(apart[:, 0] / side) * side
+    np.testing.assert_allclose(apart, 0, atol=atol)
+    turned = float(state.tilt - expected.tilt)
+    assert abs(turned - round(turned)) < 1e-9
+    for name in COUNTS:
+        assert getattr(tally, name) == getattr(sums, name), name
+    for name, value in vars(tally).items():
+        if name not in (*COUNTS, "iterations", "residual_counts", "worst_residual", "momentum_drift"):
+            expected_value = np.asarray(getattr(sums, name))
+            np.testing.assert_allclose(value, expected_value, rtol=1e-6, atol=1e-9 + atol, err_msg=name)
+    assert np.sum(tally.residual_counts) == tally.solves
+
+
+@pytest.mark.parametrize("shear_rate", [1.0, 0.0])
+@pytest.mark.parametrize("activation", ["midpoint", "touching"])
+@pytest.mark.parametrize(("packing_fraction", "steps"), [(0.4, 400), (0.6, 100), (0.78, 100)])
+def test_trajectory_and_sums_are_those_of_the_plain_advance(
+    flowing, run, native_run, packing_fraction, steps, activation, shear_rate
+) -> None:
+    state = flowing(packing_fraction)
+    flow = of(packing_fraction, activation=activation, shear_rate=shear_rate)
+    ours, plain = native_run(flow, state, steps), run(flow, state, steps)
+    assert ours[1].solves > 5
+    assert_same(ours, plain, float(state.side), 1e-6)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    packing_fraction=st.sampled_from([0.1, 0.4, 0.7, 0.8]),
+    restitution=st.floats(0, 1),
+    timestep=st.floats(-6, -2).map(lambda x: 10**x),
+    speed=st.floats(0, 20),
+    tilt=st.floats(-0.5, 0.49),
+    seed=st.integers(0, 10**6),
+)
+@example(packing_fraction=0.8, restitution=0.0, timestep=1e-3, speed=0.0, tilt=0.0, seed=0)
+def test_any_flow_takes_its_first_events_as_in_the_plain_advance(
+    packed, run, native_run, packing_fraction, restitution, timestep, speed, tilt, seed
+) -> None:
+    still = packed(packing_fraction)
+    velocities = speed * np.random.default_rng(seed).normal(size=(GRAINS, 2))
+    state = replace(still, velocities=jnp.asarray(velocities))
+    if tilt:  # a packing in another cell overlaps here and there: overlaps are contacts like others
+        state = replace(state, tilt=jnp.asarray(tilt))
+    flow = of(packing_fraction, restitution, timestep)
+    ours, plain = native_run(flow, state, 5), run(flow, state, 5)
+    assume(plain[1].status < Status.capacity)  # its lists are narrower: the machine code may still hold such a flow
+    assert ours[1].status == plain[1].status
+    if plain[1].status < Status.infeasible:
+        assert_same(ours, plain, float(state.side), 1e-6 * max(1, speed))
+
+
+def test_two_advances_are_one(flowing, native_run) -> None:
+    state = flowing(0.6)
+    flow = of(0.6)
+    half, first = native_run(flow, state, 40)
+    twice = native_run(flow, half, 60)
+    assert_same((twice[0], first + twice[1]), native_run(flow, state, 100), float(state.side), 1e-7)
+
+
+def test_no_step_changes_nothing(flowing, native_run) -> None:
+    state = flowing(0.6)
+    after, tally = native_run(of(0.6), state, 0)
+    jax.tree.map(np.testing.assert_array_equal, after, state)
+    assert tally.steps == 0 and tally.solves == 0
+
+
+def test_time_scales_with_the_shear_rate_bit_for_bit(flowing, native_run) -> None:
+    state = flowing(0.78)
+    slow = native_run(of(0.78), state, 300)
+    fast = native_run(of(0.78, timestep=1e-3 / 4, shear_rate=4.0), replace(state, velocities=4 * state.velocities), 300)
+    np.testing.assert_array_equal(fast[0].positions, slow[0].positions)
+    np.testing.assert_array_equal(fast[0].velocities, 4 * slow[0].velocities)
+    np.testing.assert_array_equal(fast[1].contact_moment, 4 * slow[1].contact_moment)
+    np.testing.assert_array_equal(fast[1].dissipation, 16 * slow[1].dissipation)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(restitution=st.floats(0, 1), seed=st.integers(0, 10**6), packing_fraction=st.sampled_from([0.3, 0.7, 0.8]))
+def test_momentum_is_conserved_and_free_flow_gains_no_energy(
+    packed, native_run, restitution, seed, packing_fraction
+) -> None:
+    velocities = np.random.default_rng(seed).normal(size=(GRAINS, 2))
+    state = replace(packed(packing_fraction), velocities=jnp.asarray(velocities))
+    flow = of(packing_fraction, restitution, shear_rate=0.0)
+    after, tally = native_run(flow, state, 300)
+    masses = np.asarray(state.grains.masses)[:, None]
+    np.testing.assert_allclose(np.sum(masses * after.velocities, 0), np.sum(masses * velocities, 0), atol=1e-10)
+    energy = np.sum(masses * velocities**2) / 2
+    assert float(tally.energy_change) <= 1e-12 * energy
+    np.testing.assert_allclose(tally.energy_change, -tally.dissipation, atol=1e-8 * energy)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.3, 1.0])
+def test_two_grains_rebound_with_the_restitution(scene, native_run, restitution) -> None:
+    state = scene([[10.0, 10.0], [11.2, 10.0]], [[1.0, 0.0], [-1.0, 0.0]])
+    state = replace(state, velocities=state.velocities.at[:, 0].add(state.positions[:, 1]))  # at rest but for two
+    after, tally = native_run(of(0.1, restitution, shear_rate=0.0), state, 300)
+    assert tally.collisions == 1
+    np.testing.assert_allclose(after.velocities[:2], [[-restitution, 0], [restitution, 0]], atol=1e-12)
+
+
+def test_failures_are_told(packed, flowing, native_run) -> None:
+    state = flowing(0.78)
+    lost = native_run(of(0.78), replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan)), 10)
+    assert lost[1].status == Status.nonfinite and lost[1].steps == 0
+    hasty = native_run(replace(of(0.78), max_iterations=1), state, 100)
+    assert hasty[1].status == Status.iteration_limit and hasty[1].unconverged > 0
+    squeezed = replace(state, grains=Grains(1.02 * state.grains.radii, state.grains.masses))
+    assert native_run(of(0.78), squeezed, 1)[1].status == Status.deep_overlap
+    few = 0.1 * np.random.default_rng(0).normal(size=(100, 2)) + 5
+    heap = State(
+        Grains(jnp.full(100, 0.5), jnp.ones(100)),
+        jnp.asarray(few),
+        jnp.zeros((100, 2)),
+        jnp.asarray(10.0),
+        jnp.asarray(0.0),
+    )
+    full = jax.jit(native.advance)(ShearFlow(100, 0.5, 0.7, 1e-3), heap, jnp.int32(1))
+    assert full[1].status == Status.capacity
+
+
+def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
+    """Grains that touch in a closed row can only stand still relative to each other, whatever drives them together."""
+    places = np.stack([np.arange(GRAINS) + 0.5, np.full(GRAINS, GRAINS / 2)], axis=-1)
+    velocities = np.zeros((GRAINS, 2))
+    velocities[:, 0] = -0.1 * np.sin(2 * np.pi * np.arange(GRAINS) / GRAINS)
+    grains = Grains(jnp.full(GRAINS, 0.5 * (1 + 1e-3)), jnp.ones(GRAINS))
+    state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, GRAINS, 0.0)))
+    after, tally = native_run(replace(of(0.7, 0.0, shear_rate=0.0), tolerance=1e-6), state, 1)
+    assert tally.status == Status.ok and tally.loaded_contacts >= GRAINS / 2
+    np.testing.assert_allclose(after.velocities, 0, atol=1e-5)
+
+
+def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None:
+    flow, state = of(0.6), flowing(0.6)
+    assert native.serves(flow, state)
+    assert not native.serves(replace(flow, solver="nesterov"), state)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
+    assert not native.serves(flow, single)
+    batched = jax.tree.map(lambda x: x[None], state)
+    served = []
+    jax.vmap(lambda one: served.append(native.serves(flow, one)), axis_name=AXIS)(batched)
+    assert served == [False]
+
+
+def test_transformations_apply(flowing, native_run) -> None:
+    flow, states = of(0.6), [flowing(0.6, seed) for seed in (0, 1)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    one = jax.jit(lambda state: native.advance(flow, state, jnp.int32(50)))
+    for many in (jax.vmap(one), lambda batch: jax.lax.map(one, batch)):
+        for k, found in enumerate(states):
+            jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found))
+
+
+def test_derivatives_are_those_of_the_plain_advance(flowing) -> None:
+    state = flowing(0.6)
+
+    def velocities(advance):
+        return lambda alpha: advance(replace(of(0.6), restitution=alpha), state, jnp.int32(30))[0].velocities
+
+    ours, plain = (jax.jit(jax.jacfwd(velocities(x)))(0.5) for x in (native.advance, dynamics.advance))
+    assert np.max(np.abs(plain)) > 0.1
+    np.testing.assert_array_equal(ours, plain)
+
+
+def test_mistakes_are_one_sentence(flowing) -> None:
+    with pytest.raises(InputError, match="a whole number of 0"):
+        native.advance(of(0.6), flowing(0.6), 0.5)
+    with pytest.raises(InputError, match="state must be one State"):
+        native.advance(of(0.6), jax.tree.map(lambda x: x[:3], flowing(0.6).positions), 5)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    count=st.integers(16, 300),
+    packing_fraction=st.floats(0.05, 0.8),
+    tilt=st.floats(-0.5, 0.5),
+    skin=st.floats(0.01, 1.0),
+    seed=st.integers(0, 10**6),
+)
+def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin, seed) -> None:
+    rng = np.random.default_rng(seed)
+    radii = rng.uniform(0.37, 0.63, count)
+    side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
+    reach = 2 * radii.max() + skin
+    if reach > side / 2:  # nearest images would not be unique
+        return
+    motion = np.zeros((count, 4))
+    motion[:, :2] = rng.uniform(0, side, (count, 2))
+    motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
+    room = count * (count - 1) // 2
+    pairs, images = np.empty((2, room), np.uint32), np.empty((2, room))
+    heads, links = np.empty(2 * count, np.int32), np.empty(count, np.int32)
+    grains = np.stack([radii, np.ones(count)], axis=-1)
+    found = event_loop._near_pairs(motion, grains, side, tilt, reach, skin, room, heads, links, pairs, images)
+    expected = set()
+    for row in (-1, 0, 1):
+        for column in (-2, -1, 0, 1, 2):
+            shift = np.array([(column + row * tilt) * side, row * side])
+            apart = motion[:, None, :2] - motion[None, :, :2] - shift
+            near = np.hypot(*np.moveaxis(apart, -1, 0)) <= radii[:, None] + radii[None, :] + skin
+            expected |= {(i, j, row, column) for i, j in np.argwhere(near) if i < j}
+    across = np.round(images[0, :found] / side - images[1, :found] * tilt).astype(int)
+    signs = np.where(pairs[0, :found] < pairs[1, :found], 1, -1)
+    ends = np.sort(pairs[:, :found].astype(int), axis=0)
+    got = list(zip(*ends, (signs * images[1, :found]).astype(int), signs * across, strict=True))
+    assert len(got) == len(set(got))
+    assert set(got) == expected
