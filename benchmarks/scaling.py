@@ -89,7 +89,6 @@ def large_flow(grains: int) -> dict[str, float]:
     compiled = jax.jit(jg.advance).lower(flow, state, jnp.int32(1)).compile()
     compilation = time.process_time() - start
     state, seconds, tally = timed(compiled, flow, state, STRAIN)
-    memory = compiled.memory_analysis()
     return {
         "grains": grains,
         **{name: round(value, 3) for name, value in prepared.items()},
@@ -99,7 +98,6 @@ def large_flow(grains: int) -> dict[str, float]:
         "microseconds per grain and step": float(f"{1e6 * seconds['cpu'] / (grains * float(tally.steps)):.4g}"),
         "contacts per solve": round(float(tally.contacts / tally.solves), 2),
         "status": jg.Status(int(tally.status)).name,
-        "bytes per grain": round((memory.temp_size_in_bytes + memory.argument_size_in_bytes) / grains),
         "peak resident MiB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
     }
 
@@ -236,8 +234,7 @@ def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str
     resident = (last["peak resident MiB"] - first["peak resident MiB"]) * 2**20 / (last["grains"] - first["grains"])
     print(
         f"{last['grains']} grains for a strain of {STRAIN:g}: {last['seconds']:.3g} s, peak "
-        f"{last['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain, {last['bytes per grain']} of them "
-        "buffers of the advance"
+        f"{last['peak resident MiB']} MiB; {resident:.0f} bytes more for each grain"
     )
     if mixed:
         print(f"a map of ν 0.2 and 0.82 loses {100 * mixed['loss of throughput']:.1f} % of throughput against two maps")

@@ -38,7 +38,7 @@ try:
 except ImportError:  # where there are no such locks, two runs on one output are not told apart
     fcntl = None
 
-_VERSIONS = ("jaxgran", "jax", "jaxlib", "numpy")
+_VERSIONS = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 
 class Checkpoint:

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from jaxgran.terminal import configured_jax, processor_lines
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
-_PACKAGES = ("jax", "jaxlib", "jax-md", "numpy", "scipy", "xarray", "h5netcdf", "gsd", "matplotlib")
+_PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "h5netcdf", "gsd", "matplotlib")
 _SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # beginnings of the names of variables that change runs
 
 

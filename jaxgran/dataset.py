@@ -254,7 +254,7 @@ def _attributes(settings: MapSettings) -> dict[str, Any]:
         parameters["error"] = error
         del parameters["strain"]  # every seed has its own
     flow = settings.flows()[0]
-    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numpy", "xarray")
+    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
     device = jax.devices()[0]
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",

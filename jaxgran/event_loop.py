@@ -21,6 +21,9 @@ and column: every view that is made of one would be counted, at the cost of many
 spares a test for negative ones.
 """
 
+# pyright: reportCallIssue=false
+# An intrinsic of numba is called without the context that it is defined with.
+
 import math
 
 import numpy as np
@@ -505,7 +508,7 @@ def _solve_cluster(start, stop, source, ends, network, grains, target, most_iter
         rows[c, _IX], rows[c, _IY], rows[c, _JX], rows[c, _JY] = nx * mi, ny * mi, nx * mj, ny * mj
         rows[c, _MOBILITY], rows[c, _P] = mi + mj, 0.0
         turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0  # changes of velocity
-    sweeps, squared, going = 0, math.inf, True
+    sweeps, squared, moved, felt, going = 0, math.inf, 0.0, 0.0, True
     while going:
         seen = 0.0
         for c in range(size):
@@ -625,10 +628,10 @@ def _count_solve(sums, iterations, residual, outcome, deepest):
     sums[_LARGEST + 1] = max(sums[_LARGEST + 1], residual)
 
 
-# Words of eight bytes in the structures of ``xla/ffi/api/c_api.h``, whose layout is kept from version to version: a
-# frame is (size, extensions, interface, context, stage, arguments, results, ...), arguments and results are (size,
-# extensions, count, types, pointers), a buffer is (size, extensions, dtype, data, rank, dims). A frame with an extension
-# asks which version of the interface the handler speaks.
+# Words of eight bytes in the structures of ``xla/ffi/api/c_api.h``, whose layout is kept from version to version. A
+# frame is (size, extensions, interface, context, stage, arguments, results, ...); arguments and results are (size,
+# extensions, count, types, pointers); a buffer is (size, extensions, dtype, data, rank, dims). A frame that comes with
+# an extension asks for the version that is spoken.
 _EXTENSIONS, _INTERFACE, _ARGUMENTS, _RESULTS = 1, 2, 9, 14  # of a frame
 _DATA, _DIMS = 3, 5  # of a buffer
 _VERSION = 4  # of the interface: the minor version in the upper half, and the major one, 0, in the lower

@@ -57,7 +57,8 @@ class ShearFlow:
     activation        –                  "midpoint": contact if half a step of free flight overlaps;
                                          "touching": contact if the grains overlap
     relaxation        –                  ω in (0, 2) of the Jacobi methods
-    solver            –                  projected method of the contact solve, see ``methods``
+    solver            –                  projected method of the contact solve, see ``methods``; with the default, a
+                                         processor may solve by the machine code of ``native``
     ================  =================  ===============================================================
 
     Raises:

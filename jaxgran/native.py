@@ -56,6 +56,7 @@ def advance(
       The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
       the status ``nonfinite``.
     """
+    require_advance(flow, state, steps)
     if not free_flight or events is not None or moving_contacts or not serves(flow, state):
         return dynamics.advance(flow, state, steps, free_flight, events, moving_contacts)
     return _advance(flow, state, steps)
@@ -70,7 +71,6 @@ def serves(flow: ShearFlow, state: State) -> bool:
 
 @jax.custom_jvp
 def _advance(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    require_advance(flow, state, steps)
     _register()
     dtype, grains = state.positions.dtype, state.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)

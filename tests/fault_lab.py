@@ -29,7 +29,7 @@ class Lab:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        done = self.finish(self.start("whole.nc"))
+        done = self.finish(self.start("whole.nc", workers=1))
         assert done.returncode == 0, done.stderr
         self.whole = read_dataset(folder / "whole.nc")
 

@@ -57,6 +57,7 @@ def test_exact_trajectory_gives_the_restitution_exactly() -> None:
     assert abs(fit.restitution - 0.6) < 1e-6
 
 
+@pytest.mark.slow
 def test_standard_error_is_the_scatter_over_repeated_noise() -> None:
     """Over 24 observations; the ratio of the two has a standard error of 1/√46, and noise in the frames that a window
     starts with adds a little to either."""

@@ -47,7 +47,7 @@ def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: La
     data = read_dataset(lab.folder / "deadly.nc")
     for name in ("force_ratio", "pressure", "status"):
         assert data[name].values[0, 1] == lab.whole[name].values[0, 1]
-    assert lab.finish(lab.start("deadly.nc", "--resume")).returncode == 0
+    assert lab.finish(lab.start("deadly.nc", "--resume", workers=1)).returncode == 0
     lab.assert_whole("deadly.nc")
 
 
@@ -60,7 +60,7 @@ def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab)
     *_, last = done.stderr.strip().splitlines()
     words = last.split("Continue: jaxgran ")[1].split()
     assert words[-1] == "--resume" and words[words.index("--output") + 1] == "interrupted.nc"
-    assert lab.finish(lab.start("interrupted.nc", "--resume")).returncode == 0
+    assert lab.finish(lab.start("interrupted.nc", "--resume", workers=1)).returncode == 0
     lab.assert_whole("interrupted.nc")
 
 
@@ -72,7 +72,7 @@ def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab:
     *_, last = done.stderr.strip().splitlines()
     assert last.startswith("jaxgran: stopped by the file system, File too large; what is done is in ")
     assert last.endswith("add --resume.")
-    assert lab.finish(lab.start(output, "--resume", workers=workers)).returncode == 0
+    assert lab.finish(lab.start(output, "--resume", workers=1)).returncode == 0
     lab.assert_whole(output)
 
 
@@ -88,16 +88,16 @@ def test_an_output_folder_that_is_removed_is_made_again(lab: Lab) -> None:
 
 
 def test_a_clock_that_jumps_changes_nothing(lab: Lab) -> None:
-    done = lab.finish(lab.start("clock.nc", fault="clock"))
+    done = lab.finish(lab.start("clock.nc", fault="clock", workers=1))
     assert done.returncode == 0, done.stderr
     lab.assert_whole("clock.nc")
 
 
 def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> None:
-    first = lab.start("one.nc")
+    first = lab.start("one.nc", workers=1)
     lab.wait_for("one.nc", "map.nc", first)
     for words in ([], ["--resume"]):
-        second = lab.finish(lab.start("one.nc", *words))
+        second = lab.finish(lab.start("one.nc", *words, workers=1))
         assert second.returncode == 2
         assert second.stderr.count("\n") == 1 and "another process is writing 'one.nc'" in second.stderr
     assert lab.finish(first).returncode == 0

@@ -11,7 +11,7 @@ from fault_lab import MARKS, PATIENCE, Lab
 from jaxgran.dataset import read_dataset
 
 pytestmark = MARKS
-KILLS = 20
+KILLS = {1: 14, 2: 6}  # by the number of workers
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: Lab, workers: int) -> None:
     rng, maps, kills, known = random.Random(workers), 1, 0, 0
-    while kills < KILLS // 2:
+    while kills < KILLS[workers]:
         output = f"killed{workers}-{maps}.nc"
         process = lab.start(output, "--resume", "--batch", "1", workers=workers)
         if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start

@@ -32,7 +32,7 @@ def test_quick_chart_is_written_and_nothing_fails_where_a_map_is_accepted(tmp_pa
     assert {one["outcome"] for one in default} > {"ok"}, "the chart looks beyond what is accepted"
 
 
-@pytest.mark.parametrize("packing_fraction", [0.80, 0.82, 0.83, 0.835, 0.84])
+@pytest.mark.parametrize("packing_fraction", [0.80, 0.82, 0.83, 0.835, pytest.param(0.84, marks=pytest.mark.slow)])
 def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
     """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no energy appears."""
     state, _ = warm(0.0, packing_fraction)
