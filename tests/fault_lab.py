@@ -19,7 +19,7 @@ MARKS = [
 DRIVER = Path(__file__).with_name("fault_driver.py")
 MAP = (
     "map --restitution 0.3,0.7 --packing-fraction 0.6,0.75 --grains 32 --seeds 2 --timestep 1e-3 "
-    "--equilibrate 0.5 --strain 40 --batch 2"
+    "--equilibrate 0.5 --strain 600 --batch 2"
 )
 PATIENCE = 120.0
 

@@ -96,10 +96,12 @@ def test_a_clock_that_jumps_changes_nothing(lab: Lab) -> None:
 def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> None:
     first = lab.start("one.nc", workers=1)
     lab.wait_for("one.nc", "map.nc", first)
+    os.killpg(first.pid, signal.SIGSTOP)  # it holds the file as long as it lives
     for words in ([], ["--resume"]):
         second = lab.finish(lab.start("one.nc", *words, workers=1))
         assert second.returncode == 2
         assert second.stderr.count("\n") == 1 and "another process is writing 'one.nc'" in second.stderr
+    os.killpg(first.pid, signal.SIGCONT)
     assert lab.finish(first).returncode == 0
     lab.assert_whole("one.nc")
 

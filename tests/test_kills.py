@@ -27,7 +27,7 @@ def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: L
         process = lab.start(output, "--resume", "--batch", "1", workers=workers)
         if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start
             lab.wait_for_work(output, process)
-            time.sleep(rng.uniform(0, 1.5))
+            time.sleep(rng.uniform(0, 1.0))
         else:
             time.sleep(rng.uniform(0, 3.0))
         process.kill()
