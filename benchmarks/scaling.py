@@ -252,13 +252,13 @@ def draw(rows: dict[str, list[dict]], found: dict[str, float]) -> Figure:
     replicas.plot(many, [row["cpu seconds"] for row in rows["replicas"]], "ko-", label="measured")
     _guide(replicas, many, rows["replicas"][-1]["cpu seconds"], f"linear (fitted: {found['replicas']:.2f})")
     replicas.set(xlabel="replicas of 64 grains", ylabel="processor time per unit strain (s)", title="dt = 1e-3")
-    for (alpha, nu), look in ((LARGE_FLOW, "ko-"), (DENSE_FLOW, "s--")):
+    for (alpha, nu), look, colour in ((LARGE_FLOW, "o-", "black"), (DENSE_FLOW, "s--", "tab:blue")):
         here = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
         label = f"α = {alpha:g}, ν = {nu:g} (exponent {found[f'timestep at α = {alpha:g}, ν = {nu:g}']:.2f})"
         x, y = ([row[name] for row in here] for name in ("timestep", "cpu seconds per strain"))
-        timestep.plot(x, y, look, color="black" if look[0] == "k" else "tab:blue", label=label)
+        timestep.plot(x, y, look, color=colour, label=label)
     timestep.set(xlabel="dt (1/shear rate)", ylabel="processor time per unit strain (s)", title="256 grains")
-    for alpha, look, colour in ((0.1, "^-", "tab:red"), (0.5, "s--", "tab:blue"), (0.9, "ko-", "black")):
+    for alpha, look, colour in ((0.1, "^-", "tab:red"), (0.5, "s--", "tab:blue"), (0.9, "o-", "black")):
         here = [row for row in rows["contacts"] if row["alpha"] == alpha]
         x, y = ([row[name] for row in here] for name in ("contacts per grain", "microseconds per step"))
         contact.plot(x, y, look, color=colour, label=f"α = {alpha:g}")

@@ -30,7 +30,7 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
-STRAINS = {1e-3: 1.0, 1e-4: 0.5, 1e-5: 0.1}  # advanced at a time
+STRAINS = {1e-3: 2.0, 1e-4: 1.0, 1e-5: 0.5}  # advanced at a time
 GRAINS, TOLERANCE = 256, 1e-4
 
 
