@@ -62,7 +62,7 @@ def main() -> None:
         "timestep": [row for at in (LARGE_FLOW, DENSE_FLOW) for row in timesteps(at, dts)],
         "contacts": contacts(fractions),
     }
-    mixed = None if chosen.quick else mixed_map(16.0)
+    mixed = None if chosen.quick else mixed_map(48.0)
     found = exponents(rows)
     report(rows, found, mixed)
     stem = chosen.output / ("scaling_quick" if chosen.quick else "scaling")

@@ -209,7 +209,7 @@ def predicted_cost(flow: ShearFlow) -> float:
     over, so that ten times as many steps cost little more than twice as much.
     """
     alpha, nu, dt = (float(x) for x in (flow.restitution, flow.packing_fraction, flow.timestep))
-    return (20 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
+    return (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
 
 
 def _remaining(
