@@ -234,7 +234,7 @@ def exponents(rows: dict[str, list[dict]]) -> dict[str, float]:
 def report(rows: dict[str, list[dict]], found: dict[str, float], mixed: dict[str, float] | None) -> None:
     for name, value in found.items():
         print(f"exponent of the cost against {name}: {value:.3f}")
-    first, last = rows["grains"][0], rows["grains"][-1]
+    first, *_, last = (row for row in rows["grains"] if row["grains"] >= LINEAR_FROM)  # of one program
     resident = (last["peak resident MiB"] - first["peak resident MiB"]) * 2**20 / (last["grains"] - first["grains"])
     print(
         f"{last['grains']} grains for a strain of {STRAIN:g}: {last['seconds']:.3g} s, peak "

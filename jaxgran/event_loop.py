@@ -16,6 +16,9 @@ which they are a contact follow from a quadratic equation, and hold until one of
   approaches needs no impulses. Each may leave the share of the permitted squared residual that its number of contacts
   has in those of all clusters.
 
+Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for semidefinite W by
+O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977).
+
 Everything is compiled by numba when it is first needed, and kept on disc. Arrays are handed on whole and read by row
 and column: every view that is made of one would be counted, at the cost of many contacts. Indices are unsigned, which
 spares a test for negative ones.
@@ -31,6 +34,8 @@ from llvmlite import ir
 from numba import carray, cfunc, njit, types
 from numba.extending import intrinsic
 
+from jaxgran.dynamics import DEEP_OVERLAP
+from jaxgran.solver import JAMMED_RESPONSE
 from jaxgran.status import Status
 from jaxgran.tally import FLAT_SUMS, RESIDUAL_EDGES
 
@@ -46,7 +51,6 @@ _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cel
 _LANES = 64  # entries of the calendar that are compared together
 _EPS = float(np.finfo(np.float64).eps)
 _EDGES = RESIDUAL_EDGES[1:-1]
-_DEEP_OVERLAP, _JAMMED_RESPONSE = 1e-2, 1e-2
 _RELAXATION, _RELAXATION_OF_FEW, _FEW = 1.45, 1.2, 32  # over-relaxation, and that of clusters of up to 32 contacts
 _OK, _ITERATION_LIMIT, _OVERLAP = int(Status.ok), int(Status.iteration_limit), int(Status.deep_overlap)
 _INFEASIBLE, _CAPACITY, _NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
@@ -180,7 +184,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             _gather_kicks(contacts, hits, touched, bounce, ends, network, kicks, loaded)
             _count(sums, contacts, bounce, ends, network, grains, kicks, loaded)
             _count_solve(sums, iterations, residual, outcome, deepest)
-            status = max(status, outcome, _OVERLAP if deepest > _DEEP_OVERLAP else _OK)
+            status = max(status, outcome, _OVERLAP if deepest > DEEP_OVERLAP else _OK)
 
             for h in range(hits):
                 g = touched[h]
@@ -568,7 +572,7 @@ def _solve_cluster(start, stop, source, ends, network, grains, target, most_iter
         return sweeps, squared, _OK
     if not squared < math.inf:
         return sweeps, squared, _NONFINITE
-    return sweeps, squared, _INFEASIBLE if moved < _JAMMED_RESPONSE * felt else _ITERATION_LIMIT
+    return sweeps, squared, _INFEASIBLE if moved < JAMMED_RESPONSE * felt else _ITERATION_LIMIT
 
 
 @_compiled

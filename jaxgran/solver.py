@@ -35,7 +35,7 @@ from jaxgran.methods import METHODS, Iterate, dot
 from jaxgran.replica import any_replica, where_active
 from jaxgran.status import Status
 
-_JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
 _DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
 _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 
@@ -126,7 +126,7 @@ def solve(
 
     def is_jammed():
         last, moved = end.at.point  # the best iterate may be an early one, whose impulses have not grown yet
-        return dot(last, moved) < _JAMMED_RESPONSE * -dot(b, last)
+        return dot(last, moved) < JAMMED_RESPONSE * -dot(b, last)
 
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
