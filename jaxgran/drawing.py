@@ -9,6 +9,7 @@ import os
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -179,9 +180,18 @@ def force_lines(
 # ------------------------------------------------------------------------------------- frame and text
 
 
+class ShownFigure(Figure):
+    """A figure that a notebook shows where it is the last line of a cell, though no global plotting state exists."""
+
+    def _repr_png_(self) -> bytes:
+        memory = BytesIO()
+        self.savefig(memory, format="png", dpi=110)
+        return memory.getvalue()
+
+
 def empty_figure(width: float, height: float) -> Figure:
     """Return a figure of a size in inches that draws without a display."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = ShownFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

@@ -153,6 +153,11 @@ def test_error_bars_have_the_length_of_the_standard_error() -> None:
         np.testing.assert_allclose(ends, expected, rtol=1e-12)
 
 
+def test_a_notebook_shows_a_figure_though_no_plotting_state_exists() -> None:
+    figure = ratio_contours(ratio_dataset())
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
 def test_curves_are_told_apart_without_colour() -> None:
     lines = [c.lines[0] for c in ratio_curves(ratio_dataset(alphas=14)).axes[0].containers]
     assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 14
