@@ -12,9 +12,10 @@ which they are a contact follow from a quadratic equation, and hold until one of
 - *One list of near pairs*, found through a grid of cells, valid as long as the fastest pair cannot have crossed its
   skin.
 - *Clusters apart.* Isolated pairs have a closed form. The others are solved cluster by cluster, one contact after the
-  other (projected Gauss–Seidel sweeps, which converge for every relaxation between 0 and 2); a cluster in which nothing
-  approaches needs no impulses. Each may leave the share of the permitted squared residual that its number of contacts
-  has in those of all clusters.
+  other, by projected Gauss–Seidel sweeps; where these are slow (long chains, grains of very different mass, flows about
+  to jam) the default of ``methods`` goes on from where they stand. A cluster in which nothing approaches needs no
+  impulses. Each may leave the share of the permitted squared residual that its number of contacts has in those of all
+  clusters.
 
 Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for semidefinite W by
 O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977).
@@ -52,6 +53,8 @@ _LANES = 64  # entries of the calendar that are compared together
 _EPS = float(np.finfo(np.float64).eps)
 _EDGES = RESIDUAL_EDGES[1:-1]
 _RELAXATION, _RELAXATION_OF_FEW, _FEW = 1.45, 1.2, 32  # over-relaxation, and that of clusters of up to 32 contacts
+_SWEEPS = 200  # after which a cluster is taken for a stiff one
+_LONGEST_STRIDE, _WINDOW, _PROGRESS = 1e4, 100, 0.5  # as in ``methods``
 _OK, _ITERATION_LIMIT, _OVERLAP = int(Status.ok), int(Status.iteration_limit), int(Status.deep_overlap)
 _INFEASIBLE, _CAPACITY, _NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
 
@@ -62,6 +65,8 @@ _ACROSS, _ROW = range(2)  # rows of the images: r_i − r_j − (across, row·L)
 _STRIKES, _BEGINS, _ENDS = range(3)  # rows of the calendar, in steps since the search
 _NX, _NY, _APPROACH, _DISTANCE, _IMPULSE = range(5)  # rows of the network
 _PULL_X, _PULL_Y, _DRIVE, _IX, _IY, _JX, _JY, _MOBILITY, _P = range(9)  # columns of what a contact brings to the solver
+
+_RESPONSE, _STEP, _CHANGE, _BEST, _BOUND = range(5)  # columns of the same of a stiff cluster
 
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 
@@ -114,7 +119,8 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
     number = np.full(count, -1, np.int32)
     for g in range(count):
         parent[g] = g
-    kicks, rows = np.zeros((count, 2)), np.empty((size, 9))
+    kicks, matrices = np.zeros((count, 2)), np.empty((count, 3))
+    rows, stiff = np.empty((size, 9)), np.empty((size, 5))
 
     done, solved = 0, 0  # steps until the last search; whether the contacts of the present step have been dealt with
     status = _OK if finite else _NONFINITE
@@ -177,8 +183,9 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
                     begin, end = starts[m], starts[m + 1]
                     share = target * target * (end - begin) / starts[clusters]
                     needed, left, missed = _solve_cluster(
-                        begin, end, source, ends, network, grains, share, most_iterations, rows, scratch, kicks
-                    )
+                        begin, end, source, ends, network, grains, share, most_iterations, rows, stiff, scratch, kicks,
+                        matrices,
+                    )  # fmt: skip
                     iterations, squared, outcome = max(iterations, needed), squared + left, max(outcome, missed)
             residual = math.sqrt(squared) / max(math.sqrt(scale), target)
             _gather_kicks(contacts, hits, touched, bounce, ends, network, kicks, loaded)
@@ -518,14 +525,52 @@ def _sort_by_cluster(coupled, source, ends, network, parent, number, starts, scr
 
 
 @_compiled
-def _solve_cluster(start, stop, source, ends, network, grains, target, most_iterations, rows, scratch, turns):
-    """Write the impulses p₀ of one cluster at restitution zero, by projected Gauss–Seidel sweeps with over-relaxation.
+def _solve_cluster(
+    start, stop, source, ends, network, grains, target, most_iterations, rows, stiff, scratch, turns, matrices
+):
+    """Write the impulses p₀ of one cluster at restitution zero.
 
-    The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc p, u), so a sweep
-    estimates the norm for nothing; that of one state decides. ``target`` is the squared residual to reach. Returns the
-    sweeps, the squared residual, and ok, iteration_limit, infeasible or nonfinite.
+    ``target`` is the squared residual to reach. Returns the iterations, the squared residual, and ok, iteration_limit,
+    infeasible or nonfinite.
     """
     size = np.uint64(stop - start)
+    sweeps = min(most_iterations, _SWEEPS)
+    iterations, squared = _sweep(start, size, source, ends, network, grains, target, sweeps, rows, scratch, turns)
+    jammed = _is_jammed(size, rows, scratch, turns)
+    if squared > target and squared < math.inf and iterations < most_iterations:
+        needed, squared = _descend(size, target, most_iterations - iterations, rows, stiff, scratch, turns, matrices)
+        jammed = _is_jammed(size, rows, scratch, turns)  # the last iterate: impulses of the best may not have grown yet
+        iterations += needed
+        for c in range(size):
+            rows[c, _P] = stiff[c, _BEST]
+    for c in range(size):
+        network[_IMPULSE, source[start + c]] = rows[c, _P]
+    if squared <= target:
+        return iterations, squared, _OK
+    if not squared < math.inf:
+        return iterations, squared, _NONFINITE
+    return iterations, squared, _INFEASIBLE if jammed else _ITERATION_LIMIT
+
+
+@_compiled
+def _is_jammed(size, rows, scratch, turns):
+    """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at a solution."""
+    moved = felt = 0.0
+    for c in range(size):
+        i, j = scratch[_FIRST, c], scratch[_SECOND, c]
+        fall = rows[c, _PULL_X] * (turns[j, 0] - turns[i, 0]) + rows[c, _PULL_Y] * (turns[j, 1] - turns[i, 1])
+        moved -= rows[c, _P] * fall * rows[c, _MOBILITY]
+        felt -= rows[c, _P] * rows[c, _DRIVE] * rows[c, _MOBILITY]
+    return moved < JAMMED_RESPONSE * felt
+
+
+@_compiled
+def _sweep(start, size, source, ends, network, grains, target, most_sweeps, rows, scratch, turns):
+    """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared residual.
+
+    The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc p, u), so a sweep
+    estimates the norm for nothing; that of one state decides. ``turns`` are the changes of the grains' velocities.
+    """
     relaxation = _RELAXATION if size > _FEW else _RELAXATION_OF_FEW
     for c in range(size):
         s = source[start + c]
@@ -537,8 +582,8 @@ def _solve_cluster(start, stop, source, ends, network, grains, target, most_iter
         rows[c, _DRIVE] = network[_APPROACH, s] * reduced_mass
         rows[c, _IX], rows[c, _IY], rows[c, _JX], rows[c, _JY] = nx * mi, ny * mi, nx * mj, ny * mj
         rows[c, _MOBILITY], rows[c, _P] = mi + mj, 0.0
-        turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0  # changes of velocity
-    sweeps, squared, moved, felt, going = 0, math.inf, 0.0, 0.0, True
+        turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0
+    sweeps, squared, going = 0, math.inf, True
     while going:
         seen = 0.0
         for c in range(size):
@@ -555,24 +600,93 @@ def _solve_cluster(start, stop, source, ends, network, grains, target, most_iter
                 error = change * rows[c, _MOBILITY]
                 seen += error * error
         sweeps += 1
-        going = sweeps < most_iterations and seen < math.inf
+        going = sweeps < most_sweeps and seen < math.inf
         if seen <= target * relaxation * relaxation or not going:
-            squared = moved = felt = 0.0
+            squared = 0.0
             for c in range(size):
                 i, j = scratch[_FIRST, c], scratch[_SECOND, c]
                 fall = rows[c, _PULL_X] * (turns[j, 0] - turns[i, 0]) + rows[c, _PULL_Y] * (turns[j, 1] - turns[i, 1])
                 error = min(rows[c, _P], rows[c, _DRIVE] - fall) * rows[c, _MOBILITY]
                 squared += error * error
-                moved -= rows[c, _P] * fall * rows[c, _MOBILITY]
-                felt -= rows[c, _P] * rows[c, _DRIVE] * rows[c, _MOBILITY]
             going &= not squared <= target
+    return sweeps, squared
+
+
+@_compiled
+def _descend(size, target, most_iterations, rows, stiff, scratch, turns, matrices):
+    """The guarded method of Barzilai and Borwein (``methods``), from the impulses where the sweeps ended.
+
+    Returns the products with W and the squared residual of the best iterate, whose impulses are in ``stiff``.
+    """
     for c in range(size):
-        network[_IMPULSE, source[start + c]] = rows[c, _P]
-    if squared <= target:
-        return sweeps, squared, _OK
-    if not squared < math.inf:
-        return sweeps, squared, _NONFINITE
-    return sweeps, squared, _INFEASIBLE if moved < JAMMED_RESPONSE * felt else _ITERATION_LIMIT
+        for end in range(2):
+            matrices[scratch[end, c], 0] = matrices[scratch[end, c], 1] = matrices[scratch[end, c], 2] = 0.0
+    for c in range(size):
+        nx, ny = rows[c, _PULL_X] * rows[c, _MOBILITY], rows[c, _PULL_Y] * rows[c, _MOBILITY]
+        for end in range(2):
+            g = scratch[end, c]
+            matrices[g, 0] += nx * nx
+            matrices[g, 1] += nx * ny
+            matrices[g, 2] += ny * ny
+    for c in range(size):
+        nx, ny = rows[c, _PULL_X] * rows[c, _MOBILITY], rows[c, _PULL_Y] * rows[c, _MOBILITY]
+        i, j = scratch[_FIRST, c], scratch[_SECOND, c]
+        inverse_mass_i = nx * rows[c, _IX] + ny * rows[c, _IY]
+        inverse_mass_j = nx * rows[c, _JX] + ny * rows[c, _JY]
+        bound = _largest_eigenvalue(matrices, i) * inverse_mass_i + _largest_eigenvalue(matrices, j) * inverse_mass_j
+        stiff[c, _BOUND], stiff[c, _STEP], stiff[c, _CHANGE], stiff[c, _BEST] = bound, 0.0, 0.0, rows[c, _P]
+        stiff[c, _RESPONSE] = nx * (turns[i, 0] - turns[j, 0]) + ny * (turns[i, 1] - turns[j, 1])
+    stride, momentum, before, best, squared = 1.0, -1, math.inf, math.inf, math.inf
+    iterations = 0
+    while iterations == 0 or (iterations < most_iterations and not squared <= target and squared < math.inf):
+        push, descent = max(momentum, 0) / (max(momentum, 0) + 3.0), 0.0
+        for c in range(size):
+            i, j = scratch[_FIRST, c], scratch[_SECOND, c]
+            old, bound = rows[c, _P], stiff[c, _BOUND]
+            at = old + push * stiff[c, _STEP]
+            slope = stiff[c, _RESPONSE] + push * stiff[c, _CHANGE] + rows[c, _DRIVE] * rows[c, _MOBILITY]
+            new = max(0.0, at - stride * slope / bound)
+            descent += (at - new) * (new - old) * bound
+            stiff[c, _STEP] = new - old
+            rows[c, _P] = new
+            turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0
+        for c in range(size):
+            i, j, press = scratch[_FIRST, c], scratch[_SECOND, c], rows[c, _P]
+            turns[i, 0] += press * rows[c, _IX]
+            turns[i, 1] += press * rows[c, _IY]
+            turns[j, 0] -= press * rows[c, _JX]
+            turns[j, 1] -= press * rows[c, _JY]
+        squared = mixed = long = short = 0.0
+        for c in range(size):
+            i, j, bound = scratch[_FIRST, c], scratch[_SECOND, c], stiff[c, _BOUND]
+            pull = rows[c, _PULL_X] * (turns[i, 0] - turns[j, 0]) + rows[c, _PULL_Y] * (turns[i, 1] - turns[j, 1])
+            response = pull * rows[c, _MOBILITY]
+            error = min(rows[c, _P], pull + rows[c, _DRIVE]) * rows[c, _MOBILITY]
+            step, change = stiff[c, _STEP], response - stiff[c, _RESPONSE]
+            stiff[c, _CHANGE], stiff[c, _RESPONSE] = change, response
+            squared += error * error
+            mixed += step * change
+            long += step * step * bound
+            short += change * change / bound
+        if squared < best:
+            best = squared
+            for c in range(size):
+                stiff[c, _BEST] = rows[c, _P]
+        judged = iterations % _WINDOW == _WINDOW - 1
+        if momentum >= 0 or (judged and not math.sqrt(best) < _PROGRESS * before):
+            momentum, stride = 0 if descent > 0.0 else max(momentum, -1) + 1, 1.0
+        else:
+            over, under = (mixed, short) if iterations % 2 == 0 else (long, mixed)
+            stride = min(over / under, _LONGEST_STRIDE) if under > 0.0 else _LONGEST_STRIDE
+        before = math.sqrt(best) if judged else before
+        iterations += 1
+    return iterations, best
+
+
+@_compiled
+def _largest_eigenvalue(matrices, g):
+    xx, xy, yy = matrices[g, 0], matrices[g, 1], matrices[g, 2]
+    return (xx + yy + math.sqrt((xx - yy) * (xx - yy) + 4 * xy * xy)) / 2
 
 
 @_compiled

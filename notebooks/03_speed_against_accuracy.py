@@ -58,7 +58,8 @@ for timestep in timesteps:
     pressure.append(float(sample.pressure))
     error.append(float(sample.errors()["pressure"]))
     print(
-        f"dt {timestep:7.0e}   {1e3 * seconds[-1]:6.2f} ms a unit of strain   pressure {pressure[-1]:6.2f} ± {error[-1]:.2f}"
+        f"dt {timestep:7.0e}   {1e3 * seconds[-1]:6.2f} ms a unit of strain   "
+        f"pressure {pressure[-1]:6.2f} ± {error[-1]:.2f}"
     )
 
 # %% [markdown]

@@ -173,6 +173,24 @@ def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
     np.testing.assert_allclose(after.velocities, 0, atol=1e-5)
 
 
+@pytest.mark.parametrize("heaviest", [1.0, 1e4])
+def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heaviest) -> None:
+    """One grain runs into a long row of touching ones, light and heavy in turn: sweeps alone would take thousands."""
+    gap = 1e-9
+    places = np.stack([2 + np.arange(GRAINS) * (1 - gap), np.full(GRAINS, 30.0)], axis=-1)
+    velocities = np.zeros((GRAINS, 2))
+    velocities[0, 0] = 1.0
+    masses = np.where(np.arange(GRAINS) % 2, heaviest, 1.0)
+    grains = Grains(jnp.full(GRAINS, 0.5), jnp.asarray(masses))
+    state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 60.0, 0.0)))
+    flow = of(0.01, 0.0, tolerance=1e-9, shear_rate=0.0)
+    ours, plain = native_run(flow, state, 1), run(flow, state, 1)
+    assert ours[1].status == plain[1].status == Status.ok
+    assert ours[1].iterations > event_loop._SWEEPS
+    np.testing.assert_allclose(ours[0].velocities, plain[0].velocities, atol=1e-7)
+    np.testing.assert_allclose(ours[1].impulse, plain[1].impulse, rtol=1e-5)
+
+
 def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None:
     flow, state = of(0.6), flowing(0.6)
     assert native.serves(flow, state)
