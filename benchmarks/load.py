@@ -4,7 +4,7 @@
 - 10,000 points of tiny work: the time of a sweep, with its checkpoint and its dataset, less that spent in the batches.
 - A soak: sweeps one after another in one process for a given time, with the resident memory of the process.
 
-    python benchmarks/load.py [--quick] [--soak MINUTES]    # about 15 minutes on one core, and the soak
+    python benchmarks/load.py [--quick] [--soak MINUTES]    # about 4 minutes on one core, and the soak
 """
 
 import argparse

@@ -4,7 +4,7 @@ Every size of a flow is measured in a process of its own, whose largest resident
 the processor, which do not count what else runs on a machine. The exponent of each growth is a least-squares fit to the
 logarithms.
 
-    python benchmarks/scaling.py           # up to 1e5 grains and 4096 replicas; a quarter of an hour
+    python benchmarks/scaling.py           # up to 1e5 grains and 4096 replicas; 5 minutes
     python benchmarks/scaling.py --quick   # up to 1e4 grains and 64 replicas, no mixed map; most of it compilation
     python benchmarks/scaling.py --grains 100000   # one flow, for a strain of 0.1, as JSON
 """

@@ -4,8 +4,8 @@ For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxg
 by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
 printed and written as JSON and PNG. Compilation is reported apart, as is the memory of 1000 replicas.
 
-    python benchmarks/step_cost.py            # about 2 minutes
-    python benchmarks/step_cost.py --quick    # about 1 minute
+    python benchmarks/step_cost.py            # about 1 minute
+    python benchmarks/step_cost.py --quick    # half a minute
 """
 
 import argparse

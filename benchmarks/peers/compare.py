@@ -10,7 +10,7 @@ tolerance of 1e-6 over a longer strain.
 
 The time to an error of 3 % is read off the front of error against time, in logarithms (see ``front.py``).
 
-    python benchmarks/peers/compare.py           # about 30 minutes
+    python benchmarks/peers/compare.py           # about 20 minutes
     python benchmarks/peers/compare.py --flow 2  # the second flow alone, in the place of that of an earlier result
     python benchmarks/peers/compare.py --quick   # one flow of 256 discs, under 3 minutes
 """
