@@ -99,6 +99,28 @@ def test_two_advances_are_one(flowing, native_run) -> None:
     assert_same((twice[0], first + twice[1]), native_run(flow, state, 100), float(state.side), 1e-7)
 
 
+@pytest.mark.parametrize("rows", [10, 50])  # 100 grains, and more than the machine code takes as they come
+def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
+    rng, count = np.random.default_rng(rows), rows * rows
+    radii = rng.uniform(0.37, 0.63, count)
+    places = 1.5 * np.stack(np.divmod(np.arange(count), rows), axis=-1) + 0.1
+    state = State(
+        Grains(jnp.asarray(radii), jnp.asarray(4 * radii**2)),
+        jnp.asarray(places),
+        jnp.asarray(3 * rng.normal(size=(count, 2))),
+        jnp.asarray(1.5 * rows),
+        jnp.asarray(0.0),
+    )
+    flow = ShearFlow(count, 0.9, 0.4, 1e-3, tolerance=1e-12)
+    advance = jax.jit(native.advance)
+    shuffled = rng.permutation(count)
+    after, tally = advance(flow, state, jnp.int32(100))
+    other, sums = advance(flow, jax.tree.map(lambda x: x[shuffled] if x.ndim else x, state), jnp.int32(100))
+    assert tally.collisions > count / 10
+    np.testing.assert_allclose(after.velocities[shuffled], other.velocities, atol=1e-6)
+    np.testing.assert_allclose(tally.contact_moment, sums.contact_moment, rtol=1e-6)
+
+
 def test_no_step_changes_nothing(flowing, native_run) -> None:
     state = flowing(0.6)
     after, tally = native_run(of(0.6), state, 0)
