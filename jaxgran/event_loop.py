@@ -45,7 +45,7 @@ _SUMS = _TILT + 1
 
 _PAIRS_PER_GRAIN = 2.7  # expected within the skin: wide lists cost the events, narrow ones the searches
 _PAIR_CAPACITY = 16  # slots of pairs for each grain
-_NARROWEST = 0.02  # share of the skin below which a list that does not fit is given up
+_NARROWER = 12  # lists that are tried with ever narrower skins, where pairs are more than there is room for
 _LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
 _NEVER, _MANY = np.int32(2**31 - 1), 2.0**30
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
@@ -103,7 +103,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             finite &= abs(motion[g, a]) < math.inf
     widest = max(side / 2 - largest, 1e-3)  # nearest images are unique
     expected = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
-    usual = max(expected, 0.05)
+    usual = min(max(expected, 0.05), widest)
 
     room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
     slots = (room + _LANES - 1) // _LANES * _LANES
@@ -128,14 +128,19 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         fastest = _wrapped(motion, side, tilt, rate)
         sxx, sxy, syy = _kinetic(motion, grains, rate)
         skin = 1.2 * (2 * fastest * (1 + _LIFE) + rate * largest) * ahead  # what one step may need
-        skin, found = min(max(skin, usual), widest), room + 1
-        while found > room and skin >= _NARROWEST * usual:
+        skin, found = min(max(skin, usual), widest), 0
+        for _ in range(_NARROWER):
             found = _near_pairs(motion, grains, side, tilt, largest + skin, skin, room, heads, links, pairs, images)
-            skin = skin if found <= room else 0.7 * skin
+            if found <= room:
+                break
+            skin *= 0.7
         loss = 2 * fastest * (1 + _LIFE) + rate * (largest + skin) / 2  # of the skin in unit time, at most
         slack = skin - loss * ahead
         if found > room or slack < 0.0:
             found, status = min(found, room), max(status, _CAPACITY)
+        if not loss < math.inf:
+            status = _NONFINITE
+            break
         _index_pairs(pairs, found, offsets, of_grain)
         blocks = (found + _LANES - 1) // _LANES
         life = _LIFE / rate if rate > 0.0 else math.inf
@@ -169,7 +174,8 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
 
             t = k * dt
             contacts = _contacts_of_step(k, calendar, blocks, met)
-            if contacts > size:
+            overfull = contacts > size
+            if overfull:
                 contacts, status = size, max(status, _CAPACITY)
             hits, scale, deepest = _make_network(
                 contacts, met, t, side, rate, pairs, images, motion, grains, ends, network, degree, touched
@@ -227,9 +233,10 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
                             _ask(p, t, k + 1, horizon, side, rate, dt, theta, pairs, images, motion, grains, calendar)
             for h in range(hits):
                 kicks[touched[h], 0] = kicks[touched[h], 1] = 0.0
-            for c in range(contacts):
-                if calendar[_STRIKES, met[c]] <= k:  # it approached by no more than rounding
-                    _ask(met[c], t, k + 1, horizon, side, rate, dt, theta, pairs, images, motion, grains, calendar)
+            for c in range(found if overfull else contacts):
+                p = np.uint32(c) if overfull else met[c]
+                if calendar[_STRIKES, p] <= k:  # it approached by no more than rounding, or there was no room for it
+                    _ask(p, t, k + 1, horizon, side, rate, dt, theta, pairs, images, motion, grains, calendar)
 
         t = k * dt
         done += k
@@ -263,7 +270,8 @@ def _order(positions, side, tilt):
         if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
             row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
             fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
-            cell[g] = row * across + min(int((fraction - math.floor(fraction)) * across), across - 1)
+            column = int((fraction - math.floor(fraction)) * across)
+            cell[g] = row * across + min(max(column, 0), across - 1)
         before[cell[g] + 1] += 1
     for c in range(before.size - 1):
         before[c + 1] += before[c]
@@ -304,17 +312,16 @@ def _kinetic(motion, grains, rate):
 def _near_pairs(motion, grains, side, tilt, reach, skin, room, heads, links, pairs, images):
     """Write the pairs with a gap within the skin, and their images; what there is no room for is only counted."""
     count, found = motion.shape[0], 0
-    up, along = int(side / reach), int(side / (reach * math.sqrt(1.0 + tilt * tilt)))
-    while up * along > heads.size:
-        up, along = up - 1, along - 1
-    small = up < 3 or along < 3  # all pairs, by nearest images
+    most = math.sqrt(heads.size)
+    up, along = int(min(most, side / reach)), int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
+    small = not (up >= 3 and along >= 3)  # all pairs, by nearest images
     cells = 1 if small else up * along
     for cell in range(cells):
         heads[cell] = -1
     for g in range(count):
         cell = 0
         if not small:
-            row = min(int(motion[g, _Y] / side * up), up - 1)
+            row = min(max(int(motion[g, _Y] / side * up), 0), up - 1)
             fraction = (motion[g, _X] - tilt * motion[g, _Y]) / side
             cell = row * along + min(max(int(fraction * along), 0), along - 1)
         links[g] = heads[cell]
@@ -397,11 +404,11 @@ def _ask(p, t, earliest, horizon, side, rate, dt, theta, pairs, images, motion, 
         return
     root = math.sqrt(discriminant)
     now, per_step = t / dt, 1 / (speed * dt)
-    turn = _step(math.ceil(now - closing * per_step))  # the first step in which the pair recedes
+    turn = _step(np.ceil(now - closing * per_step))  # the first step in which the pair recedes
     enter = excess / ((root - closing) * dt) if closing < 0.0 else -(root + closing) * per_step
-    begin = max(earliest, _step(math.ceil(now + enter - theta)))
-    last = max(turn - 1, _step(math.floor(now + (root - closing) * per_step - theta)))
-    if begin <= last:
+    begin = max(earliest, _step(np.ceil(now + enter - theta)))
+    last = max(turn - 1, _step(np.floor(now + (root - closing) * per_step - theta)))
+    if begin <= last and begin < _MANY:
         calendar[_BEGINS, p], calendar[_ENDS, p] = begin, last
         if begin < turn:
             calendar[_STRIKES, p] = begin
@@ -409,7 +416,10 @@ def _ask(p, t, earliest, horizon, side, rate, dt, theta, pairs, images, motion, 
 
 @_compiled
 def _step(number):
-    return int(min(max(number, -1.0), _MANY))
+    """The number as a step of the calendar: -1 for what is past or no number, and never beyond its end."""
+    if number > _MANY:
+        return int(_MANY)
+    return int(number) if number > -1.0 else -1
 
 
 @_compiled

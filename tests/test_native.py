@@ -256,6 +256,27 @@ def test_mistakes_are_one_sentence(flowing) -> None:
         native.advance(of(0.6), jax.tree.map(lambda x: x[:3], flowing(0.6).positions), 5)
 
 
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(
+    place=st.floats(-300, 308).map(lambda x: 10**x),
+    speed=st.floats(-300, 308).map(lambda x: 10**x),
+    radius=st.sampled_from([0.0, -0.5, 1e-300, 0.5, 1e3, 1e300, np.nan, np.inf]),
+    mass=st.sampled_from([0.0, 1e-300, 1.0, 1e300, np.nan]),
+    side=st.sampled_from([0.0, -5.0, 1e-300, 6.0, 1e300, np.nan]),
+    tilt=st.sampled_from([0.0, 0.3, 1e300, np.nan]),
+    shear_rate=st.sampled_from([0.0, 1.0]),
+)
+@example(place=1.0, speed=1.0, radius=0.5, mass=1.0, side=6.0, tilt=0.0, shear_rate=1.0)  # more contacts than room
+def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass, side, tilt, shear_rate) -> None:
+    """Whatever a state holds, the loop ends, and what cannot be is flagged; here that nothing is NaN and called ok."""
+    rng = np.random.default_rng(0)
+    arrays = (place * rng.uniform(-1, 1, (GRAINS, 2)), speed * rng.uniform(-1, 1, (GRAINS, 2)), side, tilt)
+    state = State(Grains(jnp.full(GRAINS, radius), jnp.full(GRAINS, mass)), *(jnp.asarray(x, float) for x in arrays))
+    after, tally = native_run(replace(of(0.6, shear_rate=shear_rate), max_iterations=100), state, 20)
+    if not np.all(np.isfinite(after.velocities)):
+        assert tally.status == Status.nonfinite
+
+
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     count=st.integers(16, 300),

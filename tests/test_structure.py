@@ -34,7 +34,7 @@ def flow() -> ShearFlow:
 
 @pytest.fixture(scope="module")
 def seen(flow, flowing) -> Snapshot:
-    return series(snapshot_series(flow, flowing(0.75), 50.0, SNAPSHOTS)[1])
+    return series(snapshot_series(flow, flowing(0.75), 200.0, SNAPSHOTS)[1])
 
 
 CHAIN_AND_PAIR = [(0, 1, 2.0), (2, 1, 1.0), (3, 4, 1.0), (4, 5, 0.0)]
