@@ -250,7 +250,7 @@ def sample(
       strain: strain γ̇t to sample, rounded to whole time steps. A change of it compiles nothing anew.
       blocks: number of equal parts that the tallies are kept for, static.
       observe: what else to average, a function of a ``Snapshot`` that returns a pytree of arrays; looked at by the
-        plain advance, which on a processor takes 5 to 20 times as long as the machine code; static, so that a new
+        plain advance, which on a processor takes 5 to 7 times as long as the machine code; static, so that a new
         function compiles anew. The contacts of a snapshot are those of a step in which some approach, before they act,
         in buffers of several sizes: sum over them. A step without has none, so a mean over steps counts zero for it.
       callback: called after each block with the state and the sample so far; where it returns something true, the

@@ -34,8 +34,8 @@ def advance(
     """Advance one replica by a number of time steps.
 
     On a processor, in double precision, with the default solver and no more arguments than these three, this is a loop
-    of machine code that solves the same steps to the same tolerance as the plain advance, 5 to 20 times faster; nothing
-    but rounding and what the tolerance leaves open tells them apart.
+    of machine code that solves the same steps to the same tolerance as the plain advance, typically 5 to 7 times
+    faster; nothing but rounding and what the tolerance leaves open tells them apart.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
     (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
