@@ -161,26 +161,9 @@ def advance(
     events: int | None = None,
     moving_contacts: bool = False,
 ) -> tuple[State, Tally]:
-    """Advance one replica by a number of time steps.
+    """Advance one replica: the plain advance, which is differentiated and serves every backend.
 
-    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
-    (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
-    every event, about 0.7 kB for each grain, and finds its contacts and impulses again on the way back.
-
-    Args:
-      flow: parameters; all numbers of one replica.
-      state: the flow at the beginning.
-      steps: number of time steps, traced.
-      free_flight: whether steps without an approaching contact are jumped over. ``False`` visits every step;
-        the trajectory is the same.
-      events: None for as many evaluations as it takes, or the number of them, static, in a loop of fixed length: one
-        for each step that is visited, ``steps + 1`` at most, see ``count_events``. Where they do not suffice the
-        status is ``capacity``.
-      moving_contacts: whether derivatives include that a contact moves in time, see the module. Values do not change.
-
-    Returns:
-      The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
-      the status ``nonfinite``.
+    Arguments, derivatives and results are those of the public ``advance`` of ``native``.
     """
     rungs = None if events is None and not moving_contacts else _FEW_RUNGS
     how = _Purpose(rungs, moving_contacts)
