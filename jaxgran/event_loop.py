@@ -134,7 +134,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             if found <= room:
                 break
             skin *= 0.7
-        loss = 2 * fastest * (1 + _LIFE) + rate * (largest + skin) / 2  # of the skin in unit time, at most
+        loss = _loss(fastest, rate, largest + skin)
         slack = skin - loss * ahead
         if found > room or slack < 0.0:
             found, status = min(found, room), max(status, _CAPACITY)
@@ -220,7 +220,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             if not finite:
                 status = _NONFINITE
                 break
-            loss_before, loss = loss, 2 * fastest * (1 + _LIFE) + rate * (largest + skin) / 2
+            loss_before, loss = loss, _loss(fastest, rate, largest + skin)
             slack -= (loss - loss_before) * ahead
             horizon = max(min(slack / loss, life - t), dt) + ahead
             for h in range(hits):
@@ -243,10 +243,8 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         tilt += rate * t
         tilt -= math.floor(tilt + 0.5)
         for g in range(count):
-            cx = motion[g, _VX] - rate * (motion[g, _Y] + motion[g, _VY] * t)
             motion[g, _X] += motion[g, _VX] * t
             motion[g, _Y] += motion[g, _VY] * t
-            motion[g, _VX] = cx + rate * motion[g, _Y]
 
     for g in range(count):
         given = order[g]
@@ -256,6 +254,12 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             for a in range(2):
                 new_positions[given, a], new_velocities[given, a] = positions[given, a], velocities[given, a]
     sums[_STATUS], sums[_TILT] = status, tilt
+
+
+@_compiled
+def _loss(fastest, rate, distance):
+    """How much of its skin a list may lose in unit time, where pairs are within a distance."""
+    return 2 * fastest * (1 + _LIFE) + rate * distance / 2
 
 
 @_compiled
