@@ -63,12 +63,8 @@ def is_contact(
       >>> [bool(is_contact(apart, closing, reach, time)[0][0]) for time in (0.9, 1.1)]
       [False, True]
     """
-    squared_speed, closing = _dot(velocities, velocities), _dot(separations, velocities)
-    approaching = closing < 0
-    before_closest = -closing < squared_speed * look_ahead
-    t = jnp.where(approaching & before_closest, -closing / jnp.where(approaching, squared_speed, 1), look_ahead)
-    f = _dot(separations, separations) - reach**2 + t * (2 * closing + t * squared_speed)
-    contact = (f <= 0) & (reach > 0)
+    contact, approaching = overlaps_within(*_motion(separations, velocities, reach), look_ahead)
+    contact = contact & (reach > 0)
     return contact, contact & approaching
 
 
@@ -84,13 +80,35 @@ def first_contact_time(
       >>> float(time[0]), float(closest[0])
       (1.0, 2.0)
     """
-    squared_speed, closing = _dot(velocities, velocities), _dot(separations, velocities)
-    excess = _dot(separations, separations) - reach**2
-    discriminant = closing**2 - squared_speed * excess
+    return time_to_touch(*_motion(separations, velocities, reach))
+
+
+def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: float | Array) -> tuple:
+    """The rule of ``is_contact`` for pairs of any shape: whether they are contacts, and whether they approach.
+
+    Args:
+      squared_speed, closing, excess: |u|², s·u and |s|² − d² of pairs with separation s, relative velocity u, reach d.
+      look_ahead: θ·dt.
+    """
+    approaching = closing < 0
+    before_closest = -closing < squared_speed * look_ahead
+    t = jnp.where(approaching & before_closest, -closing / jnp.where(approaching, squared_speed, 1), look_ahead)
+    return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
+
+
+def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
+    """The times of ``first_contact_time`` from the numbers that ``overlaps_within`` takes."""
+    discriminant = closing * closing - squared_speed * excess
     touches = (closing < 0) & (discriminant >= 0)
     time = excess / (jnp.sqrt(jnp.where(touches, discriminant, 1)) - jnp.where(touches, closing, 0))
     closest = -closing / jnp.where(closing < 0, squared_speed, 1)
     return jnp.where(touches, time, jnp.inf), closest
+
+
+def _motion(separations: Array, velocities: Array, reach: Array) -> tuple[Array, Array, Array]:
+    """|u|², s·u and |s|² − d²."""
+    excess = _dot(separations, separations) - reach**2
+    return _dot(velocities, velocities), _dot(separations, velocities), excess
 
 
 def contact_network(

@@ -36,6 +36,7 @@ from numba import carray, cfunc, njit, types
 from numba.extending import intrinsic
 
 from jaxgran.dynamics import DEEP_OVERLAP
+from jaxgran.methods import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.solver import JAMMED_RESPONSE
 from jaxgran.status import Status
 from jaxgran.tally import FLAT_SUMS, RESIDUAL_EDGES
@@ -54,7 +55,6 @@ _EPS = float(np.finfo(np.float64).eps)
 _EDGES = RESIDUAL_EDGES[1:-1]
 _RELAXATION, _RELAXATION_OF_FEW, _FEW = 1.45, 1.2, 32  # over-relaxation, and that of clusters of up to 32 contacts
 _SWEEPS = 200  # after which a cluster is taken for a stiff one
-_LONGEST_STRIDE, _WINDOW, _PROGRESS = 1e4, 100, 0.5  # as in ``methods``
 _OK, _ITERATION_LIMIT, _OVERLAP = int(Status.ok), int(Status.iteration_limit), int(Status.deep_overlap)
 _INFEASIBLE, _CAPACITY, _NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
 
@@ -686,12 +686,12 @@ def _descend(size, target, most_iterations, rows, stiff, scratch, turns, matrice
             best = squared
             for c in range(size):
                 stiff[c, _BEST] = rows[c, _P]
-        judged = iterations % _WINDOW == _WINDOW - 1
-        if momentum >= 0 or (judged and not math.sqrt(best) < _PROGRESS * before):
+        judged = iterations % WINDOW == WINDOW - 1
+        if momentum >= 0 or (judged and not math.sqrt(best) < PROGRESS * before):
             momentum, stride = 0 if descent > 0.0 else max(momentum, -1) + 1, 1.0
         else:
             over, under = (mixed, short) if iterations % 2 == 0 else (long, mixed)
-            stride = min(over / under, _LONGEST_STRIDE) if under > 0.0 else _LONGEST_STRIDE
+            stride = min(over / under, LONGEST_STRIDE) if under > 0.0 else LONGEST_STRIDE
         before = math.sqrt(best) if judged else before
         iterations += 1
     return iterations, best

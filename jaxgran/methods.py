@@ -37,8 +37,8 @@ from jaxgran.contacts import Contacts
 from jaxgran.delassus import count_bound, diagonal, spectral_bound
 from jaxgran.flow import Solver
 
-_LONGEST_STRIDE = 1e4
-_WINDOW, _PROGRESS = 100, 0.5
+LONGEST_STRIDE = 1e4
+WINDOW, PROGRESS = 100, 0.5
 
 
 class Iterate(NamedTuple):
@@ -102,14 +102,14 @@ def _stride(now: Iterate, relaxation: Array) -> tuple[Array, Array]:
 def _spectral_stride(now: Iterate, start: Array, point: Array, bound: Array, residual: Array) -> tuple[Array, ...]:
     """Step length, momentum (negative as long as the method is not Nesterov's), best residual when last judged."""
     _, k, before = now.memory
-    judged = now.iterations % _WINDOW == _WINDOW - 1
-    guarded = (k >= 0) | (judged & ~(residual < _PROGRESS * before))
+    judged = now.iterations % WINDOW == WINDOW - 1
+    guarded = (k >= 0) | (judged & ~(residual < PROGRESS * before))
     step, response = point - now.point
     long = now.iterations % 2 == 1
     left = jnp.where(long | guarded, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
     own, mixed = dot(left, jnp.where(long | guarded, step, response)), dot(step, response)
     over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
-    stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), _LONGEST_STRIDE), _LONGEST_STRIDE)
+    stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), LONGEST_STRIDE), LONGEST_STRIDE)
     momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
     return (
         jnp.where(guarded, 1, stride),
