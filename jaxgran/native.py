@@ -1,12 +1,21 @@
-"""The advance in use: machine code (``event_loop``) on a processor, the plain ``dynamics.advance`` everywhere else.
+"""The advance in use: the fastest that there is for a flow here and now.
 
-XLA calls the machine code through its foreign function interface, so ``jit``, ``lax.map`` and ``vmap`` apply to it as
-to everything else. Derivatives are those of the plain advance, which also serves accelerators, single precision, every
-method of the contact solve but the default, and batches with a named axis.
+==================  ==========================================================================================
+on                  what advances a replica
+==================  ==========================================================================================
+a processor         machine code (``event_loop``), in double precision, unless a batch has a named axis
+a GPU               a thread block (``thread_block``), up to 1024 grains, in single or double precision
+anything else       the plain ``dynamics.advance``; so too derivatives, and every method of the contact solve but the
+                    default
+==================  ==========================================================================================
+
+All three solve the same steps to the same tolerance. XLA calls the machine code through its foreign function interface,
+and the thread block as a kernel of Pallas, so ``jit``, ``lax.map`` and ``vmap`` apply to them as to everything else.
 """
 
 import ctypes
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +30,7 @@ from jaxgran.tally import FLAT_SUMS, Sums, Tally
 
 _TARGET = "jaxgran_advance"
 _SOLVER = ShearFlow.__dataclass_fields__["solver"].default
+Engine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
 
 
 def advance(
@@ -33,9 +43,9 @@ def advance(
 ) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
 
-    On a processor, in double precision, with the default solver and no more arguments than these three, this is a loop
-    of machine code that solves the same steps to the same tolerance as the plain advance, typically 5 to 7 times
-    faster; nothing but rounding and what the tolerance leaves open tells them apart.
+    On a processor or a GPU, with the default solver and no more arguments than these three, this is a loop of
+    compiled code that solves the same steps to the same tolerance as the plain advance, see ``native``; on a processor
+    it is typically 5 to 7 times faster. Nothing but rounding and what the tolerance leaves open tells them apart.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
     (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
@@ -57,20 +67,39 @@ def advance(
       the status ``nonfinite``.
     """
     require_advance(flow, state, steps)
-    if not free_flight or events is not None or moving_contacts or not serves(flow, state):
+    by = engine(flow, state)
+    if not free_flight or events is not None or moving_contacts or by is None:
         return dynamics.advance(flow, state, steps, free_flight, events, moving_contacts)
-    return _advance(flow, state, steps)
+    return _advance(by, flow, state, steps)
 
 
-def serves(flow: ShearFlow, state: State) -> bool:
-    """Whether the machine code can advance a flow, here and now."""
-    here = jax.default_backend() == "cpu" and not in_batch()
-    doubles = all(x.dtype == jnp.float64 for x in jax.tree.leaves(state))
-    return here and doubles and flow.solver == _SOLVER
+def engine(flow: ShearFlow, state: State) -> Engine | None:
+    """What advances a flow here and now: ``machine_code``, ``thread_block.advance``, or None for the plain advance."""
+    dtypes = {x.dtype for x in jax.tree.leaves(state)}
+    if flow.solver != _SOLVER or len(dtypes) > 1:
+        return None
+    (dtype,) = dtypes
+    if jax.default_backend() == "cpu":
+        return machine_code if dtype == jnp.float64 and not in_batch() else None
+    if jax.default_backend() == "gpu":
+        from jaxgran import thread_block
+
+        return thread_block.advance if thread_block.serves(flow.grains, dtype) else None
+    return None
 
 
-@jax.custom_jvp
-def _advance(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _advance(by: Engine, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    return by(flow, state, steps)
+
+
+@_advance.defjvp
+def _advance_jvp(by: Engine, primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
+    return jax.jvp(dynamics.advance, primals, tangents)
+
+
+def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica by ``event_loop``."""
     _register()
     dtype, grains = state.positions.dtype, state.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
@@ -82,11 +111,6 @@ def _advance(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]
     flights, contacts, clusters, solves, largest, status, tilt = jnp.split(sums, FLAT_SUMS)
     gathered = Sums(flights, contacts.reshape(7, 5), clusters, solves, largest, status[0].astype(jnp.int32))
     return ended(state, wrap(positions, state.side, tilt[0]), tilt[0], velocities, gathered)
-
-
-@_advance.defjvp
-def _advance_jvp(primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
-    return jax.jvp(dynamics.advance, primals, tangents)
 
 
 @cache

@@ -18,8 +18,10 @@ The kernel runs as it is in the interpreter of Pallas, on any machine, which is 
 compiles it.
 """
 
+import math
+import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +36,7 @@ from jaxgran.cell import wrap
 from jaxgran.contacts import overlaps_within, time_to_touch
 from jaxgran.dynamics import DEEP_OVERLAP, State, ended
 from jaxgran.flow import ShearFlow
+from jaxgran.grains import Grains
 from jaxgran.methods import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.solver import JAMMED_RESPONSE
 from jaxgran.status import Status
@@ -52,7 +55,7 @@ _X, _Y, _VX, _VY, _RADIUS, _INVERSE_MASS = range(6)  # rows of what is given; th
 _PULL_X, _PULL_Y, _WIDTH, _SHARED = range(4, 8)  # velocity changes by impulses, and eigenvalues of the spectral bound
 _TOUCHING, _LOADED = range(2)  # rows of the counts
 _NX, _NY, _APPROACH, _DISTANCE, _IMPULSE, _RESPONSE, _STEP, _CHANGE, _BEST, _BOUND, _ROWS = range(11)  # of the network
-_CONTACT_SUMS = 17
+_CONTACT_SUMS, _KINETIC, _RESIDUALS, _SUMS = 17, 17, 20, 21  # rows of the sums: of contacts, of flights, of solves
 
 
 class _Flow(NamedTuple):
@@ -84,7 +87,7 @@ class _Block(NamedTuple):
     moved: Any  # (4, threads): positions and peculiar velocities at the end
     totals: Any  # (27,): sums over all grains, and the tilt
     state: Any  # (1,): status
-    solves: Any  # (threads,): solves by residual
+    sums: Any  # (21, threads): what each grain adds to the sums, and the solves by residual
     shared: Any  # (7, threads): what grains tell each other
     counts: Any  # (2, threads): the same of counts
     near: Any  # (near, threads): near grains and their images
@@ -109,6 +112,11 @@ class _Thread(NamedTuple):
             memory = self.block.counts if value.dtype == jnp.int32 else self.block.shared
             memory[row, :] = value
         self.wait()
+
+    def add(self, row: int, values: Sequence[Array]) -> None:
+        """Add to the sums of the thread, from a row on."""
+        for n, value in enumerate(values, row):
+            self.block.sums[n, :] = self.block.sums[n, :] + value
 
     def ask(self, memory: Any, row: int, other: Array, mask: Array) -> Array:
         """What other threads have told, zero where the mask is not set."""
@@ -142,13 +150,14 @@ class _Lists(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Sums of the advance: those of grains one a thread."""
+    """Sums of the advance that are not one for each grain: time, and what there is of solves."""
 
     time: Array
-    kinetic: tuple[Array, ...]  # of each grain, the integrals of m c_x c_x, m c_x c_y and m c_y c_y
-    contacts: tuple[Array, ...]  # of each grain, see ``_tallied``
-    solved: tuple[Array, ...]  # networks, iterations, unconverged ones, the deepest overlap, the worst residual
-    residuals: Array  # solves by residual, a bin a thread
+    networks: Array
+    iterations: Array
+    unconverged: Array
+    overlap: Array  # the deepest one
+    residual: Array  # the worst one
 
 
 class _Carry(NamedTuple):
@@ -188,7 +197,7 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: boo
         memory(4, threads),
         memory(32),
         memory(1, kind=jnp.int32),
-        memory(threads),
+        memory(_SUMS, threads),
         memory(_SHARED, threads),
         memory(2, threads, kind=jnp.int32),
         memory(_NEAR, threads, kind=jnp.int32),
@@ -202,7 +211,7 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: boo
         compiler_params=triton.CompilerParams(num_warps=threads // _WARP),
         name="jaxgran_advance",
     )
-    moved, totals, status, residuals, *_ = call(
+    moved, totals, status, sums, *_ = call(
         jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers]),
         jnp.stack([jnp.asarray(x).astype(jnp.int32) for x in (flow.max_iterations, steps, int(Status.ok))]),
         jnp.pad(given, ((0, 0), (0, threads - count))),
@@ -212,7 +221,32 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: boo
     idle = steps == 0  # as it was, to the bit
     positions = jnp.where(idle, state.positions, wrap(jnp.stack([x, y], axis=-1), side, totals[27]))
     velocities = jnp.where(idle, state.velocities, jnp.stack([cx, cy], axis=-1))
-    return ended(state, positions, totals[27], velocities, _sums(totals, residuals, status[0]))
+    return ended(state, positions, totals[27], velocities, _sums(totals, sums[_RESIDUALS], status[0]))
+
+
+@cache
+def serves(grains: int, dtype: jnp.dtype) -> bool:
+    """Whether the kernel runs on the device at hand: tried once, on two grains that meet head on among others at rest."""
+    if grains > MOST_GRAINS:
+        return False
+    row = math.isqrt(grains - 1) + 1
+    places = 5.0 * np.stack([np.arange(grains) % row, np.arange(grains) // row], axis=-1) + 1
+    places[1, 0] = 2.5
+    speeds = np.zeros((grains, 2))
+    speeds[:2, 0] = 1, -1
+    flow = ShearFlow(grains, 0.5, 0.03, 1e-2, shear_rate=0.0)
+    try:
+        with jax.ensure_compile_time_eval():
+            numbers = (jnp.asarray(x, dtype) for x in (places, speeds, 5 * row, 0))
+            state = State(Grains(jnp.full(grains, 0.5, dtype), jnp.ones(grains, dtype)), *numbers)
+            after, tally = jax.jit(advance)(flow, state, jnp.int32(50))
+        right = np.allclose(after.velocities, -flow.restitution * speeds, atol=1e-5) and tally.collisions == 1
+        problem = "" if right else "it gets a collision wrong"
+    except Exception as error:  # of a compiler, a driver or a device: there is no saying which
+        problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    if problem:
+        warnings.warn(f"flows take the plain advance: the kernel for GPUs does not run here ({problem}).", stacklevel=2)
+    return not problem
 
 
 def _sums(totals: Array, residuals: Array, status: Array) -> Sums:
@@ -243,16 +277,17 @@ def _kernel(*memory: Any, grains: int, interpret: bool) -> None:
     )
     x, y, cx, cy = given[:4]
     start = _Grains(x, y, cx + flow.shear_rate * y, cy)
-    zero, none, nothing = jnp.zeros_like(x), jnp.zeros_like(number), jnp.zeros_like(flow.side)
+    none, nothing = jnp.zeros_like(number), jnp.zeros_like(flow.side)
+    for row in range(_SUMS):
+        block.sums[row, :] = jnp.zeros_like(x)
     finite = (abs(x) < jnp.inf) & (abs(y) < jnp.inf) & (abs(cx) < jnp.inf) & (abs(cy) < jnp.inf)
-    counts = _Counts(nothing, (zero,) * 3, (zero,) * _CONTACT_SUMS, (nothing,) * 5, zero)
     carry = _Carry(
         grains=start,
         lists=_Lists(jnp.int32(0), none, flow.tilt, nothing, nothing, nothing - 1),
         step=jnp.int32(0),
         solved=jnp.int32(0),
-        status=jnp.where(_all(finite), 0, int(Status.nonfinite)).astype(jnp.int32),
-        counts=counts,
+        status=_if(~_all(finite), Status.nonfinite),
+        counts=_Counts(*[nothing] * 6),
     )
     end = lax.while_loop(
         lambda now: (now.step < flow.steps) & (now.status < int(Status.nonfinite)),
@@ -262,12 +297,13 @@ def _kernel(*memory: Any, grains: int, interpret: bool) -> None:
     x, y, vx, vy = end.grains
     for row, value in enumerate((x, y, vx - flow.shear_rate * y, vy)):
         block.moved[row, :] = value
-    sums = [jnp.sum(value) / 2 for value in end.counts.contacts]  # every contact was seen from both of its grains
-    sums += [end.counts.time, end.step.astype(x.dtype), *map(jnp.sum, end.counts.kinetic), *end.counts.solved]
-    for n, value in enumerate([*sums, _remapped(end.lists.tilt + flow.shear_rate * end.lists.age)]):
+    sums = [jnp.sum(block.sums[row, :]) for row in range(_RESIDUALS)]
+    contacts, kinetic = [total / 2 for total in sums[:_KINETIC]], sums[_KINETIC:]  # each contact was seen twice
+    time, *solves = end.counts
+    tilt = _remapped(end.lists.tilt + flow.shear_rate * end.lists.age)
+    for n, value in enumerate([*contacts, time, end.step.astype(x.dtype), *kinetic, *solves, tilt]):
         block.totals[n] = value
     block.state[0] = end.status
-    block.solves[:] = end.counts.residuals
 
 
 def _event(thread: _Thread, grains: int, now: _Carry) -> _Carry:
@@ -310,8 +346,8 @@ def _event(thread: _Thread, grains: int, now: _Carry) -> _Carry:
     lists = lists._replace(age=lists.age + flight, slack=lists.slack - loss * flight)
     thread.tell((_X, _Y, _VX, _VY), after)
     torn = lists.slack - loss * ahead < -16 * flow.epsilon * lists.skin
-    status = jnp.maximum(status, jnp.where(torn, int(Status.capacity), 0).astype(jnp.int32))
-    status = jnp.maximum(status, jnp.where(loss < jnp.inf, 0, int(Status.nonfinite)).astype(jnp.int32))
+    status = jnp.maximum(status, _if(torn, Status.capacity))
+    status = jnp.maximum(status, _if(~(loss < jnp.inf), Status.nonfinite))
     status = jnp.maximum(jnp.maximum(now.status, crowded), status)
     return _Carry(after, lists, step, (step < flow.steps).astype(jnp.int32), status, counts)
 
@@ -320,8 +356,9 @@ def _all(predicate: Array) -> Array:
     return jnp.min(predicate.astype(jnp.int32)) > 0
 
 
-def _any(predicate: Array) -> Array:
-    return jnp.max(predicate.astype(jnp.int32)) > 0
+def _if(predicate: Array, status: Status) -> Array:
+    """The status where the predicate holds, and ok elsewhere."""
+    return int(status) * predicate.astype(jnp.int32)
 
 
 def _fastest(grains: _Grains, rate: Array) -> Array:
@@ -380,7 +417,7 @@ def _search(
 
     tried = lambda at: (at[0] < _NARROWER) & (at[3] > _NEAR)  # noqa: E731
     _, skin, near, longest = lax.while_loop(tried, narrowed, (jnp.int32(1), skin, near, jnp.max(near)))
-    crowded = jnp.where(longest > _NEAR, int(Status.capacity), 0).astype(jnp.int32)
+    crowded = _if(longest > _NEAR, Status.capacity)
     lists = _Lists(jnp.minimum(longest, _NEAR), jnp.minimum(near, _NEAR), tilt, 0 * side, skin, skin)
     return wrapped, lists, crowded
 
@@ -441,10 +478,9 @@ def _flown(thread: _Thread, counts: _Counts, grains: _Grains, flight: Array) -> 
     cx, cy = grains.vx - thread.flow.shear_rate * grains.y, grains.vy
     mass = jnp.where(thread.inverse_mass > 0, 1 / jnp.where(thread.inverse_mass > 0, thread.inverse_mass, 1), 0)
     turned = thread.flow.shear_rate * flight
-    xx, xy, yy = counts.kinetic
-    xx = xx + mass * flight * (cx * cx - turned * cx * cy + turned * turned / 3 * cy * cy)
-    xy = xy + mass * flight * (cx * cy - turned / 2 * cy * cy)
-    return counts._replace(time=counts.time + flight, kinetic=(xx, xy, yy + mass * flight * cy * cy))
+    xx = cx * cx - turned * cx * cy + turned * turned / 3 * cy * cy
+    thread.add(_KINETIC, [mass * flight * x for x in (xx, cx * cy - turned / 2 * cy * cy, cy * cy)])
+    return counts._replace(time=counts.time + flight)
 
 
 def _collide(
@@ -499,7 +535,7 @@ def _solved(
 ) -> tuple[_Grains, _Counts, Array]:
     """Velocities after the impulses of the contacts of one step, the counts with them, and the status."""
     flow, block = thread.flow, thread.block
-    network, bounce, number = block.network, 1 + flow.restitution, thread.number
+    network, bounce = block.network, 1 + flow.restitution
     target = flow.tolerance * jnp.sqrt(scale) + 10 * flow.epsilon * flow.shear_rate
     thread.tell([_TOUCHING], [touching])
     most = jnp.max(touching)
@@ -531,7 +567,7 @@ def _solved(
     pull_x, pull_y, loaded = _pulls(thread, touching, most, _IMPULSE)
     thread.tell((_PULL_X, _PULL_Y, _LOADED), (pull_x, pull_y, loaded))
 
-    def tallied(m: Array, sums: tuple[Array, ...]) -> tuple[Array, ...]:
+    def tally(m: Array, _: Array) -> Array:
         real = m < touching
         other = thread.read(block.partners, m, mask=real)
         rows = (_NX, _NY, _APPROACH, _DISTANCE, _IMPULSE)
@@ -549,25 +585,22 @@ def _solved(
         new += [weight * moment for weight in (push, single, jnp.where(clustered, push, 0)) for moment in moments]
         new += [-push * (approach + response), push * (bounce / 2 * approach + response)]
         new += [jnp.where(real, jnp.maximum(reach - distance, 0), 0)]
-        return tuple(a + b for a, b in zip(sums, new, strict=True))
+        thread.add(0, new)
+        return _
 
+    lax.fori_loop(0, most, tally, flow.ok)
     residual = jnp.sqrt(solve.squared) / jnp.maximum(jnp.sqrt(scale), target)
     here = (residual > block.bins[0, :]) & (residual <= block.bins[1, :])
-    networks, iterations, unconverged, overlap, worst = counts.solved
+    thread.add(_RESIDUALS, [here.astype(zero.dtype)])
     counts = counts._replace(
-        contacts=lax.fori_loop(0, most, tallied, counts.contacts),
-        residuals=counts.residuals + here.astype(zero.dtype),
-        solved=(
-            networks + 1,
-            iterations + solve.iterations.astype(target.dtype),
-            unconverged + (solve.status != 0).astype(target.dtype),
-            jnp.maximum(overlap, deepest),
-            jnp.maximum(worst, residual),
-        ),
+        networks=counts.networks + 1,
+        iterations=counts.iterations + solve.iterations.astype(target.dtype),
+        unconverged=counts.unconverged + (solve.status != 0).astype(target.dtype),
+        overlap=jnp.maximum(counts.overlap, deepest),
+        residual=jnp.maximum(counts.residual, residual),
     )
-    deep = jnp.where(deepest > DEEP_OVERLAP, int(Status.deep_overlap), 0).astype(jnp.int32)
+    deep = _if(deepest > DEEP_OVERLAP, Status.deep_overlap)
     kicked = grains._replace(vx=grains.vx + bounce * pull_x, vy=grains.vy + bounce * pull_y)
-    del number
     return kicked, counts, jnp.maximum(solve.status, deep)
 
 
@@ -715,7 +748,6 @@ def _descend(thread: _Thread, contacts: Array, most: Array, width: Array, target
 
     lax.fori_loop(0, most, settle, flow.ok)
     jammed = end.moved < JAMMED_RESPONSE * end.felt
-    missed = jnp.where(jammed, int(Status.infeasible), int(Status.iteration_limit))
-    missed = jnp.where(end.squared < jnp.inf, missed, int(Status.nonfinite))
-    status = jnp.where(end.squared <= target, int(Status.ok), missed).astype(jnp.int32)
-    return _Solve(end.iterations, end.best, status)
+    missed, finite = ~(end.squared <= target), end.squared < jnp.inf
+    status = jnp.maximum(_if(missed & jammed, Status.infeasible), _if(missed & ~jammed, Status.iteration_limit))
+    return _Solve(end.iterations, end.best, jnp.maximum(status, _if(~finite, Status.nonfinite)))

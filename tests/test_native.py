@@ -1,6 +1,7 @@
 """The machine code of a processor is the plain advance: same contacts, same impulses, same sums, same failures."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran import dynamics, event_loop, native
+from jaxgran import dynamics, event_loop, native, thread_block
 from jaxgran.dynamics import State
 from jaxgran.flow import InputError, ShearFlow
 from jaxgran.grains import Grains
@@ -21,9 +22,12 @@ GRAINS = pytest.GRAINS
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
-@pytest.fixture(scope="module")
-def native_run():
-    compiled = jax.jit(native.advance)
+ENGINES = {"machine code": native.advance, "thread block": partial(thread_block.advance, interpret=True)}
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def native_run(request):
+    compiled = jax.jit(ENGINES[request.param])
     return lambda flow, state, steps: jax.block_until_ready(compiled(flow, state, jnp.int32(steps)))
 
 
@@ -215,14 +219,14 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
 
 def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None:
     flow, state = of(0.6), flowing(0.6)
-    assert native.serves(flow, state)
-    assert not native.serves(replace(flow, solver="nesterov"), state)
+    assert native.engine(flow, state) is native.machine_code
+    assert native.engine(replace(flow, solver="nesterov"), state) is None
     single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
-    assert not native.serves(flow, single)
+    assert native.engine(flow, single) is None
     batched = jax.tree.map(lambda x: x[None], state)
-    served = []
-    jax.vmap(lambda one: served.append(native.serves(flow, one)), axis_name=AXIS)(batched)
-    assert served == [False]
+    found = []
+    jax.vmap(lambda one: found.append(native.engine(flow, one)), axis_name=AXIS)(batched)
+    assert found == [None]
 
 
 def test_transformations_apply(flowing, native_run) -> None:
