@@ -1,4 +1,7 @@
-"""The machine code of a processor is the plain advance: same contacts, same impulses, same sums, same failures."""
+"""Machine code and thread block are the plain advance: same contacts, same impulses, same sums, same failures.
+
+The thread block is interpreted here. That Pallas can lower it for a GPU needs none, and is tested too.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -227,6 +230,82 @@ def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None
     found = []
     jax.vmap(lambda one: found.append(native.engine(flow, one)), axis_name=AXIS)(batched)
     assert found == [None]
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """A processor that passes for a GPU, with a kernel that is interpreted."""
+    thread_block.serves.cache_clear()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(thread_block, "advance", partial(thread_block.advance, interpret=True))
+    yield monkeypatch
+    thread_block.serves.cache_clear()
+
+
+def test_a_gpu_takes_thread_blocks_in_batches_too(gpu, flowing) -> None:
+    flow, state = of(0.6, tolerance=1e-4), flowing(0.6)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
+    assert native.engine(flow, state) is native.engine(flow, single) is thread_block.advance
+    assert native.engine(replace(flow, solver="nesterov"), state) is None
+    assert not thread_block.serves(thread_block.MOST_GRAINS + 1, state.positions.dtype)
+    batch = jax.tree.map(lambda *x: jnp.stack(x), state, flowing(0.6, 1))
+    calls = jax.make_jaxpr(jax.vmap(lambda one: native.advance(flow, one, jnp.int32(9)), axis_name=AXIS))(batch)
+    assert "pallas_call" in str(calls) and " pmax" not in str(calls)  # replicas do not wait for each other
+
+
+@pytest.mark.parametrize("failure", ["an error", "a wrong result"])
+def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, failure) -> None:
+    def broken(flow, state, steps):
+        if failure == "an error":
+            raise RuntimeError("no such\ninstruction")
+        return state, empty_tally(state.side.dtype)
+
+    gpu.setattr(thread_block, "advance", broken)
+    said = "no such instruction" if failure == "an error" else "gets a collision wrong"
+    with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
+        assert native.engine(of(0.6), flowing(0.6)) is None
+    assert native.engine(of(0.6), flowing(0.6)) is None  # and says so once
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("count", [16, 300, 1024])
+def test_the_kernel_lowers_for_a_gpu(count, dtype) -> None:
+    """To a Triton module in which a thread is a grain, so that what a thread has written is its own."""
+    replicas = 3
+
+    def some(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((replicas, *shape), dtype)
+
+    state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
+    advance = jax.vmap(partial(thread_block.advance, ShearFlow(count, 0.5, 0.6, 1e-3)), (0, None), axis_name=AXIS)
+    traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    (call,) = (line for line in text.splitlines() if "__gpu$xla.gpu.triton" in line)
+    threads = max(64, 1 << (count - 1).bit_length())
+    assert f"grid_x = {replicas} : i32" in call and f"num_warps = {threads // 32} : i32" in call
+
+
+def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing) -> None:
+    flow, state = of(0.78), flowing(0.78)
+    lost = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan))
+    batch = jax.tree.map(lambda *x: jnp.stack(x), state, lost, state)
+    advance = jax.jit(jax.vmap(partial(ENGINES["thread block"], flow), axis_name=AXIS))
+    after, tally = advance(batch, jnp.asarray([40, 40, 0], jnp.int32))
+    assert tally.status.tolist() == [Status.ok, Status.nonfinite, Status.ok]
+    alone, sums = jax.jit(partial(ENGINES["thread block"], flow))(state, jnp.int32(40))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[0], (after, tally)), (alone, sums))
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[2], after), state)
+
+
+def test_single_precision_is_double_precision_to_its_rounding(flowing) -> None:
+    flow, state = of(0.7, tolerance=1e-6), flowing(0.7)
+    run = jax.jit(ENGINES["thread block"])
+    (after, tally), (expected, sums) = (
+        run(flow, jax.tree.map(lambda x, d=d: x.astype(d), state), jnp.int32(100)) for d in (jnp.float32, jnp.float64)
+    )
+    assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
+    np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
+    np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
 
 
 def test_transformations_apply(flowing, native_run) -> None:
