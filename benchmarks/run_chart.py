@@ -7,6 +7,7 @@ tolerance at the same time step and rule: its error is that of the solver alone.
 """
 
 import json
+import math
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -54,9 +55,9 @@ FULL = Plan(
     flows=((0.9, 0.7), (0.5, 0.8), (0.2, 0.7)),
     grains=256,
     seeds=4,
-    strain=20.0,
+    strain=100.0,
     reference=Config(1e-4, 1e-6, "midpoint"),
-    reference_strain=40.0,
+    reference_strain=200.0,
     configs=(
         *(Config(*c, "midpoint") for c in product((1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-1, 1e-2, 1e-3, 1e-4, 1e-6))),
         *(Config(*c, "touching") for c in product((1e-2, 3e-3, 1e-3, 3e-4, 1e-4), (1e-2, 1e-4, 1e-6))),
@@ -218,6 +219,7 @@ def draw(flows: list[dict]) -> Figure:
             axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set_ylim(FLOOR, 1)
             axes.axhline(0.02, color="0.6", linestyle=":", zorder=0)
+        row_of_panels[0].set_xlim(*widened([row["seconds_per_strain"] for row in flow["rows"]]))
         row_of_panels[0].set_ylabel(f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}\n|relative error|")
     for name, axes in zip(OBSERVABLES, panels[0], strict=True):
         axes.set_title(name.replace("_", " "), fontsize="medium")
@@ -237,6 +239,12 @@ def draw(flows: list[dict]) -> Figure:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", frameon=False)
     return figure
+
+
+def widened(costs: list[float]) -> tuple[float, float]:
+    """Limits of an axis of costs, so wide that its ticks have room where all cost the same."""
+    middle, width = math.sqrt(min(costs) * max(costs)), max(1.3 * math.sqrt(max(costs) / min(costs)), 2.5)
+    return middle / width, middle * width
 
 
 def draw_point(axes, row: dict, name: str, marker: str, shade: str) -> None:

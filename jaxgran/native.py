@@ -79,13 +79,19 @@ def engine(flow: ShearFlow, state: State) -> Engine | None:
     if flow.solver != _SOLVER or len(dtypes) > 1:
         return None
     (dtype,) = dtypes
-    if jax.default_backend() == "cpu":
+    if _platform() == "cpu":
         return machine_code if dtype == jnp.float64 and not in_batch() else None
-    if jax.default_backend() == "gpu":
+    if _platform() == "gpu":
         from jaxgran import thread_block
 
         return thread_block.advance if thread_block.serves(flow.grains, dtype) else None
     return None
+
+
+def _platform() -> str:
+    """Where JAX computes: "cpu", "gpu" or "tpu". What ``jax.default_device`` sets is a device, a platform, or None."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.default_backend() if device is None else getattr(device, "platform", device)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

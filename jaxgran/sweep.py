@@ -36,7 +36,7 @@ from jaxgran.store import Damaged
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
-_GRAIN_BYTES = 2000  # lists, network and state of a replica
+_GRAIN_BYTES = 5000  # lists, network and state of a replica, where threads are twice as many as grains
 _SHARE_OF_MEMORY = 0.5
 _MOST_WORKERS = 1024
 _LIKE = 2  # replicas that advance in lockstep differ in cost by at most this factor

@@ -248,6 +248,8 @@ def test_a_gpu_takes_thread_blocks_in_batches_too(gpu, flowing) -> None:
     assert native.engine(flow, state) is native.engine(flow, single) is thread_block.advance
     assert native.engine(replace(flow, solver="nesterov"), state) is None
     assert not thread_block.serves(thread_block.MOST_GRAINS + 1, state.positions.dtype)
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert native.engine(flow, state) is native.machine_code
     batch = jax.tree.map(lambda *x: jnp.stack(x), state, flowing(0.6, 1))
     calls = jax.make_jaxpr(jax.vmap(lambda one: native.advance(flow, one, jnp.int32(9)), axis_name=AXIS))(batch)
     assert "pallas_call" in str(calls) and " pmax" not in str(calls)  # replicas do not wait for each other
