@@ -16,11 +16,11 @@ SOURCES = sorted(path for path in Path(jaxgran.__file__).parent.glob("*.py") if 
 # A module imports only modules before it.
 LAYERS = """
     replica status display flow maps grains cell neighbours pairs contacts delassus methods solver tally observer
-    dynamics event_loop block block_solver thread_block native snapshots free_cooling coarse_graining fields sensitivity calibrate packing observables
-    statistics series force_chains structure measure kinetic_theory kinetics batch protocol accuracy settings store
-    recorder trajectory dataset journal checkpoint pool cluster sweep rheology closure closure_fit stress_inversion
-    cross_validation drawing contours theory_figures rheology_figures figures flow_figures movie progress terminal
-    cli_options cli_measure cli_map cli_run cli_fit cli_info cli_mistakes cli __main__
+    dynamics event_loop block block_solver thread_block native snapshots free_cooling coarse_graining fields sensitivity
+    calibrate packing observables statistics series force_chains structure measure kinetic_theory kinetics batch
+    protocol accuracy settings store recorder trajectory dataset journal checkpoint pool cluster sweep rheology closure
+    closure_fit stress_inversion cross_validation drawing contours theory_figures rheology_figures figures flow_figures
+    movie progress terminal cli_options cli_measure cli_map cli_run cli_fit cli_info cli_mistakes cli __main__
 """
 
 
