@@ -33,7 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 MAP_EXAMPLES = {
-    "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, about a minute on two cores": "jaxgran map",
+    "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
     "A plane of your own, at a time step that suits it": "jaxgran map --restitution 0.1,0.5,0.9 "
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
     "Until every point is good to 2 %, and on after an interruption": "jaxgran map --error 0.02 --resume",
