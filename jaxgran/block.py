@@ -1,7 +1,7 @@
 """What the threads of a thread block know, keep and tell each other: the ground of ``thread_block``.
 
 Every array has an entry for each thread, and a thread is a grain: what a thread has written it reads without waiting.
-It learns of other grains through ``shared`` and ``counts``, which all threads write and read between two barriers.
+It learns of other grains through ``shared`` and ``counts``, which all write between two barriers and read after both.
 
 Pallas lowers kernels to Triton with gaps that show here and in what uses it: a row is a number and not a slice of
 an array of vectors, a branch returns values and not constants (``Flow.ok`` is a zero that is one), and what is not read
@@ -95,8 +95,8 @@ class Thread(NamedTuple):
     def tell(self, rows: Sequence[int], values: Sequence[Array]) -> list[Array]:
         """Write what other threads may ask for: numbers to ``shared``, whole numbers to ``counts``.
 
-        Returns the values as they have been written: a product that a compiler fused into a later sum would not be
-        rounded as the others know it, and two grains would not see the same contact.
+        Returns the values as they have been written, for products to be used further: one that a compiler fuses into a
+        later sum is not rounded as the others know it, and two grains would not see the same contact.
         """
         self.wait()
         memory = [self.block.counts if value.dtype == jnp.int32 else self.block.shared for value in values]

@@ -152,7 +152,8 @@ def collided(
         return ok
 
     lax.fori_loop(0, most, tally, flow.ok)
-    residual = jnp.sqrt(solve.squared) / jnp.maximum(jnp.sqrt(scale), target)
+    floor = jnp.maximum(jnp.sqrt(scale), target)  # zero where what approaches does so by rounding, without shear
+    residual = jnp.sqrt(solve.squared) / jnp.where(floor > 0, floor, 1)
     mine = (residual > block.bins[0, :]) & (residual <= block.bins[1, :])
     thread.add(RESIDUALS, [mine.astype(zero.dtype)])
     counts = counts._replace(
@@ -236,7 +237,7 @@ def _descend(thread: Thread, contacts: Array, most: Array, width: Array, target:
 
         squared, over, under = lax.fori_loop(0, most, feel, (zero,) * 3)
         residual = jnp.sum(squared) / 2
-        best, judging = jnp.minimum(residual, now.best), now.iterations % WINDOW == WINDOW - 1
+        best, judging = jnp.where(residual < now.best, residual, now.best), now.iterations % WINDOW == WINDOW - 1
         guarded = (now.momentum >= 0) | (judging & ~(best < PROGRESS * PROGRESS * now.judged))
         over, under = jnp.sum(jnp.where(guarded, descent, over)), jnp.sum(under)
         stride = jnp.where(under > 0, over / jnp.where(under > 0, under, 1), LONGEST_STRIDE)

@@ -193,7 +193,8 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
                         matrices,
                     )  # fmt: skip
                     iterations, squared, outcome = max(iterations, needed), squared + left, max(outcome, missed)
-            residual = math.sqrt(squared) / max(math.sqrt(scale), target)
+            floor = max(math.sqrt(scale), target)  # zero where what approaches does so by rounding, without shear
+            residual = math.sqrt(squared) / floor if floor > 0.0 else 0.0
             _gather_kicks(contacts, hits, touched, bounce, ends, network, kicks, loaded)
             _count(sums, contacts, bounce, ends, network, grains, kicks, loaded)
             _count_solve(sums, iterations, residual, outcome, deepest)

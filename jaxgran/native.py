@@ -4,7 +4,7 @@
 on                  what advances a replica
 ==================  ==========================================================================================
 a processor         machine code (``event_loop``), in double precision, unless a batch has a named axis
-a GPU               a thread block (``thread_block``), up to 1024 grains, in single or double precision
+an NVIDIA GPU       a thread block (``thread_block``), up to 1024 grains, in single or double precision
 anything else       the plain ``dynamics.advance``; so too derivatives, and every method of the contact solve but the
                     default
 ==================  ==========================================================================================
@@ -14,11 +14,15 @@ and the thread block as a kernel of Pallas, so ``jit``, ``lax.map`` and ``vmap``
 """
 
 import ctypes
+import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran import dynamics
@@ -29,6 +33,7 @@ from jaxgran.replica import in_batch
 from jaxgran.tally import FLAT_SUMS, Sums, Tally
 
 _TARGET = "jaxgran_advance"
+MOST_GRAINS = 1024  # of a thread block: the threads that it can have
 _SOLVER = ShearFlow.__dataclass_fields__["solver"].default
 Engine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
 
@@ -43,7 +48,7 @@ def advance(
 ) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
 
-    On a processor or a GPU, with the default solver and no more arguments than these three, this is a loop of
+    On a processor or an NVIDIA GPU, with the default solver and no more arguments than these three, this is a loop of
     compiled code that solves the same steps to the same tolerance as the plain advance, see ``native``; on a processor
     it is typically 5 to 7 times faster. Nothing but rounding and what the tolerance leaves open tells them apart.
 
@@ -64,7 +69,7 @@ def advance(
 
     Returns:
       The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
-      the status ``nonfinite``.
+      the status ``nonfinite``; so does, on a GPU, one whose lists have no room, with ``capacity``.
     """
     require_advance(flow, state, steps)
     by = engine(flow, state)
@@ -74,24 +79,39 @@ def advance(
 
 
 def engine(flow: ShearFlow, state: State) -> Engine | None:
-    """What advances a flow here and now: ``machine_code``, ``thread_block.advance``, or None for the plain advance."""
+    """What advances a flow here and now: ``machine_code``, ``thread_block``, or None for the plain advance."""
     dtypes = {x.dtype for x in jax.tree.leaves(state)}
     if flow.solver != _SOLVER or len(dtypes) > 1:
         return None
     (dtype,) = dtypes
-    if _platform() == "cpu":
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # of ``jax.default_device``
+    device = jax.devices(device)[0] if device is None or isinstance(device, str) else device
+    if device.platform == "cpu":
         return machine_code if dtype == jnp.float64 and not in_batch() else None
-    if _platform() == "gpu":
+    fits = device.platform == "gpu" and flow.grains <= MOST_GRAINS
+    return (
+        thread_block if fits and _kernel_runs(flow.grains, dtype, device, jax.config.read("jax_enable_x64")) else None
+    )
+
+
+@cache
+def _kernel_runs(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> bool:
+    """Whether the kernel compiles and keeps the laws of contacts on a device: tried once."""
+
+    def trial() -> None:
         from jaxgran import thread_block
 
-        return thread_block.advance if thread_block.serves(flow.grains, dtype) else None
-    return None
+        with jax.default_device(device), jax.enable_x64(x64):
+            thread_block.trial(grains, dtype)
 
-
-def _platform() -> str:
-    """Where JAX computes: "cpu", "gpu" or "tpu". What ``jax.default_device`` sets is a device, a platform, or None."""
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-    return jax.default_backend() if device is None else getattr(device, "platform", device)
+    try:
+        with ThreadPoolExecutor(1) as other:  # what is being traced here is not traced there
+            other.submit(trial).result()
+    except Exception as error:  # of a compiler, a driver or a device: there is no saying which
+        problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        warnings.warn(f"flows take the plain advance: the kernel for GPUs does not run here ({problem}).", stacklevel=2)
+        return False
+    return True
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -117,6 +137,13 @@ def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Ta
     flights, contacts, clusters, solves, largest, status, tilt = jnp.split(sums, FLAT_SUMS)
     gathered = Sums(flights, contacts.reshape(7, 5), clusters, solves, largest, status[0].astype(jnp.int32))
     return ended(state, wrap(positions, state.side, tilt[0]), tilt[0], velocities, gathered)
+
+
+def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica by the kernel of ``thread_block``, and plainly where this is compiled for another device."""
+    from jaxgran.thread_block import advance
+
+    return lax.platform_dependent(flow, state, steps, cuda=advance, default=dynamics.advance)
 
 
 @cache

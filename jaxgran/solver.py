@@ -131,10 +131,11 @@ def solve(
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
     status = jnp.where(capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok)
+    floor = jnp.maximum(scale, target)  # zero where what approaches does so by rounding, without shear
     return Solution(
         impulses=impulses,
         response=response,
-        residual=jnp.where(active, end.at.best_residual / jnp.maximum(scale, target), 0),
+        residual=jnp.where(active, end.at.best_residual / jnp.where(floor > 0, floor, 1), 0),
         iterations=end.at.iterations,
         status=jnp.where(active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status).astype(jnp.int32),
     )

@@ -36,7 +36,7 @@ from jaxgran.store import Damaged
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
-_GRAIN_BYTES = 5000  # lists, network and state of a replica, where threads are twice as many as grains
+_GRAIN_BYTES = 2500  # lists, network and state of a replica: for each grain, filled up to a power of two
 _SHARE_OF_MEMORY = 0.5
 _MOST_WORKERS = 1024
 _LIKE = 2  # replicas that advance in lockstep differ in cost by at most this factor
@@ -246,7 +246,7 @@ def _batch_size(grains: int, count: int, workers: int) -> int:
         largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
         return next(size for size in range(largest, 0, -1) if count % size == 0)  # a smaller last one compiles again
     memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
-    per_replica = _GRAIN_BYTES * grains + _SEARCH_BYTES * min(grains, 512) ** 2
+    per_replica = _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _SEARCH_BYTES * min(grains, 512) ** 2
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
 
 
