@@ -95,8 +95,8 @@ class Thread(NamedTuple):
     def tell(self, rows: Sequence[int], values: Sequence[Array]) -> list[Array]:
         """Write what other threads may ask for: numbers to ``shared``, whole numbers to ``counts``.
 
-        Returns the values as they have been written, for products to be used further: one that a compiler fuses into a
-        later sum is not rounded as the others know it, and two grains would not see the same contact.
+        Returns the values as they have been written. These are to be used further: a product that a compiler fuses into
+        a later sum is not rounded as the others know it, and two grains would not see the same contact.
         """
         self.wait()
         memory = [self.block.counts if value.dtype == jnp.int32 else self.block.shared for value in values]

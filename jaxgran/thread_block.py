@@ -152,12 +152,12 @@ def trial(grains: int, dtype: jnp.dtype) -> None:
         "momentum": tally.momentum_drift <= few,
         "energy": abs(work - tally.dissipation - tally.energy_change) <= few * tally.dissipation,
         "the contact law": abs(tally.complementarity) <= 1e-3 * tally.dissipation,
-        "the room of the grains": tally.largest_overlap <= 0.2,
-        "what a lattice does": (tally.iterations > 2 * tally.solves) & (tally.status <= Status.deep_overlap),
+        "overlaps": tally.largest_overlap <= 0.2,
+        "clusters": (tally.iterations > 2 * tally.solves) & (tally.status <= Status.deep_overlap),
     }
-    broken = [name for name, holds in laws.items() if not holds]
-    if broken:
-        raise RuntimeError(f"it breaks {', '.join(broken)}")
+    wrong = [name for name, holds in laws.items() if not holds]
+    if wrong:
+        raise RuntimeError(f"it fails in {', '.join(wrong)}")
 
 
 def _sums(totals: Array, residuals: Array, status: Array) -> Sums:
@@ -251,7 +251,7 @@ def _event(thread: Thread, grains: int, now: _Carry) -> _Carry:
         lambda: _collide(thread, motion, flown, lists, flight, counts),
         lambda: (flown, counts, flow.ok),
     )
-    thread.tell((X, Y, CX, CY), flown)
+    flown = Motion(*thread.tell((X, Y, CX, CY), flown))
     lists = lists._replace(
         strain=lists.strain + rate * flight, age=lists.age + flight, slack=lists.slack - loss * flight
     )
@@ -327,8 +327,7 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
     _, skin, near, longest = lax.while_loop(
         lambda at: (at[0] < _NARROWER) & (at[3] > NEAR), narrowed, (jnp.int32(1), skin, near, jnp.max(near))
     )
-    still = motion._replace(x=jnp.zeros_like(x) + 0 * fastest, y=jnp.zeros_like(y) + 0 * fastest)
-    thread.tell((X, Y, CX, CY), still)
+    still = Motion(*thread.tell((X, Y, CX, CY), (jnp.zeros_like(x), jnp.zeros_like(y), motion.cx, motion.cy)))
     lists = _Lists(jnp.minimum(near, NEAR), jnp.minimum(longest, NEAR), tilt, 0 * side, 0 * side, skin, skin)
     return still, lists, status_if(longest > NEAR, Status.capacity)
 

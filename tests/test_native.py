@@ -272,7 +272,7 @@ def broken(*_):
     ("place", "failure", "said"),
     [
         (thread_block, broken, "no such instruction"),
-        (block_solver, unsolved, "it breaks the room of the grains"),
+        (block_solver, unsolved, "it fails in overlaps"),
     ],
 )
 def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, place, failure, said) -> None:
