@@ -36,4 +36,6 @@ elif FAULT == "deadly batch":
 if __name__ == "__main__":
     from jaxgran.cli import main
 
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it runs in the background
+
     main()
