@@ -251,7 +251,9 @@ def draw(rows: dict[str, list[dict]], found: dict[str, float]) -> Figure:
     grains, replicas, timestep, contact = figure.subplots(2, 2).flat
     sizes = np.array([row["grains"] for row in rows["grains"]])
     grains.plot(sizes, [row["cpu seconds"] / STRAIN for row in rows["grains"]], "ko-", label="measured")
-    _guide(grains, sizes, rows["grains"][-1]["cpu seconds"] / STRAIN, f"linear (fitted to 10⁵: {found['grains']:.2f})")
+    *_, last = (row for row in rows["grains"] if row["grains"] <= LINEAR[1])
+    linear = last["cpu seconds"] / STRAIN / last["grains"] * sizes[-1]
+    _guide(grains, sizes, linear, f"linear (fitted to 10⁵: {found['grains']:.2f})")
     grains.set(xlabel="grains N", ylabel="processor time per unit strain (s)", title="α = 0.8, ν = 0.6, dt = 1e-3")
     many = np.array([row["replicas"] for row in rows["replicas"]])
     replicas.plot(many, [row["cpu seconds"] for row in rows["replicas"]], "ko-", label="measured")
