@@ -19,12 +19,13 @@ import jax
 import jax.numpy as jnp
 import rival_numba
 from hardware import hardware
-from step_cost import rival_state
+from step_cost import rival_arguments
 
 import jaxgran as jg
 from jaxgran import dynamics, native
 from jaxgran.batch import advance_batch, replicated
 from jaxgran.cli_map import PRESETS
+from jaxgran.cli_options import number_list
 from jaxgran.sweep import usable_cores
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
@@ -91,7 +92,7 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
                 seconds[name].append(time.perf_counter() - start)
     speeds = {name: done / min(seconds[name]) for name, (_, done) in ways.items()}
     engine = native.engine(flow, state)
-    taken = "plain" if engine is None else engine.__module__.removeprefix("jaxgran.")
+    taken = "plain" if engine is None else engine.__name__
     return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
 
 
@@ -100,25 +101,14 @@ plain = jax.jit(lambda flows, states, steps: replicated(dynamics.advance)(flows,
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:
     for state in states:
-        rival_numba.advance(
-            **rival_state(state),
-            shear_rate=1.0,
-            restitution=flow.restitution,
-            timestep=flow.timestep,
-            activation=flow.activation_fraction,
-            tolerance=flow.tolerance,
-            steps=steps,
-        )
+        rival_numba.advance(**rival_arguments(flow, state), steps=steps)
 
 
 def paper_map() -> float:
     """Seconds of the map of the paper, with a worker for each core of a processor."""
-    preset = {
-        name: value for name, value in PRESETS["paper"].items() if name not in ("restitution", "packing_fraction")
-    }
-    axes = ([float(x) for x in PRESETS["paper"][name].split(",")] for name in ("restitution", "packing_fraction"))
+    axes = {name: number_list(PRESETS["paper"][name], name) for name in ("restitution", "packing_fraction")}
     start = time.perf_counter()
-    jg.ratio_map(*axes, **preset, workers=usable_cores() if jax.default_backend() == "cpu" else 1)
+    jg.ratio_map(**PRESETS["paper"] | axes, workers=usable_cores() if jax.default_backend() == "cpu" else 1)
     return time.perf_counter() - start
 
 

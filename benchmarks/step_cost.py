@@ -103,13 +103,11 @@ def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
     steps = round(STRAINS[dt] / dt)
     ours, theirs, sums = [], [], []
     for repeat in range(repeats + 1):  # the first is warm-up
-        copy = rival_state(state)
+        rivals = rival_arguments(flow, state)
         start = time.perf_counter()
         state, tally = jax.block_until_ready(advance(flow, state, jnp.int32(steps)))
         middle = time.perf_counter()
-        *_, rival = rival_numba.advance(
-            **copy, shear_rate=1.0, restitution=alpha, timestep=dt, activation=0.5, tolerance=TOLERANCE, steps=steps
-        )
+        *_, rival = rival_numba.advance(**rivals, steps=steps)
         end = time.perf_counter()
         if repeat:
             ours.append((middle - start) / steps * 1e6)
@@ -134,7 +132,8 @@ def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
 advance = jax.jit(jg.advance)
 
 
-def rival_state(state: jg.State) -> dict[str, np.ndarray | float]:
+def rival_arguments(flow: jg.ShearFlow, state: jg.State) -> dict[str, np.ndarray | float]:
+    """What the rival needs to know of a flow and its state, which it changes."""
     return {
         "positions": np.array(state.positions),
         "velocities": np.array(state.velocities),
@@ -142,6 +141,11 @@ def rival_state(state: jg.State) -> dict[str, np.ndarray | float]:
         "masses": np.array(state.grains.masses),
         "side": float(state.side),
         "tilt": float(state.tilt),
+        "shear_rate": float(flow.shear_rate),
+        "restitution": float(flow.restitution),
+        "timestep": float(flow.timestep),
+        "activation": flow.activation_fraction,
+        "tolerance": float(flow.tolerance),
     }
 
 

@@ -23,7 +23,7 @@ X, Y, CX, CY, RADIUS, INVERSE_MASS, GIVEN = range(7)  # rows of what is given; t
 PULL_X, PULL_Y, WIDTH, SHARED = range(4, 8)  # velocity changes by impulses; the share of a grain in the spectral bound
 TOUCHING, LOADED, COUNTS = range(3)  # contacts of a grain, and those that carry an impulse
 NX, NY, APPROACH, DISTANCE, IMPULSE, RESPONSE, STEP, CHANGE, BEST, BOUND, NETWORK = range(11)  # of a contact
-CONTACT_SUMS, KINETIC, RESIDUALS, SUMS = 17, 17, 20, 21  # rows of the sums: of contacts, of flights, of solves
+KINETIC, RESIDUALS, SUMS = 17, 20, 21  # rows of the sums: contacts come before flights, and solves last
 TOTALS = 28  # the sums but the last, time, steps, five numbers of the solves, and the tilt
 
 

@@ -38,6 +38,7 @@ from jaxgran.block import (
     Thread,
     status_if,
 )
+from jaxgran.delassus import largest_eigenvalue
 from jaxgran.dynamics import DEEP_OVERLAP
 from jaxgran.methods import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.solver import JAMMED_RESPONSE
@@ -90,7 +91,7 @@ def _response(thread: Thread, contact: _Contact, x: Array, y: Array) -> Array:
 
 
 def collided(
-    thread: Thread, grains: Motion, contacts: Array, scale: Array, deepest: Array, counts: Counts
+    thread: Thread, motion: Motion, contacts: Array, scale: Array, deepest: Array, counts: Counts
 ) -> tuple[Motion, Counts, Array]:
     """Motion after the impulses of the contacts of one step, counts with them, and the status.
 
@@ -103,7 +104,7 @@ def collided(
     bounce = 1 + flow.restitution
     target = flow.tolerance * jnp.sqrt(scale) + 10 * flow.epsilon * flow.shear_rate
     thread.tell([TOUCHING], [contacts])
-    most, zero = jnp.max(contacts), jnp.zeros_like(grains.x)
+    most, zero = jnp.max(contacts), jnp.zeros_like(motion.x)
 
     def isolate(m: Array, shape: tuple[Array, ...]) -> tuple[Array, ...]:
         """Write the impulses of isolated pairs, and add up n ⊗ n of the others."""
@@ -116,7 +117,7 @@ def collided(
 
     xx, xy, yy = lax.fori_loop(0, most, isolate, (zero,) * 3)
     coupled = jnp.where(xx + yy > 0, contacts, 0)
-    width = (xx + yy + jnp.sqrt((xx - yy) * (xx - yy) + 4 * xy * xy)) / 2 * thread.inverse_mass
+    width = largest_eigenvalue(xx, xy, yy) * thread.inverse_mass
     most_coupled = jnp.max(coupled)
     solve = lax.cond(
         most_coupled > 0,
@@ -164,7 +165,7 @@ def collided(
         residual=jnp.maximum(counts.residual, residual),
     )
     deep = status_if(deepest > DEEP_OVERLAP, Status.deep_overlap)
-    kicked = grains._replace(cx=grains.cx + bounce * x, cy=grains.cy + bounce * y)
+    kicked = motion._replace(cx=motion.cx + bounce * x, cy=motion.cy + bounce * y)
     return kicked, counts, jnp.maximum(solve.status, deep)
 
 

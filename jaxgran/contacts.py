@@ -63,7 +63,7 @@ def is_contact(
       >>> [bool(is_contact(apart, closing, reach, time)[0][0]) for time in (0.9, 1.1)]
       [False, True]
     """
-    contact, approaching = overlaps_within(*_motion(separations, velocities, reach), look_ahead)
+    contact, approaching = overlaps_within(*_gaps(separations, velocities, reach), look_ahead)
     contact = contact & (reach > 0)
     return contact, contact & approaching
 
@@ -80,14 +80,14 @@ def first_contact_time(
       >>> float(time[0]), float(closest[0])
       (1.0, 2.0)
     """
-    return time_to_touch(*_motion(separations, velocities, reach))
+    return time_to_touch(*_gaps(separations, velocities, reach))
 
 
 def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: float | Array) -> tuple:
     """The rule of ``is_contact`` for pairs of any shape: whether they are contacts, and whether they approach.
 
     Args:
-      squared_speed, closing, excess: |u|², s·u and |s|² − d² of pairs with separation s, relative velocity u, reach d.
+      squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
       look_ahead: θ·dt.
     """
     approaching = closing < 0
@@ -105,10 +105,13 @@ def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
     return jnp.where(touches, time, jnp.inf), closest
 
 
-def _motion(separations: Array, velocities: Array, reach: Array) -> tuple[Array, Array, Array]:
-    """|u|², s·u and |s|² − d²."""
-    excess = _dot(separations, separations) - reach**2
-    return _dot(velocities, velocities), _dot(separations, velocities), excess
+def gap_coefficients(x: Array, y: Array, ux: Array, uy: Array, reach: Array) -> tuple[Array, Array, Array]:
+    """|u|², s·u and |s|² − d², the coefficients of |s + u t|² − d²."""
+    return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach**2
+
+
+def _gaps(separations: Array, velocities: Array, reach: Array) -> tuple[Array, Array, Array]:
+    return gap_coefficients(separations[:, 0], separations[:, 1], velocities[:, 0], velocities[:, 1], reach)
 
 
 def contact_network(

@@ -63,9 +63,14 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     outer = jnp.stack([nx * nx, nx * ny, ny * ny], axis=-1)
     total = _gathered(contacts, outer, outer, grains)
     xx, xy, yy = total[:, 0], total[:, 1], total[:, 2]
-    largest = (xx + yy + jnp.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
+    largest = largest_eigenvalue(xx, xy, yy)
     bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
+
+
+def largest_eigenvalue(xx: Array, xy: Array, yy: Array) -> Array:
+    """The larger eigenvalue of symmetric 2×2 matrices."""
+    return (xx + yy + jnp.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
 
 
 def _gathered(

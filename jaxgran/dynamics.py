@@ -352,10 +352,27 @@ def _steps_to_contact(pairs: _Pairs, reach: Array, flow: ShearFlow, least: Array
 
 def _fly(frame: Frame, velocities: Array, flight: Array, shear_rate: float | Array) -> tuple[Frame, Array]:
     """Exact free flight (SLLOD) for a time: the laboratory velocities stay as they are."""
-    cx, cy = velocities[:, 0], velocities[:, 1]
-    dx = (cx - frame.strain * cy) * flight - shear_rate * cy * flight**2
-    moved = frame.displacements + jnp.stack([dx, cy * flight], axis=-1)
-    return Frame(moved, frame.strain + shear_rate * flight), jnp.stack([cx - shear_rate * flight * cy, cy], axis=-1)
+    cy = velocities[:, 1]
+    dx, dy, cx = flight_of(velocities[:, 0], cy, frame.strain, flight, shear_rate)
+    moved = frame.displacements + jnp.stack([dx, dy], axis=-1)
+    return Frame(moved, frame.strain + shear_rate * flight), jnp.stack([cx, cy], axis=-1)
+
+
+def flight_of(cx: Array, cy: Array, strain: Array, flight: Array, shear_rate: float | Array) -> tuple[Array, ...]:
+    """Displacements of a free flight in the frame that shears with the flow, and the peculiar velocity c_x after it.
+
+    Args:
+      cx, cy: peculiar velocities before; c_y stays as it is.
+      strain: that of the frame before.
+      flight: time.
+    """
+    dx = (cx - strain * cy) * flight - shear_rate * cy * flight**2
+    return dx, cy * flight, cx - shear_rate * flight * cy
+
+
+def kinetic_means(xx: Array, xy: Array, yy: Array, turned: Array) -> tuple[Array, Array, Array]:
+    """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``turned``, in which c_x falls by γ̇ c_y t."""
+    return xx - turned * xy + turned**2 / 3 * yy, xy - turned / 2 * yy, yy
 
 
 def _add_flight(
@@ -365,8 +382,7 @@ def _add_flight(
     cx, cy = velocities[:, 0], velocities[:, 1]
     px, py = grains.masses * cx, grains.masses * cy
     xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in ((px, cx), (px, cy), (py, cy)))
-    turned = shear_rate * flight
-    xx, xy = xx - turned * xy + turned**2 / 3 * yy, xy - turned / 2 * yy
+    xx, xy, yy = kinetic_means(xx, xy, yy, shear_rate * flight)
     flown = jnp.stack([flight, jump.astype(flight.dtype), flight * xx, flight * xy, flight * yy])
     return sums._replace(flights=sums.flights + flown)
 

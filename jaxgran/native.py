@@ -72,8 +72,9 @@ def advance(
       the status ``nonfinite``; so does, on a GPU, one whose lists have no room, with ``capacity``.
     """
     require_advance(flow, state, steps)
-    by = engine(flow, state)
-    if not free_flight or events is not None or moving_contacts or by is None:
+    plain = not free_flight or events is not None or moving_contacts
+    by = None if plain else engine(flow, state)
+    if by is None:
         return dynamics.advance(flow, state, steps, free_flight, events, moving_contacts)
     return _advance(by, flow, state, steps)
 

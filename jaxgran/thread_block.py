@@ -32,7 +32,6 @@ from jaxtyping import Array, Int
 
 from jaxgran.block import (
     APPROACH,
-    CONTACT_SUMS,
     CX,
     CY,
     DISTANCE,
@@ -57,8 +56,8 @@ from jaxgran.block import (
 )
 from jaxgran.block_solver import collided
 from jaxgran.cell import remap_tilt, wrap
-from jaxgran.contacts import overlaps_within, time_to_touch
-from jaxgran.dynamics import State, ended
+from jaxgran.contacts import gap_coefficients, overlaps_within, time_to_touch
+from jaxgran.dynamics import State, ended, flight_of, kinetic_means
 from jaxgran.flow import ShearFlow
 from jaxgran.grains import Grains
 from jaxgran.status import Status
@@ -161,8 +160,8 @@ def trial(grains: int, dtype: jnp.dtype) -> None:
 
 
 def _sums(totals: Array, residuals: Array, status: Array) -> Sums:
-    """The sums of an advance from what the kernel returns: ``CONTACT_SUMS`` first, then flights and solves."""
-    of, rest = totals[:CONTACT_SUMS], totals[CONTACT_SUMS:]
+    """The sums of an advance from what the kernel returns: those of contacts, then flights and solves."""
+    of, rest = totals[:KINETIC], totals[KINETIC:]
     empty = empty_sums(totals.dtype)
     contacts = empty.contacts.at[0].set(of[:5]).at[1:4, 0].set(of[5:8]).at[1:4, 1].set(of[8:11])
     contacts = contacts.at[4, 0].set(of[14]).at[6, 0].set(of[15]).at[5, 2].set(of[16])
@@ -244,7 +243,8 @@ def _event(thread: Thread, grains: int, now: _Carry) -> _Carry:
     jump = jnp.minimum(jump.astype(jnp.int32), flow.steps - now.step)
     flight, step = jump.astype(dt.dtype) * dt, now.step + jump
     counts = _add_flight(thread, now.counts, motion, flight)
-    flown = _fly(motion, lists.strain, flight, rate)
+    dx, dy, cx = flight_of(motion.cx, motion.cy, lists.strain, flight, rate)
+    flown = Motion(motion.x + dx, motion.y + dy, cx, motion.cy)
 
     flown, counts, status = lax.cond(
         step < flow.steps,
@@ -277,13 +277,6 @@ def _positions(thread: Thread, motion: Motion, lists: _Lists) -> tuple[Array, Ar
     """Where the grains are, not wrapped."""
     y = thread.block.moved[Y, :] + motion.y
     return thread.block.moved[X, :] + motion.x + lists.strain * y, y
-
-
-def _fly(motion: Motion, strain: Array, flight: Array, rate: Array) -> Motion:
-    """Exact free flight for a time, which begins at a strain since the search; as ``dynamics`` has it."""
-    x, y, cx, cy = motion
-    moved = x + ((cx - strain * cy) * flight - rate * cy * flight * flight)
-    return Motion(moved, y + cy * flight, cx - rate * flight * cy, cy)
 
 
 def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _Lists) -> tuple[Motion, _Lists, Array]:
@@ -346,10 +339,8 @@ class _Pair(NamedTuple):
     def after(self, flight: Array) -> "_Pair":
         return self._replace(x=self.x + self.ux * flight, y=self.y + self.uy * flight)
 
-    def numbers(self) -> tuple[Array, Array, Array]:
-        """|u|², s·u and |s|² − d²."""
-        excess = self.x * self.x + self.y * self.y - self.reach * self.reach
-        return self.ux * self.ux + self.uy * self.uy, self.x * self.ux + self.y * self.uy, excess
+    def gap(self) -> tuple[Array, Array, Array]:
+        return gap_coefficients(self.x, self.y, self.ux, self.uy, self.reach)
 
 
 def _pair(thread: Thread, k: Array, motion: Motion, lists: _Lists) -> _Pair:
@@ -370,7 +361,7 @@ def _steps_to_contact(thread: Thread, motion: Motion, lists: _Lists, least: Arra
 
     def sooner(k: Array, soonest: Array) -> Array:
         pair = _pair(thread, k, motion, lists)
-        time, closest = time_to_touch(*pair.numbers())
+        time, closest = time_to_touch(*pair.gap())
         steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least)
         return jnp.where(pair.real & (steps * flow.timestep < closest), jnp.minimum(soonest, steps), soonest)
 
@@ -378,12 +369,11 @@ def _steps_to_contact(thread: Thread, motion: Motion, lists: _Lists, least: Arra
 
 
 def _add_flight(thread: Thread, counts: Counts, motion: Motion, flight: Array) -> Counts:
-    """The counts with the time of a flight; ∫ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t, goes to the sums."""
+    """The counts with the time of a flight; ∫ m c ⊗ c dt along it goes to the sums."""
     cx, cy, real = motion.cx, motion.cy, thread.inverse_mass > 0
     weight = jnp.where(real, flight / jnp.where(real, thread.inverse_mass, 1), 0)
-    turned = thread.flow.shear_rate * flight
-    xx = cx * cx - turned * cx * cy + turned * turned / 3 * cy * cy
-    thread.add(KINETIC, [weight * x for x in (xx, cx * cy - turned / 2 * cy * cy, cy * cy)])
+    means = kinetic_means(cx * cx, cx * cy, cy * cy, thread.flow.shear_rate * flight)
+    thread.add(KINETIC, [weight * mean for mean in means])
     return counts._replace(time=counts.time + flight)
 
 
@@ -400,7 +390,7 @@ def _collide(
         """Write a pair down if it is a contact."""
         contacts, approached, scale, deepest = found
         pair = _pair(thread, k, told, lists).after(flight)
-        contact, approaching = overlaps_within(*pair.numbers(), flow.activation_fraction * flow.timestep)
+        contact, approaching = overlaps_within(*pair.gap(), flow.activation_fraction * flow.timestep)
         contact = contact & pair.real
         distance = jnp.sqrt(pair.x * pair.x + pair.y * pair.y)
         nx, ny = pair.x / distance, pair.y / distance
