@@ -22,11 +22,12 @@ from hardware import hardware
 from step_cost import rival_arguments
 
 import jaxgran as jg
-from jaxgran import dynamics, native
-from jaxgran.batch import advance_batch, replicated
-from jaxgran.cli_map import PRESETS
-from jaxgran.cli_options import number_list
-from jaxgran.sweep import usable_cores
+from jaxgran.cli.arguments import number_list
+from jaxgran.cli.map import PRESETS
+from jaxgran.dynamics import advance
+from jaxgran.dynamics import plain as plain_module
+from jaxgran.maps.sweep import usable_cores
+from jaxgran.sampling.batch import advance_batch, replicated
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
 REPLICAS, GRAINS, STRAIN = 1000, 256, 0.2
@@ -72,7 +73,7 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
     """Replica-steps per second from the same states: the fastest of three calls each, in turn."""
     flow = jg.ShearFlow(grains=GRAINS, restitution=alpha, packing_fraction=nu, timestep=dt)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=5.0)
-    forward = jax.jit(native.advance)
+    forward = jax.jit(advance.advance)
     distinct = [state := forward(flow, state, jnp.int32(round(APART / dt)))[0] for _ in range(DISTINCT)]
     batch = jax.tree.map(lambda *x: jnp.stack([x[n % DISTINCT] for n in range(replicas)]), *distinct)
     flows = jax.tree.map(lambda x: jnp.full(replicas, x), flow)
@@ -91,12 +92,12 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
             if turn:
                 seconds[name].append(time.perf_counter() - start)
     speeds = {name: done / min(seconds[name]) for name, (_, done) in ways.items()}
-    engine = native.engine(flow, state)
+    engine = advance.engine(flow, state)
     taken = "plain" if engine is None else engine.__name__
     return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
 
 
-plain = jax.jit(lambda flows, states, steps: replicated(dynamics.advance)(flows, states, steps))
+plain = jax.jit(lambda flows, states, steps: replicated(plain_module.advance)(flows, states, steps))
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

@@ -25,11 +25,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 import jaxgran as jg
-from jaxgran.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
-from jaxgran.drawing import force_lines
-from jaxgran.fields import Fields, fields_at, grid
-from jaxgran.force_chains import loaded_contacts
-from jaxgran.snapshots import Snapshot, snapshot
+from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
+from jaxgran.analysis.fields import Fields, fields_at, grid
+from jaxgran.analysis.force_chains import loaded_contacts
+from jaxgran.dynamics.snapshots import Snapshot, snapshot
+from jaxgran.plotting.drawing import force_lines
 
 RESTITUTION, PACKING_FRACTION, TIMESTEP = 0.2, 0.78, 1e-3
 WIDTH = 0.6

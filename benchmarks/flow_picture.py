@@ -18,10 +18,10 @@ import numpy as np
 from hardware import hardware
 
 import jaxgran as jg
-from jaxgran.drawing import LABEL_SIZE, empty_figure, write
-from jaxgran.flow_figures import Colour, Scene, common_scale, draw_picture, scene_of
-from jaxgran.force_chains import cluster_share, cluster_sizes
-from jaxgran.snapshots import Snapshot
+from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.plotting.drawing import LABEL_SIZE, empty_figure, write
+from jaxgran.plotting.flow import Colour, Scene, common_scale, draw_picture, scene_of
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
 TILT = 0.15  # of the cell at the first snapshot

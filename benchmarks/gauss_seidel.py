@@ -1,6 +1,7 @@
 """Other ways to solve the contact problem, for comparison only: Gauss–Seidel sweeps, and the exact solution.
 
-The problem is 0 ≤ p ⟂ W p + u⁻ ≥ 0 on a network of ``jaxgran.contacts.Contacts``; see ``jaxgran.solver``.
+The problem is 0 ≤ p ⟂ W p + u⁻ ≥ 0 on a network of contacts, see ``jaxgran.contact.network`` and
+``jaxgran.contact.solver``.
 """
 
 from typing import NamedTuple
@@ -9,16 +10,16 @@ import numba
 import numpy as np
 from scipy.optimize import nnls
 
-from jaxgran.contacts import Contacts
-from jaxgran.solver import Solution
-from jaxgran.status import Status
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.solver import Solution
+from jaxgran.model.status import Status
 
 
 def gauss_seidel(contacts: Contacts, grains: int, tolerance: float, max_sweeps: int, shear_rate: float = 1) -> Solution:
     """Impulses by projected Gauss–Seidel sweeps over the contacts in their order, from zero impulses.
 
-    The residual and the tolerance are those of ``jaxgran.solver.solve``. The updates of a sweep estimate the residual
-    for nothing; it is computed only when that estimate has met the tolerance, and then decides.
+    The residual and the tolerance are those of ``jaxgran.contact.solver.solve``. The updates of a sweep estimate the
+    residual for nothing; it is computed only when that estimate has met the tolerance, and then decides.
 
     Args:
       contacts: the network.

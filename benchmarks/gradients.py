@@ -25,8 +25,8 @@ import numpy as np
 from hardware import hardware
 
 import jaxgran as jg
-from jaxgran.cell import displacement
-from jaxgran.sensitivity import growth, lyapunov_exponent
+from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
+from jaxgran.model.cell import displacement
 
 FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packing fraction
 GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-6, 1.2, 48, 6

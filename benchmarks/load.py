@@ -18,10 +18,10 @@ import numpy as np
 from hardware import hardware
 from matplotlib.figure import Figure
 
-from jaxgran import sweep
-from jaxgran.checkpoint import Checkpoint
-from jaxgran.dataset import map_dataset, write_dataset
-from jaxgran.settings import MapSettings
+from jaxgran.maps import sweep
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.dataset import map_dataset, write_dataset
+from jaxgran.maps.settings import MapSettings
 
 
 def main() -> None:

@@ -22,9 +22,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from networks import INFEASIBLE, Network, collection
 
-from jaxgran.contacts import Contacts
-from jaxgran.solver import Solution, solve
-from jaxgran.status import Status
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.solver import Solution, solve
+from jaxgran.model.status import Status
 
 CAP, QUICK_CAP = 5000, 2000  # products with W
 RELAXATION = {"jacobi": 1.8, "jacobi-count": 1.8, "jacobi-diagonal": 1.0}

@@ -23,10 +23,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxgran as jg
-from jaxgran.batch import stack
-from jaxgran.measure import estimates
-from jaxgran.protocol import prepare_batch
-from jaxgran.sweep import usable_cores
+from jaxgran.maps.sweep import usable_cores
+from jaxgran.sampling.batch import stack
+from jaxgran.sampling.sample import estimates
+from jaxgran.sampling.steady_state import prepare_batch
 
 OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "force_ratio")
 DEFAULT = (1e-3, 1e-4, "midpoint")  # of the command line

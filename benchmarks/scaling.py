@@ -27,8 +27,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.batch import advance_batch, stack
-from jaxgran.sweep import usable_cores
+from jaxgran.maps.sweep import usable_cores
+from jaxgran.sampling.batch import advance_batch, stack
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
 REPLICAS, QUICK_REPLICAS = (1, 4, 16, 64, 256, 1024, 4096), (8, 64)

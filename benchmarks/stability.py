@@ -27,11 +27,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.batch import stack
-from jaxgran.flow import InputError
-from jaxgran.observables import averages
-from jaxgran.protocol import predicted
-from jaxgran.settings import MapSettings
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.flow import InputError
+from jaxgran.sampling.batch import stack
+from jaxgran.sampling.observables import averages
+from jaxgran.sampling.steady_state import predicted
 
 RESTITUTIONS = (0.0, 0.5, 0.9)
 PACKING_FRACTIONS = (0.3, 0.5, 0.6, 0.7, 0.75, 0.8, 0.82, 0.83, 0.835, 0.84)

@@ -27,10 +27,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxgran as jg
-from jaxgran import force_chains, kinetics, structure
-from jaxgran.series import Curve, Measured, ratio, series, with_errors
-from jaxgran.snapshots import Snapshot, snapshot_series
-from jaxgran.status import Status
+from jaxgran.analysis import force_chains, velocity_correlations
+from jaxgran.analysis import order as order_module
+from jaxgran.analysis.series import Curve, Measured, ratio, series, with_errors
+from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
+from jaxgran.model.status import Status
 
 SHELLS = (1.0, 0.25)  # over ``contact_shell``
 LAGS = (1, 2, 3, 5, 8, 12, 20, 35, 60, 100, 180, 320)  # time steps
@@ -104,11 +105,14 @@ def measured(plan: Plan, nu: float, alpha: float) -> dict:
     few = jax.tree.map(lambda x: x[::4], seen)  # for what changes slowly
 
     velocities, share, fabric = (
-        measure(seen) for measure in (kinetics.velocity_distribution, force_chains.cluster_share, force_chains.fabric)
+        measure(seen)
+        for measure in (velocity_correlations.velocity_distribution, force_chains.cluster_share, force_chains.fabric)
     )
-    near, closer = (kinetics.near_contact(seen, share * kinetics.contact_shell(nu)) for share in SHELLS)
+    near, closer = (
+        velocity_correlations.near_contact(seen, share * velocity_correlations.contact_shell(nu)) for share in SHELLS
+    )
     lasting = force_chains.persistence(successive, 1.0, [lag for lag in LAGS if lag < plan.snapshots])
-    order, touching = structure.hexatic_order(few), structure.coordination(few)
+    order, touching = order_module.hexatic_order(few), order_module.coordination(few)
     numbers = {
         "force_ratio": force_ratio(seen),
         "contact_lifetime": lasting.contact_lifetime,
@@ -128,7 +132,7 @@ def measured(plan: Plan, nu: float, alpha: float) -> dict:
         "force_distribution": force_chains.force_distribution(seen, FORCES),
         "cluster_sizes": force_chains.cluster_sizes(seen, SIZES),
         "force_correlation": force_correlation(seen),
-        "pair_correlation": structure.pair_correlation(few, 1 + np.linspace(0, 0.2, 21)),
+        "pair_correlation": order_module.pair_correlation(few, 1 + np.linspace(0, 0.2, 21)),
         "contact_persistence": lasting.contact,
         "cluster_persistence": lasting.cluster,
     }
@@ -153,7 +157,7 @@ def force_ratio(seen: Snapshot) -> Measured:
     return with_errors(lambda s: {"ratio": ratio(s["p"], s["binary"])}, sums)["ratio"]
 
 
-def small_over_large(velocities: kinetics.VelocityDistribution) -> Measured:
+def small_over_large(velocities: velocity_correlations.VelocityDistribution) -> Measured:
     """Temperature of the smallest third of the grains over that of the largest."""
     value, error = velocities.size_temperatures
     over = value[0] / value[-1]

@@ -15,8 +15,8 @@ from hardware import hardware, json_with_rows
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.kinetic_theory import garzo_dufty, gaussian_moments, jenkins_richman
-from jaxgran.sweep import usable_cores
+from jaxgran.maps.sweep import usable_cores
+from jaxgran.theory.kinetic_theory import garzo_dufty, gaussian_moments, jenkins_richman
 
 THEORIES = {"moments": gaussian_moments, "Garzó–Dufty": garzo_dufty, "Jenkins–Richman": jenkins_richman}
 NAMES = ("pressure", "shear_stress", "granular_temperature", "collision_rate")

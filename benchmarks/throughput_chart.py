@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from networks import TIMESTEP, further, sheared
 
 import jaxgran as jg
-from jaxgran.replica import AXIS
+from jaxgran.model.control_flow import AXIS
 
 FLOWS = ((0.5, 0.7), (0.5, 0.8))  # restitution, packing fraction
 SIZES, QUICK_SIZES = tuple(2**k for k in range(9)), (8,)

@@ -36,8 +36,8 @@ from matplotlib.lines import Line2D
 from scipy.optimize import minimize_scalar
 
 import jaxgran as jg
-from jaxgran.measure import estimates
-from jaxgran.sweep import usable_cores
+from jaxgran.maps.sweep import usable_cores
+from jaxgran.sampling.sample import estimates
 
 RULES = ("midpoint", "touching")
 START = 1e-3  # time step of the steady state

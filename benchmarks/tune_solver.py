@@ -1,6 +1,7 @@
 """Whether momentum or relaxation tuned by gradient solves contact networks in fewer products with W than the default.
 
-The tuned method is a projected one of ``jaxgran.methods`` with three numbers, 0 < τ < 2, 0 ≤ s ≤ 1 and r > 0,
+The tuned method is a projected one of ``jaxgran.contact.projected_methods`` with three numbers, 0 < τ < 2, 0 ≤ s ≤ 1
+and r > 0,
 
     p ← max(0, y − τ D⁻¹(W y + b)),    y = p + s k/(k + r) (p − p_before),    W ⪯ D the spectral bound.
 
@@ -28,11 +29,11 @@ from hardware import hardware, json_with_rows
 from matplotlib.figure import Figure
 from networks import GRAINS, INFEASIBLE, Network, collection
 
-from jaxgran.contacts import Contacts
-from jaxgran.delassus import delassus_product, diagonal, spectral_bound
-from jaxgran.methods import METHODS, Method
-from jaxgran.solver import solve
-from jaxgran.status import Status
+from jaxgran.contact.delassus import delassus_product, diagonal, spectral_bound
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import METHODS, Method
+from jaxgran.contact.solver import solve
+from jaxgran.model.status import Status
 
 DEFAULT, TOLERANCES, FLOOR, RATE = "barzilai-borwein", (1e-4, 1e-6), 1e-8, 0.05
 STOCK = {"momentum": (1.0, 1.0, 3.0), "relaxation": (1.8, 0.0, 1.0)}  # τ, s, r

@@ -18,7 +18,7 @@ from hardware import hardware
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.sweep import usable_cores
+from jaxgran.maps.sweep import usable_cores
 
 # (packing fraction, restitution): temperature, pressure, shear stress; m = σ = γ̇ = 1
 EVENT_DRIVEN = {

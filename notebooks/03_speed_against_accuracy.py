@@ -30,8 +30,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran as jg
-from jaxgran.accuracy import automatic_timestep, expected_temperature, stress_error
-from jaxgran.kinetic_theory import gaussian_moments
+from jaxgran.sampling.timestep import automatic_timestep, expected_temperature, stress_error
+from jaxgran.theory.kinetic_theory import gaussian_moments
 
 jax.config.update("jax_enable_x64", True)
 quick = bool(os.environ.get("QUICK"))

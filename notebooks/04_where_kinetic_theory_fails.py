@@ -27,7 +27,7 @@ import jax
 import numpy as np
 
 import jaxgran as jg
-from jaxgran.kinetics import near_contact
+from jaxgran.analysis.velocity_correlations import near_contact
 
 jax.config.update("jax_enable_x64", True)
 quick = bool(os.environ.get("QUICK"))

@@ -28,7 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran as jg
-from jaxgran.sensitivity import growth
+from jaxgran.analysis.sensitivity import growth
 
 jax.config.update("jax_enable_x64", True)
 quick = bool(os.environ.get("QUICK"))

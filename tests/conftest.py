@@ -31,11 +31,11 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-from jaxgran.dynamics import State, advance  # noqa: E402
-from jaxgran.flow import ShearFlow  # noqa: E402
-from jaxgran.grains import Grains  # noqa: E402
-from jaxgran.packing import pack  # noqa: E402
-from jaxgran.solver import solve  # noqa: E402
+from jaxgran.contact.solver import solve  # noqa: E402
+from jaxgran.dynamics.plain import State, advance  # noqa: E402
+from jaxgran.model.flow import ShearFlow  # noqa: E402
+from jaxgran.model.grains import Grains  # noqa: E402
+from jaxgran.sampling.packing import pack  # noqa: E402
 
 GRAINS = 32
 

@@ -16,10 +16,10 @@ elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))
 
-from jaxgran.batch import advance_batch  # noqa: E402
-from jaxgran.dynamics import State  # noqa: E402
-from jaxgran.flow import ShearFlow  # noqa: E402
-from jaxgran.grains import Grains  # noqa: E402
+from jaxgran.dynamics.plain import State  # noqa: E402
+from jaxgran.model.flow import ShearFlow  # noqa: E402
+from jaxgran.model.grains import Grains  # noqa: E402
+from jaxgran.sampling.batch import advance_batch  # noqa: E402
 
 like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), State(Grains(0, 0), 0, 0, 0, 0), 0)  # pyright: ignore
 with np.load(start) as arrays:

@@ -11,11 +11,11 @@ from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
 
-from jaxgran import journal, sweep
+from jaxgran.maps import journal, sweep
 
 journal.SECONDS = 0.3  # so that batches of a second have journals
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
-sys.modules["jaxgran.figures"] = figures
+sys.modules["jaxgran.plotting.ratio"] = figures
 FAULT = os.environ.get("FAULT", "")
 
 if FAULT == "clock":
@@ -34,7 +34,7 @@ elif FAULT == "deadly batch":
     sweep._measured = deadly
 
 if __name__ == "__main__":
-    from jaxgran.cli import main
+    from jaxgran.cli.app import main
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it runs in the background
 

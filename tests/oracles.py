@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from jaxgran.contacts import Contacts
+from jaxgran.contact.network import Contacts
 
 MAX_DISCS, MAX_CONTACTS = 60, 192
 

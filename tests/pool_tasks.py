@@ -6,8 +6,8 @@ import struct
 import time
 from pathlib import Path
 
-from jaxgran import pool
-from jaxgran.pool import send
+from jaxgran.maps import pool
+from jaxgran.maps.pool import send
 
 
 def prepare() -> None:

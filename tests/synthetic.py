@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from jaxgran.contacts import Contacts
-from jaxgran.dataset import Replica
-from jaxgran.dynamics import State
-from jaxgran.grains import Grains
-from jaxgran.measure import BLOCKS, Sample
-from jaxgran.series import minimum_image
-from jaxgran.settings import MapSettings
-from jaxgran.snapshots import Snapshot
-from jaxgran.status import Status
-from jaxgran.tally import Tally
+from jaxgran.contact.network import Contacts
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.tally import Tally
+from jaxgran.maps.dataset import Replica
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.cell import minimum_image
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
+from jaxgran.sampling.sample import BLOCKS, Sample
 
 SNAPSHOTS = 1000  # a static choice, the same wherever snapshots of a flow are taken: one compilation
 

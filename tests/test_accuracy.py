@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from run_chart import on_front
 
-from jaxgran.accuracy import (
+from jaxgran.dynamics.plain import DEEP_OVERLAP
+from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.batch import stack
+from jaxgran.sampling.steady_state import predicted
+from jaxgran.sampling.timestep import (
     automatic_timestep,
     automatic_tolerance,
     expected_temperature,
     longest_timestep,
     stress_error,
 )
-from jaxgran.batch import stack
-from jaxgran.dynamics import DEEP_OVERLAP
-from jaxgran.flow import ShearFlow
-from jaxgran.protocol import predicted
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 # (packing fraction, restitution): temperature of event-driven hard discs, and of soft ones in the stiff limit

@@ -24,10 +24,13 @@ from test_cli import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_
 from test_figures import ratio_dataset, with_timesteps
 
 import jaxgran as jg
-from jaxgran import fields, free_cooling, measure, protocol, snapshots, sweep
-from jaxgran import settings as map_settings
-from jaxgran.flow import InputError
-from jaxgran.status import Status
+from jaxgran.analysis import fields
+from jaxgran.dynamics import snapshots
+from jaxgran.maps import settings as map_settings
+from jaxgran.maps import sweep
+from jaxgran.model.flow import InputError
+from jaxgran.model.status import Status
+from jaxgran.sampling import free_cooling, sample, steady_state
 
 GRAINS = 32
 FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
@@ -55,11 +58,11 @@ def nothing_runs() -> Iterator[None]:
     """Whatever a public function would compile and run raises ``WouldRun``."""
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
-            (measure, "_sample"),
+            (sample, "_sample"),
             (snapshots, "_snapshot_series"),
             (fields, "_fields_at"),
-            (protocol, "prepare_batch"),
-            (protocol, "_heated"),
+            (steady_state, "prepare_batch"),
+            (steady_state, "_heated"),
             (free_cooling, "_cooling"),
             (sweep, "replicas"),
         ):
@@ -299,9 +302,9 @@ def test_a_refusal_says_what_is_accepted(case: str) -> None:
 
 
 def test_prepare_refuses_a_time_step_too_short_to_count_before_it_packs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol, "_heated", would_run)
+    monkeypatch.setattr(steady_state, "_heated", would_run)
     with pytest.raises(InputError, match="timestep must be at least 1e-08 / shear_rate"):
-        protocol.check_timestep(make_flow("timestep", 1e-12), None)
+        steady_state.check_timestep(make_flow("timestep", 1e-12), None)
 
 
 @pytest.mark.parametrize(

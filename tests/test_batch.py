@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.batch import advance_batch, stack
-from jaxgran.flow import ShearFlow
+from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.batch import advance_batch, stack
 
 PROGRAM = Path(__file__).with_name("devices.py")
 RESTITUTIONS = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)  # more than four devices, and not a multiple

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.calibrate import fit_restitution
-from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.packing import pack
-from jaxgran.snapshots import snapshot_series
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.snapshots import snapshot_series
+from jaxgran.inference.restitution import fit_restitution
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.sampling.packing import pack
 
 GRAINS, FRAMES, STRAIN, NOISE = 64, 100, 0.5, 0.01
 TIMES = STRAIN * np.arange(1, FRAMES + 1) / FRAMES

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import nearest_image
 
-from jaxgran.cell import cell_side, displacement, relative_velocity, remap_tilt, sheared, wrap
+from jaxgran.model.cell import cell_side, displacement, relative_velocity, remap_tilt, sheared, wrap
 
 EPS = np.finfo(float).eps
 POINTS = 64

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from synthetic import one_sentence, random_replica
 
-from jaxgran import checkpoint
-from jaxgran.checkpoint import Checkpoint
-from jaxgran.dataset import Key, Replica
-from jaxgran.flow import InputError
-from jaxgran.settings import MapSettings
-from jaxgran.status import Status
-from jaxgran.store import write_arrays
+from jaxgran.io.atomic import write_arrays
+from jaxgran.maps import checkpoint
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.dataset import Key, Replica
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.flow import InputError
+from jaxgran.model.status import Status
 
 SETTINGS = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0)
 
@@ -233,8 +233,8 @@ def test_a_second_writer_is_refused_until_the_first_has_ended_however_it_did(out
     script = f"""
 import time
 from pathlib import Path
-from jaxgran.checkpoint import Checkpoint
-from jaxgran.settings import MapSettings
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.settings import MapSettings
 import jax
 jax.config.update("jax_enable_x64", True)
 Checkpoint(Path({str(output)!r}), {SETTINGS!r}, resume=False)

@@ -23,13 +23,17 @@ from PIL import Image
 from synthetic import one_sentence, random_replica
 from test_closure import made_up_map
 
-from jaxgran import calibrate, cli, cli_fit, cli_info, cli_map, cli_measure, cli_run, movie, sweep
-from jaxgran.cli_options import FIRST_STRAIN, number_list
-from jaxgran.dataset import NOT_RUN, read_dataset, write_dataset
-from jaxgran.flow import InputError
-from jaxgran.status import Status
-from jaxgran.terminal import print_table
-from jaxgran.trajectory import read_trajectory
+from jaxgran.cli import app, fit, info, measure, run
+from jaxgran.cli import map as map_module
+from jaxgran.cli.arguments import FIRST_STRAIN, number_list
+from jaxgran.cli.terminal import print_table
+from jaxgran.inference import restitution
+from jaxgran.io.trajectory import read_trajectory
+from jaxgran.maps import sweep
+from jaxgran.maps.dataset import NOT_RUN, read_dataset, write_dataset
+from jaxgran.model.flow import InputError
+from jaxgran.model.status import Status
+from jaxgran.plotting import movie
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
@@ -57,15 +61,15 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
     ):
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
-        for module in (cli_fit, cli_info, cli_map, cli_measure, cli_run):
+        for module in (fit, info, map_module, measure, run):
             patch.setattr(module, "configured_jax", lambda: jax)
-        cli.main()
+        app.main()
     return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
 
 
 def in_a_process(folder: Path, *arguments: str) -> Outcome:
     """Run a command as its user would, in a process of its own."""
-    command = [sys.executable, "-c", "from jaxgran.cli import main; main()", *arguments]
+    command = [sys.executable, "-c", "from jaxgran.cli.app import main; main()", *arguments]
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     return Outcome(done.returncode, done.stdout, done.stderr)
@@ -426,7 +430,7 @@ def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_n
     assert outcome.status == 0
     assert "none: Unable to initialize backend 'cuda': no driver.\n" in outcome.out
     assert "JAX_PLATFORMS=cpu,made-up" in outcome.out
-    checkout = (Path(cli.__file__).resolve().parent.parent / ".git").exists()
+    checkout = (Path(app.__file__).resolve().parents[2] / ".git").exists()
     assert (", commit " in outcome.out.splitlines()[0]) == checkout
 
 
@@ -445,9 +449,9 @@ def test_fit_finds_the_restitution_of_a_trajectory(small_run, tmp_path: Path) ->
 
 def test_fit_that_fails_says_so_in_one_sentence(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sentences of what the fit raises end as sentences do."""
-    monkeypatch.setattr(calibrate, "_MOST_STEPS", 1)
-    monkeypatch.setattr(calibrate, "_SETTLED", 0.0)
-    monkeypatch.setattr(calibrate, "_LEAST_STEP", 0.0)
+    monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
+    monkeypatch.setattr(restitution, "_SETTLED", 0.0)
+    monkeypatch.setattr(restitution, "_LEAST_STEP", 0.0)
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
     assert (outcome.status, outcome.out) == (3, "")
     assert outcome.err.startswith("jaxgran: the restitution did not settle: it was last 0.")
@@ -490,7 +494,7 @@ def test_fit_of_a_map_without_such_a_flow_prints_no_table(known_map: Path, tmp_p
 # Help, completion, colours
 
 
-HELPS = {"": cli.EXAMPLES, **{f"{name} ": shown for name, (_, _, shown) in cli.COMMANDS.items()}}
+HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (_, _, shown) in app.COMMANDS.items()}}
 
 
 @pytest.mark.parametrize("command", HELPS)
@@ -498,7 +502,7 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
     outcome = jaxgran(tmp_path, *command.split(), "--help")
     assert outcome.status == 0 and "\x1b" not in outcome.out
     assert jaxgran(tmp_path, *command.split(), "-h") == outcome
-    group = typer.main.get_command(cli.app)
+    group = typer.main.get_command(app.app)
     assert HELPS[command]
     for does, example in HELPS[command].items():
         assert f"  {does}:\n    {example}\n".replace(" ", "") in outcome.out.replace(" ", "")
@@ -520,7 +524,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(sweep, "replicas", every)
     (tmp_path / "figures").mkdir()
-    plane, again = list(cli_map.MAP_EXAMPLES.values())[1], list(cli_map.PLOT_EXAMPLES.values())[1]
+    plane, again = list(map_module.MAP_EXAMPLES.values())[1], list(map_module.PLOT_EXAMPLES.values())[1]
     for example in (plane, again):
         assert jaxgran(tmp_path, *shlex.split(example)[1:]).status == 0, example
     assert {"ratio.nc", "ratio_contours.png", "figures"} <= files(tmp_path)
@@ -569,7 +573,7 @@ def test_completion_completes(line: str, expected: set[str], tmp_path: Path, mon
 def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colour_is_asked_for(
     small_map, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    table = cli_map._ratio_table(read_dataset(small_map[0] / "small.nc"))
+    table = map_module._ratio_table(read_dataset(small_map[0] / "small.nc"))
 
     class Terminal(StringIO):
         def isatty(self) -> bool:
@@ -602,8 +606,8 @@ def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeyp
     def interrupts(_) -> NoReturn:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli_map, "say_written", interrupts)
-    monkeypatch.setattr("jaxgran.dataset.read_dataset", interrupts)
+    monkeypatch.setattr(map_module, "say_written", interrupts)
+    monkeypatch.setattr("jaxgran.maps.dataset.read_dataset", interrupts)
     outcome = jaxgran(tmp_path, "plot", "map.nc")
     assert (outcome.status, outcome.out) == (130, "")
     assert outcome.err.strip() == "jaxgran: interrupted."

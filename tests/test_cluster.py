@@ -9,9 +9,9 @@ import jax
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.cluster import run_on_cluster
-from jaxgran.dataset import read_dataset
-from jaxgran.flow import InputError
+from jaxgran.maps.cluster import run_on_cluster
+from jaxgran.maps.dataset import read_dataset
+from jaxgran.model.flow import InputError
 
 MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "slurm_map.py"
@@ -34,7 +34,7 @@ def test_a_map_on_a_cluster_is_that_of_one_process(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere"])
 def test_a_scheduler_that_does_not_answer_is_one_sentence(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("jaxgran.cluster._PATIENCE", "0.5s")
+    monkeypatch.setattr("jaxgran.maps.cluster._PATIENCE", "0.5s")
     with pytest.raises(InputError, match="no scheduler answers") as refused:
         next(run_on_cluster(address, print, [()], print, ()))
     assert one_sentence(str(refused.value))

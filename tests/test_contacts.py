@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran.contacts import contact_network, first_contact_time, is_contact
-from jaxgran.grains import Grains
-from jaxgran.pairs import PairList
+from jaxgran.contact.near_pairs import PairList
+from jaxgran.contact.network import contact_network, first_contact_time, is_contact
+from jaxgran.model.grains import Grains
 
 EPS = np.finfo(float).eps
 PAIRS, INSTANTS = 256, 1001

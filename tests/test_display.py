@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran.display import Row, html_of, text_of, value_text
-from jaxgran.dynamics import State
-from jaxgran.flow import ShearFlow
-from jaxgran.grains import Grains
-from jaxgran.measure import BLOCKS, Sample
-from jaxgran.status import Status
+from jaxgran.dynamics.plain import State
+from jaxgran.model.display import Row, html_of, text_of, value_text
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
+from jaxgran.sampling.sample import BLOCKS, Sample
 
 GRAINS, REPLICAS = 64, 1000
 

@@ -9,12 +9,12 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
-from jaxgran import dynamics
-from jaxgran.cell import displacement, remap_tilt
-from jaxgran.dynamics import advance, contact_capacities, contacts_now
-from jaxgran.flow import ShearFlow
-from jaxgran.status import Status
-from jaxgran.tally import Tally
+from jaxgran.dynamics import plain
+from jaxgran.dynamics.plain import advance, contact_capacities, contacts_now
+from jaxgran.dynamics.tally import Tally
+from jaxgran.model.cell import displacement, remap_tilt
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
@@ -169,7 +169,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(run, flowing):
 def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     """A ladder of buffers that ends too early drops contacts, and says so."""
     state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
-    monkeypatch.setattr(dynamics, "contact_capacities", lambda grains: (1, 2))
+    monkeypatch.setattr(plain, "contact_capacities", lambda grains: (1, 2))
     _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 

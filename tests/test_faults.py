@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from fault_lab import MARKS, Lab, workers_of
 
-from jaxgran import sweep
-from jaxgran.dataset import read_dataset
-from jaxgran.settings import MapSettings
+from jaxgran.maps import sweep
+from jaxgran.maps.dataset import read_dataset
+from jaxgran.maps.settings import MapSettings
 
 pytestmark = MARKS
 

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from jax import lax
 from scipy.integrate import quad
 
-from jaxgran.cell import wrap
-from jaxgran.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
-from jaxgran.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.observables import averages
-from jaxgran.snapshots import Snapshot, collided, flown, snapshot
+from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
+from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
+from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
+from jaxgran.model.cell import wrap
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.sampling.observables import averages
 
 GRAINS = pytest.GRAINS
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
@@ -417,7 +417,7 @@ def test_branches_in_several_blocks_are_all_counted(seen, points, monkeypatch) -
     """In a series of snapshots, too."""
     graining, series = SMOOTH["lucy"], jax.tree.map(lambda x: x[None], seen)
     whole = fields_at(seen, points, graining)
-    monkeypatch.setattr("jaxgran.fields._BRANCHES_AT_ONCE", 7)
+    monkeypatch.setattr("jaxgran.analysis.fields._BRANCHES_AT_ONCE", 7)
     fewer = points[:-1]  # another shape, so that it is compiled anew
     cut = lax.map(lambda one: fields_at(one, fewer, graining), series)
     assert_same(jax.tree.map(lambda x: x[0], cut), jax.tree.map(lambda x: x[:-1], whole), 1e-11)

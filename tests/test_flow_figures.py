@@ -14,12 +14,12 @@ from PIL import Image, ImageSequence
 from synthetic import one_sentence, snapshot_of
 
 import jaxgran as jg
-from jaxgran import flow_figures, movie
-from jaxgran.drawing import empty_figure
-from jaxgran.flow import InputError
-from jaxgran.flow_figures import Scale, common_scale, draw_scene, flow_figure, scene_of
-from jaxgran.force_chains import pair_forces
-from jaxgran.movie import Frames, check_movie, write_movie
+from jaxgran.analysis.force_chains import pair_forces
+from jaxgran.model.flow import InputError
+from jaxgran.plotting import flow, movie
+from jaxgran.plotting.drawing import empty_figure
+from jaxgran.plotting.flow import Scale, common_scale, draw_scene, flow_figure, scene_of
+from jaxgran.plotting.movie import Frames, check_movie, write_movie
 
 SIDE, GRAINS = 8.0, 40
 
@@ -80,8 +80,8 @@ def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() 
     _, clusters, binaries, _ = drawn(scene, Scale(1.0, 2.0))
     assert len(clusters.get_segments()) == 2 * 9 and len(binaries.get_segments()) == 9
     widths = {*clusters.get_linewidths(), *binaries.get_linewidths()}
-    assert max(widths) == flow_figures._WIDEST
-    np.testing.assert_allclose(sorted(widths), flow_figures._WIDEST * np.array([0.25, 0.5, 1.0]))
+    assert max(widths) == flow._WIDEST
+    np.testing.assert_allclose(sorted(widths), flow._WIDEST * np.array([0.25, 0.5, 1.0]))
     middle = binaries.get_segments()[4]  # the image that is not shifted
     start, end = (scene.centres[k] for k in (4, 3))
     np.testing.assert_allclose(middle[0], start)
@@ -95,7 +95,7 @@ def test_clusters_and_binary_collisions_differ_in_grey() -> None:
         return float(np.dot(np.asarray(colour)[0, :3], [0.299, 0.587, 0.114]))
 
     _, clusters, binaries, _ = drawn(scene_of(seen()))
-    deepest = [np.asarray(colours(1.0))[None] for colours in flow_figures.COLOURS.values()]
+    deepest = [np.asarray(colours(1.0))[None] for colours in flow.COLOURS.values()]
     dark, light, grains = grey(clusters.get_edgecolor()), grey(binaries.get_edgecolor()), min(map(grey, deepest))
     assert dark + 0.3 < light < grains - 0.2
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.free_cooling import Cooling, _cooling, cooling
-from jaxgran.kinetic_theory import contact_value
-from jaxgran.measure import sample
-from jaxgran.protocol import heated, prepare
-from jaxgran.snapshots import snapshot_series
-from jaxgran.status import Status
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.snapshots import snapshot_series
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.status import Status
+from jaxgran.sampling.free_cooling import Cooling, _cooling, cooling
+from jaxgran.sampling.sample import sample
+from jaxgran.sampling.steady_state import heated, prepare
+from jaxgran.theory.kinetic_theory import contact_value
 
 GRAINS, NU, ALPHA, SEEDS = 64, 0.3, 0.95, 8
 FLOW = ShearFlow(GRAINS, ALPHA, NU, 1e-3, shear_rate=0.0, polydispersity=0.0)

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from jax import lax
 from oracles import MAX_DISCS, delassus, padded_network, random_network
 
-from jaxgran.cell import displacement
-from jaxgran.contacts import Contacts
-from jaxgran.delassus import delassus_product, grain_impulses, spectral_bound
-from jaxgran.dynamics import State, advance, count_events
-from jaxgran.flow import ShearFlow
-from jaxgran.grains import Grains
-from jaxgran.sensitivity import margins
-from jaxgran.snapshots import snapshot
-from jaxgran.solver import solve
-from jaxgran.status import Status
+from jaxgran.analysis.sensitivity import margins
+from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.solver import solve
+from jaxgran.dynamics.plain import State, advance, count_events
+from jaxgran.dynamics.snapshots import snapshot
+from jaxgran.model.cell import displacement
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
 
 networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, MAX_DISCS))
 STEPS = 40

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxgran.flow import InputError
-from jaxgran.grains import own_grains, polydisperse
+from jaxgran.model.flow import InputError
+from jaxgran.model.grains import own_grains, polydisperse
 
 EPS = np.finfo(float).eps
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran import journal as journal_module
-from jaxgran.batch import advance_batch, stack
-from jaxgran.dynamics import State
-from jaxgran.flow import ShearFlow
-from jaxgran.grains import Grains
-from jaxgran.journal import Journal
-from jaxgran.protocol import prepare_batch, sample_batch
-from jaxgran.store import Damaged, read_arrays
+from jaxgran.dynamics.plain import State
+from jaxgran.io.atomic import Damaged, read_arrays
+from jaxgran.maps import journal as journal_module
+from jaxgran.maps.journal import Journal
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.sampling.batch import advance_batch, stack
+from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 KEYS = [(0, 0), (1, 0)]
 GRAINS = 64  # as in the tests of the protocol: compiled once

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran import kinetic_theory
-from jaxgran.kinetic_theory import SteadyShear, contact_value, garzo_dufty, gaussian_moments, jenkins_richman
+from jaxgran.theory import kinetic_theory
+from jaxgran.theory.kinetic_theory import SteadyShear, contact_value, garzo_dufty, gaussian_moments, jenkins_richman
 
 PLANE = [axis.ravel() for axis in np.meshgrid(np.append(np.arange(0, 1, 0.1), 0.99), [0.01, 0.1, 0.3, 0.5, 0.7, 0.83])]
 
@@ -201,5 +201,7 @@ def test_one_elastic_replica_leaves_the_others_alone():
 
 
 def test_import_computes_nothing():
-    program = "import jax._src.xla_bridge as b, jaxgran.kinetic_theory; raise SystemExit(b.backends_are_initialized())"
+    program = (
+        "import jax._src.xla_bridge as b, jaxgran.theory.kinetic_theory; raise SystemExit(b.backends_are_initialized())"
+    )
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0

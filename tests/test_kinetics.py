@@ -5,11 +5,11 @@ import pytest
 from scipy.special import ndtr
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
-from jaxgran.flow import ShearFlow
-from jaxgran.kinetic_theory import contact_value, gaussian_moments
-from jaxgran.kinetics import mixture_contact_value, near_contact, velocity_distribution
-from jaxgran.observables import averages
-from jaxgran.snapshots import snapshot_series
+from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_contact, velocity_distribution
+from jaxgran.dynamics.snapshots import snapshot_series
+from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.observables import averages
+from jaxgran.theory.kinetic_theory import contact_value, gaussian_moments
 
 GRAINS = pytest.GRAINS
 STRAIN = 40.0

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from synthetic import one_sentence, random_tally
 
-from jaxgran.batch import advance_batch, stack
-from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.measure import BLOCKS, Sample, _sample, check_precision, sample
-from jaxgran.observables import OBSERVABLES
-from jaxgran.protocol import Batch, prepare_batch, sample_batch
-from jaxgran.status import Status
-from jaxgran.tally import EXTREMES
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.tally import EXTREMES
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.status import Status
+from jaxgran.sampling.batch import advance_batch, stack
+from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.sampling.sample import BLOCKS, Sample, _sample, check_precision, sample
+from jaxgran.sampling.steady_state import Batch, prepare_batch, sample_batch
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]

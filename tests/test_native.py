@@ -14,19 +14,22 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran import block_solver, dynamics, event_loop, native, thread_block
-from jaxgran.dynamics import State
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.grains import Grains
-from jaxgran.replica import AXIS
-from jaxgran.status import Status
-from jaxgran.tally import empty_tally
+from jaxgran.dynamics import advance as advance_module
+from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics.machine_code import loop
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.tally import empty_tally
+from jaxgran.dynamics.thread_block import kernel, solver
+from jaxgran.model.control_flow import AXIS
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
 
 GRAINS = pytest.GRAINS
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
-ENGINES = {"machine code": native.advance, "thread block": partial(thread_block.advance, interpret=True)}
+ENGINES = {"machine code": advance_module.advance, "thread block": partial(kernel.advance, interpret=True)}
 
 
 @pytest.fixture(scope="module", params=ENGINES)
@@ -124,7 +127,7 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
         jnp.asarray(0.0),
     )
     flow = ShearFlow(count, 0.9, 0.4, 1e-3, tolerance=1e-12)
-    advance = jax.jit(native.advance)
+    advance = jax.jit(advance_module.advance)
     shuffled = rng.permutation(count)
     after, tally = advance(flow, state, jnp.int32(100))
     other, sums = advance(flow, jax.tree.map(lambda x: x[shuffled] if x.ndim else x, state), jnp.int32(100))
@@ -220,27 +223,27 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     flow = of(0.01, 0.0, tolerance=1e-9, shear_rate=0.0)
     ours, plain = native_run(flow, state, 1), run(flow, state, 1)
     assert ours[1].status == plain[1].status == Status.ok
-    assert ours[1].iterations > event_loop._SWEEPS
+    assert ours[1].iterations > loop._SWEEPS
     np.testing.assert_allclose(ours[0].velocities, plain[0].velocities, atol=1e-7)
     np.testing.assert_allclose(ours[1].impulse, plain[1].impulse, rtol=1e-5)
 
 
 def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None:
     flow, state = of(0.6), flowing(0.6)
-    assert native.engine(flow, state) is native.machine_code
-    assert native.engine(replace(flow, solver="nesterov"), state) is None
+    assert advance_module.engine(flow, state) is advance_module.machine_code
+    assert advance_module.engine(replace(flow, solver="nesterov"), state) is None
     single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
-    assert native.engine(flow, single) is None
+    assert advance_module.engine(flow, single) is None
     batched = jax.tree.map(lambda x: x[None], state)
     found = []
-    jax.vmap(lambda one: found.append(native.engine(flow, one)), axis_name=AXIS)(batched)
+    jax.vmap(lambda one: found.append(advance_module.engine(flow, one)), axis_name=AXIS)(batched)
     assert found == [None]
 
 
 @pytest.fixture
 def gpu(monkeypatch):
     """Processors that pass for GPUs, with a kernel that is interpreted."""
-    native._kernel_runs.cache_clear()
+    advance_module._kernel_runs.cache_clear()
 
     class Device:
         platform = "gpu"
@@ -248,20 +251,20 @@ def gpu(monkeypatch):
     device = Device()
     monkeypatch.setattr(jax, "devices", lambda *_: [device])
     monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
-    monkeypatch.setattr(thread_block, "advance", partial(thread_block.advance, interpret=True))
+    monkeypatch.setattr(kernel, "advance", partial(kernel.advance, interpret=True))
     yield monkeypatch
-    native._kernel_runs.cache_clear()
+    advance_module._kernel_runs.cache_clear()
 
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
     flow, state = of(0.6, tolerance=1e-4), flowing(0.6)
-    assert native.engine(flow, state) is native.thread_block
-    assert native.engine(replace(flow, solver="nesterov"), state) is None
-    assert native.engine(replace(flow, grains=native.MOST_GRAINS + 1), state) is None
+    assert advance_module.engine(flow, state) is advance_module.thread_block
+    assert advance_module.engine(replace(flow, solver="nesterov"), state) is None
+    assert advance_module.engine(replace(flow, grains=advance_module.MOST_GRAINS + 1), state) is None
 
 
 def unsolved(thread, contacts, most, width, target):
-    return block_solver.Solve(3 + thread.flow.ok, 0 * target, thread.flow.ok)
+    return solver.Solve(3 + thread.flow.ok, 0 * target, thread.flow.ok)
 
 
 def broken(*_):
@@ -271,16 +274,16 @@ def broken(*_):
 @pytest.mark.parametrize(
     ("place", "failure", "said"),
     [
-        (thread_block, broken, "no such instruction"),
-        (block_solver, unsolved, "it fails in overlaps"),
+        (kernel, broken, "no such instruction"),
+        (solver, unsolved, "it fails in overlaps"),
     ],
 )
 def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, place, failure, said) -> None:
-    gpu.setattr(place, "advance" if place is thread_block else "_descend", failure)
-    flow, state = replace(of(0.6), grains=40 if place is block_solver else GRAINS), flowing(0.6)  # traced for no other
+    gpu.setattr(place, "advance" if place is kernel else "_descend", failure)
+    flow, state = replace(of(0.6), grains=40 if place is solver else GRAINS), flowing(0.6)  # traced for no other
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
-        assert native.engine(flow, state) is None
-    assert native.engine(flow, state) is None  # and says so once
+        assert advance_module.engine(flow, state) is None
+    assert advance_module.engine(flow, state) is None  # and says so once
 
 
 @pytest.mark.parametrize(("count", "dtype"), [(16, jnp.float64), (300, jnp.float32), (1024, jnp.float64)])
@@ -292,7 +295,7 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype) -> None:
         return jax.ShapeDtypeStruct((replicas, *shape), dtype)
 
     state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
-    way = native.thread_block if count == 16 else thread_block.advance  # the former is traced with the plain advance
+    way = advance_module.thread_block if count == 16 else kernel.advance  # the former is traced with the plain advance
     advance = jax.vmap(partial(way, ShearFlow(count, 0.5, 0.6, 1e-3)), (0, None), axis_name=AXIS)
     traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
     text = traced.lower(lowering_platforms=("cuda",)).as_text()
@@ -358,7 +361,7 @@ def test_single_precision_is_double_precision_to_its_rounding(flowing) -> None:
 def test_transformations_apply(flowing) -> None:
     flow, states = of(0.6), [flowing(0.6, seed) for seed in (0, 1)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    one = jax.jit(lambda state: native.advance(flow, state, jnp.int32(50)))
+    one = jax.jit(lambda state: advance_module.advance(flow, state, jnp.int32(50)))
     for many in (jax.vmap(one), lambda batch: jax.lax.map(one, batch)):
         for k, found in enumerate(states):
             jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found))
@@ -370,10 +373,10 @@ def test_derivatives_go_through_the_plain_advance(flowing, monkeypatch) -> None:
     def plain(flow, state, steps):
         return replace(state, velocities=flow.restitution * state.velocities), empty_tally(state.side.dtype)
 
-    monkeypatch.setattr(dynamics, "advance", plain)
+    monkeypatch.setattr(plain_module, "advance", plain)
 
     def velocities(alpha):
-        return native.advance(replace(of(0.6), restitution=alpha), state, jnp.int32(30))[0].velocities
+        return advance_module.advance(replace(of(0.6), restitution=alpha), state, jnp.int32(30))[0].velocities
 
     np.testing.assert_array_equal(jax.jvp(velocities, (0.5,), (1.0,))[1], state.velocities)
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
@@ -381,9 +384,9 @@ def test_derivatives_go_through_the_plain_advance(flowing, monkeypatch) -> None:
 
 def test_mistakes_are_one_sentence(flowing) -> None:
     with pytest.raises(InputError, match="a whole number of 0"):
-        native.advance(of(0.6), flowing(0.6), 0.5)
+        advance_module.advance(of(0.6), flowing(0.6), 0.5)
     with pytest.raises(InputError, match="state must be one State"):
-        native.advance(of(0.6), jax.tree.map(lambda x: x[:3], flowing(0.6).positions), 5)
+        advance_module.advance(of(0.6), jax.tree.map(lambda x: x[:3], flowing(0.6).positions), 5)
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)
@@ -429,7 +432,7 @@ def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin,
     pairs, images = np.empty((2, room), np.uint32), np.empty((2, room))
     heads, links = np.empty(2 * count, np.int32), np.empty(count, np.int32)
     grains = np.stack([radii, np.ones(count)], axis=-1)
-    found = event_loop._near_pairs(motion, grains, side, tilt, reach, skin, room, heads, links, pairs, images)
+    found = loop._near_pairs(motion, grains, side, tilt, reach, skin, room, heads, links, pairs, images)
     expected = set()
     for row in (-1, 0, 1):
         for column in (-2, -1, 0, 1, 2):

@@ -8,10 +8,10 @@ from gauss_seidel import exact, gauss_seidel
 from networks import CHAINS, INFEASIBLE, chain, collection
 from oracles import delassus, exact_velocities, incidence
 
-from jaxgran.delassus import spectral_bound
-from jaxgran.flow import ShearFlow
-from jaxgran.solver import solve
-from jaxgran.status import Status
+from jaxgran.contact.delassus import spectral_bound
+from jaxgran.contact.solver import solve
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
 
 DEFAULT = ShearFlow(16, 0.5, 0.5, 1e-3).solver
 BOUNDED = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran.observables import OBSERVABLES, TENSORS, averages
-from jaxgran.tally import RESIDUAL_EDGES, Tally, empty_tally
+from jaxgran.dynamics.tally import RESIDUAL_EDGES, Tally, empty_tally
+from jaxgran.sampling.observables import OBSERVABLES, TENSORS, averages
 
 GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 

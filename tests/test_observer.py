@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.measure import BLOCKS, sample
-from jaxgran.snapshots import Snapshot
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.sampling.sample import BLOCKS, sample
 
 GRAINS, STRAIN = pytest.GRAINS, 0.32
 # With a method by name, looking and not looking take the same advance; with the default, not looking the machine code.

@@ -10,10 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import gaps_of
 
-from jaxgran import pairs
-from jaxgran.cell import displacement
-from jaxgran.grains import Grains
-from jaxgran.pairs import (
+from jaxgran.contact import near_pairs
+from jaxgran.contact.near_pairs import (
     Frame,
     Neighbourhood,
     consumed_skin,
@@ -23,6 +21,8 @@ from jaxgran.pairs import (
     refresh,
     separations_now,
 )
+from jaxgran.model.cell import displacement
+from jaxgran.model.grains import Grains
 
 EPS = np.finfo(float).eps
 
@@ -128,7 +128,7 @@ def clustered(count: int, side: float, seed: int) -> np.ndarray:
 def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
     """With a buffer that is too small a list is complete, or says that it is not: by its flag or a skin used up."""
     state, flags = packed(0.7), []
-    monkeypatch.setattr(pairs, buffer, 2)
+    monkeypatch.setattr(near_pairs, buffer, 2)
     tiny = jax.jit(lambda *arguments: neighbourhood(*arguments))
     for seed in range(6):
         places = state.positions if seed == 0 else clustered(len(state.positions), float(state.side), seed)
@@ -141,8 +141,8 @@ def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
 
 
 def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
-    monkeypatch.setattr(pairs, "OUTER_PAIRS_PER_GRAIN", 1)
-    monkeypatch.setattr(pairs, "NEAR_PAIRS_PER_GRAIN", 10)
+    monkeypatch.setattr(near_pairs, "OUTER_PAIRS_PER_GRAIN", 1)
+    monkeypatch.setattr(near_pairs, "NEAR_PAIRS_PER_GRAIN", 10)
     state = packed(0.7)
     places = clustered(len(state.positions), float(state.side), 0)
     hood = jax.jit(lambda *arguments: neighbourhood(*arguments))(places, state.grains, state.side, state.tilt)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from oracles import gaps_of, kinetic_energy
 
-from jaxgran.cell import displacement, relative_velocity
-from jaxgran.dynamics import State
-from jaxgran.flow import ShearFlow
-from jaxgran.observables import averages
-from jaxgran.status import Status
+from jaxgran.dynamics.plain import State
+from jaxgran.model.cell import displacement, relative_velocity
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
+from jaxgran.sampling.observables import averages
 
 EPS = np.finfo(float).eps
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pool_tasks
 import pytest
 
-from jaxgran.pool import ATTEMPTS, Died, run_tasks
+from jaxgran.maps.pool import ATTEMPTS, Died, run_tasks
 
 
 def run(function, tasks, workers: int = 2, hear=lambda _: None) -> dict:
@@ -108,7 +108,7 @@ def test_workers_end_with_the_iterator() -> None:
 def test_no_worker_outlives_a_parent_that_is_killed_nor_says_a_word_about_it() -> None:
     script = """
 import pool_tasks, sys
-from jaxgran.pool import run_tasks
+from jaxgran.maps.pool import run_tasks
 if __name__ == "__main__":
     tasks = [(0.5,), (0.5,), (60,), (60,)]
     for _, process in run_tasks(pool_tasks.process_id, tasks, 2, pool_tasks.prepare, (), print):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran import protocol
-from jaxgran.batch import advance_batch, reporting, stack
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.measure import relative_error
-from jaxgran.protocol import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch
-from jaxgran.status import Status
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.status import Status
+from jaxgran.sampling import steady_state
+from jaxgran.sampling.batch import advance_batch, reporting, stack
+from jaxgran.sampling.sample import relative_error
+from jaxgran.sampling.steady_state import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch
 
 GRAINS, TIMESTEP = 64, 1e-2
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
@@ -54,7 +54,7 @@ def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> N
 
 def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     temperature = jnp.asarray([0.3, 2.0])
-    state, found = protocol._heated(stack(FLOWS), keys, temperature)
+    state, found = steady_state._heated(stack(FLOWS), keys, temperature)
     masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
     assert np.all(found)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)
@@ -79,7 +79,7 @@ def test_steady_noise_is_accepted_at_the_rate_of_its_criterion() -> None:
     # Two errors hold 95.4 % of a Gaussian, and fewer where the error itself comes from few values.
     rng = np.random.default_rng(0)
     for length, least in ((6, 0.85), (40, 0.93)):
-        levels = [protocol._is_level(0.05 * rng.normal(size=length)) for _ in range(2000)]
+        levels = [steady_state._is_level(0.05 * rng.normal(size=length)) for _ in range(2000)]
         assert np.mean(levels) > least - 4 * np.sqrt(least * (1 - least) / 2000)
 
 
@@ -88,12 +88,12 @@ def test_a_drifting_record_is_refused() -> None:
     for length in (6, 20, 40):
         drifting = np.linspace(0.0, 1.0, length) + 0.05 * rng.normal(size=(200, length))
         relaxing = np.exp(-np.linspace(0.0, 2.0, length)) + 0.01 * rng.normal(size=(200, length))
-        assert not any(protocol._is_level(one) for one in drifting)
-        assert not any(protocol._is_level(one) for one in relaxing)
+        assert not any(steady_state._is_level(one) for one in drifting)
+        assert not any(steady_state._is_level(one) for one in relaxing)
 
 
 def test_noise_that_hides_any_drift_is_refused() -> None:
-    assert not any(protocol._is_level(one) for one in np.random.default_rng(2).normal(size=(100, 12)))
+    assert not any(steady_state._is_level(one) for one in np.random.default_rng(2).normal(size=(100, 12)))
 
 
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,13 +109,13 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
         pressure = np.exp([0.02 * rng.normal(), 0.0, rng.normal(), -n / 10, np.nan])
         return {"granular_temperature": temperature, "pressure": pressure}
 
-    monkeypatch.setattr(protocol, "_chunk", chunk)
-    monkeypatch.setattr(protocol, "_averages", averages)
+    monkeypatch.setattr(steady_state, "_chunk", chunk)
+    monkeypatch.setattr(steady_state, "_averages", averages)
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
     theory: Any = SimpleNamespace(granular_temperature=np.full(5, 1.0), shear_stress=np.full(5, 0.2))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
-    end = protocol._until_steady(Batch(flow, start, status, np.zeros(5)), theory, None)
+    end = steady_state._until_steady(Batch(flow, start, status, np.zeros(5)), theory, None)
     bad = Status.not_steady
     np.testing.assert_array_equal(end.status, [Status.ok, bad, bad, bad, Status.nonfinite])
     strain = np.array(sheared)
@@ -134,10 +134,10 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
         record.append((np.asarray(batch.flow.timestep), strain))
         return batch
 
-    monkeypatch.setattr(protocol, "_sheared", sheared)
+    monkeypatch.setattr(steady_state, "_sheared", sheared)
     flow, coarse = with_timesteps(1e-5, 2e-4), with_timesteps(1e-3, 1e-3)
     state: Any = SimpleNamespace(side=jnp.full(2, 10.0))
-    end = protocol._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2)), flow, None)
+    end = steady_state._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2)), flow, None)
     timesteps, strains = np.array([dt for dt, _ in record]), np.array([strain for _, strain in record])
     ladder = np.vstack([coarse.timestep, timesteps])
     np.testing.assert_allclose(ladder[1:, 0] / ladder[:-1, 0], 10**-0.5, rtol=1e-6)
@@ -148,7 +148,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert end.flow is flow
 
     record.clear()
-    protocol._shortened(Batch(flow, state, np.zeros(2), np.zeros(2)), flow, None)
+    steady_state._shortened(Batch(flow, state, np.zeros(2), np.zeros(2)), flow, None)
     assert record == []
 
 
@@ -156,8 +156,8 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
 def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(protocol, "RELAXATION_STRAIN", 0.02)
-    monkeypatch.setattr(protocol, "_SHORTENING_STRAIN", 0.02)
+    monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
+    monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
     flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3, 2e-4, 1e-5)]
     keys = jax.random.split(jax.random.key(5), len(flows))
     together = prepare_batch(stack(flows), keys, equilibrate=0.1)
@@ -169,8 +169,8 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
 
 def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     flow = with_timesteps(1e-4, 2e-2)
-    coarse = np.asarray(protocol._coarse_timestep(flow, predicted(flow)))
-    assert coarse[0] == protocol.COARSE_TIMESTEP
+    coarse = np.asarray(steady_state._coarse_timestep(flow, predicted(flow)))
+    assert coarse[0] == steady_state.COARSE_TIMESTEP
     assert coarse[1] == 2e-2
 
 
@@ -197,7 +197,7 @@ def test_prepare_refuses_a_time_step_too_long_for_its_flow() -> None:
 
 def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = batch._replace(status=np.array([Status.not_steady]))
-    monkeypatch.setattr(protocol, "prepare_batch", lambda *_, **__: bad)
+    monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
     with pytest.raises(RuntimeError, match="not_steady"):
         prepare(FLOWS[0], jax.random.key(0))
 
@@ -216,15 +216,15 @@ def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identica
 def test_sample_that_drifts_is_not_steady() -> None:
     rng = np.random.default_rng(4)
     noise = 0.05 * rng.normal(size=(200, 16))
-    assert not any(protocol._drifts(one) for one in noise)
-    assert all(protocol._drifts(one) for one in noise + 0.5 * (np.arange(16) > 7))
-    assert not any(protocol._drifts(one) for one in 0.1 * noise + 0.15 * (np.arange(16) > 7))  # too little to matter
-    assert protocol._drifts(np.full(16, np.nan))
+    assert not any(steady_state._drifts(one) for one in noise)
+    assert all(steady_state._drifts(one) for one in noise + 0.5 * (np.arange(16) > 7))
+    assert not any(steady_state._drifts(one) for one in 0.1 * noise + 0.15 * (np.arange(16) > 7))  # small
+    assert steady_state._drifts(np.full(16, np.nan))
 
 
 def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch, monkeypatch) -> None:
     """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
-    monkeypatch.setattr(protocol, "LONGEST_STRAIN", 2.56)
+    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 2.56)
     _, short = sample_batch(batch, 0.64)
     errors = [relative_error(replica(short, k)) for k in (0, 1)]
     target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
@@ -239,7 +239,7 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch
 
 
 def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -> None:
-    monkeypatch.setattr(protocol, "LONGEST_STRAIN", 0.64)
+    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
     _, grown = sample_batch(batch, 0.32, error=1e-9)
     _, whole = sample_batch(batch, 0.64)
     np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)

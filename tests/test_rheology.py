@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from synthetic import one_sentence
 
-from jaxgran.rheology import FrictionLaw, dense_points, friction_law
+from jaxgran.inference.friction_law import FrictionLaw, dense_points, friction_law
 
 FRICTION, FRACTION = (0.10, 0.60, 0.40), (0.84, -0.25, 0.80)
 

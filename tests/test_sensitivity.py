@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.cell import displacement
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.sensitivity import growth, lyapunov_exponent
+from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
+from jaxgran.model.cell import displacement
+from jaxgran.model.flow import InputError, ShearFlow
 
 
 def flow_of(restitution) -> ShearFlow:

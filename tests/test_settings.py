@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.flow import InputError
-from jaxgran.settings import MapSettings, automatic
+from jaxgran.maps.settings import MapSettings, automatic
+from jaxgran.model.flow import InputError
 
 GOOD: dict[str, Any] = {
     "restitution": (0.5, 0.9),

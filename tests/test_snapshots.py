@@ -9,9 +9,9 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxgran.cell import displacement
-from jaxgran.flow import ShearFlow
-from jaxgran.snapshots import collided, flown, snapshot, snapshot_series
+from jaxgran.dynamics.snapshots import collided, flown, snapshot, snapshot_series
+from jaxgran.model.cell import displacement
+from jaxgran.model.flow import ShearFlow
 
 GRAINS = pytest.GRAINS
 

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import MAX_DISCS, delassus, exact_velocities, padded_network, random_network
 
-from jaxgran.contacts import Contacts
-from jaxgran.delassus import count_bound, delassus_product, grain_impulses, spectral_bound
-from jaxgran.solver import solve
-from jaxgran.status import Status
+from jaxgran.contact.delassus import count_bound, delassus_product, grain_impulses, spectral_bound
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.solver import solve
+from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
 METHODS = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import stability
 
-from jaxgran.dynamics import DEEP_OVERLAP, State
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.grains import Grains
-from jaxgran.measure import sample
-from jaxgran.observables import averages
-from jaxgran.status import Status
+from jaxgran.dynamics.plain import DEEP_OVERLAP, State
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
+from jaxgran.sampling.observables import averages
+from jaxgran.sampling.sample import sample
 
 PAIRS = stability.GRAINS // 2
 

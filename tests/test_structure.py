@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
-from jaxgran.cell import displacement
-from jaxgran.flow import ShearFlow
-from jaxgran.force_chains import (
+from jaxgran.analysis.force_chains import (
     cluster_share,
     cluster_sizes,
     clusters,
@@ -19,10 +17,12 @@ from jaxgran.force_chains import (
     loaded_contacts,
     persistence,
 )
-from jaxgran.kinetics import near_contact
-from jaxgran.series import minimum_image, series
-from jaxgran.snapshots import Snapshot, snapshot_series
-from jaxgran.structure import coordination, hexatic_order, pair_correlation, profiles
+from jaxgran.analysis.order import coordination, hexatic_order, pair_correlation, profiles
+from jaxgran.analysis.series import series
+from jaxgran.analysis.velocity_correlations import near_contact
+from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
+from jaxgran.model.cell import displacement, minimum_image
+from jaxgran.model.flow import ShearFlow
 
 GRAINS = pytest.GRAINS
 

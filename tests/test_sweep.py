@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_replica
 
-from jaxgran import sweep
-from jaxgran.dataset import Key, Replica, map_dataset
-from jaxgran.flow import ShearFlow
-from jaxgran.settings import MapSettings
-from jaxgran.status import Status
-from jaxgran.sweep import predicted_cost, ratio_map, replicas
+from jaxgran.maps import sweep
+from jaxgran.maps.dataset import Key, Replica, map_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.sweep import predicted_cost, ratio_map, replicas
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
 
 SETTINGS = {
     "restitution": (0.5, 0.9),

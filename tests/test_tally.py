@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran.status import Status
-from jaxgran.tally import EXTREMES, Tally, empty_tally
+from jaxgran.dynamics.tally import EXTREMES, Tally, empty_tally
+from jaxgran.model.status import Status
 
 
 def random_tally(seed: int) -> Tally:

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from test_figures import caption, excess_of, legend_texts, ratio_dataset, with_timesteps
 from test_rheology import dense_map
 
-from jaxgran.contours import EXCESS_LEVELS
-from jaxgran.figures import save_figures
-from jaxgran.rheology import friction_law
-from jaxgran.rheology_figures import friction_figure, parameters_text
-from jaxgran.theory_figures import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
+from jaxgran.inference.friction_law import friction_law
+from jaxgran.plotting.contours import EXCESS_LEVELS
+from jaxgran.plotting.friction import friction_figure, parameters_text
+from jaxgran.plotting.ratio import save_figures
+from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
 
 DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress, relative

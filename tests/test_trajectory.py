@@ -12,12 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.batch import stack
-from jaxgran.cell import displacement
-from jaxgran.flow import InputError, ShearFlow
-from jaxgran.recorder import Recorder
-from jaxgran.snapshots import snapshot
-from jaxgran.trajectory import (
+from jaxgran.dynamics.snapshots import snapshot
+from jaxgran.io.trajectory import (
     Trajectory,
     append_frame,
     check_trajectory,
@@ -25,6 +21,10 @@ from jaxgran.trajectory import (
     start_trajectory,
     write_frame,
 )
+from jaxgran.model.cell import displacement
+from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.sampling.batch import stack
+from jaxgran.sampling.recorder import Recorder
 
 GRAINS = pytest.GRAINS
 TILTS = (-0.4, 0.0, 0.3)

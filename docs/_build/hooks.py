@@ -6,7 +6,7 @@ Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` o
 
 in a page stands for a section of the README, or for the part of it that begins with that bold paragraph, up to the next
 one; ``{README: Section / }`` is what precedes the first. A section that is not there stops the build. ``{OBSERVABLES}``
-stands for the names, units and meanings in ``jaxgran/observables.py``.
+stands for the names, units and meanings in ``jaxgran/sampling/observables.py``.
 """
 
 import ast
@@ -57,7 +57,7 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 def observables() -> str:
     """A table of what is measured, read from the source: importing it would start JAX."""
-    tree = ast.parse((ROOT / "jaxgran" / "observables.py").read_text(encoding="utf-8"))
+    tree = ast.parse((ROOT / "jaxgran" / "sampling" / "observables.py").read_text(encoding="utf-8"))
     constants = {name.id: value for name, value in map(_assigned, tree.body) if name is not None}
     stress_unit = ast.literal_eval(constants["STRESS_UNIT"])
     rows = ["| name | unit | meaning |", "| --- | --- | --- |"]

@@ -1,0 +1,71 @@
+"""The public names of jaxgran and where they live; they load when they are first used."""
+
+from .analysis.coarse_graining import gaussian, heaviside, lucy
+from .analysis.fields import Fields, fields_at
+from .dynamics.advance import advance
+from .dynamics.plain import State, count_events
+from .dynamics.snapshots import Snapshot, snapshot_series
+from .dynamics.tally import Tally
+from .inference.closure import Closure, predict
+from .inference.closure_fit import fit_closure
+from .inference.friction_law import friction_law
+from .inference.restitution import RestitutionFit, fit_restitution
+from .inference.stress_inversion import restitution_from_stresses
+from .io.trajectory import Trajectory, read_trajectory
+from .maps.sweep import ratio_map
+from .model.flow import ShearFlow
+from .model.grains import Grains, own_grains, polydisperse
+from .model.status import Status
+from .plotting.flow import flow_figure
+from .plotting.friction import friction_figure
+from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
+from .plotting.theory import cluster_shares, theory_errors
+from .sampling.free_cooling import Cooling, cooling
+from .sampling.packing import pack
+from .sampling.sample import Sample, sample
+from .sampling.steady_state import heated, prepare
+
+__version__: str
+__all__ = [
+    "Closure",
+    "Cooling",
+    "Fields",
+    "Grains",
+    "RestitutionFit",
+    "Sample",
+    "ShearFlow",
+    "Snapshot",
+    "State",
+    "Status",
+    "Tally",
+    "Trajectory",
+    "advance",
+    "cluster_shares",
+    "cooling",
+    "count_events",
+    "fields_at",
+    "fit_closure",
+    "fit_restitution",
+    "flow_figure",
+    "friction_figure",
+    "friction_law",
+    "gaussian",
+    "heated",
+    "heaviside",
+    "lucy",
+    "own_grains",
+    "pack",
+    "polydisperse",
+    "predict",
+    "prepare",
+    "ratio_against_timestep",
+    "ratio_contours",
+    "ratio_curves",
+    "ratio_map",
+    "read_trajectory",
+    "restitution_from_stresses",
+    "sample",
+    "save_figures",
+    "snapshot_series",
+    "theory_errors",
+]

@@ -1,0 +1,136 @@
+"""Coarse-graining functions: how a grain is spread over the plane, and a contact along its branch.
+
+Each is normalised in the plane and knows its integral along a line in closed form. A new one takes two functions and
+two numbers: see ``Kernel``.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import erf
+from jaxtyping import Array, Float
+
+from jaxgran.model.flow import require_number
+
+
+class Kernel(NamedTuple):
+    """A coarse-graining function of unit width, g(q), normalised in the plane.
+
+    =============  ==============  ==========================================================================
+    field          signature       meaning
+    =============  ==============  ==========================================================================
+    value          q² → g          the function
+    line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line that passes the centre at the distance b
+    second_moment  number          ∫ g q_x² d²q
+    reach          number          g vanishes beyond it, or may be left out
+    =============  ==============  ==========================================================================
+    """
+
+    value: Callable[[Array], Array]
+    line: Callable[[Array, Array], Array]
+    second_moment: float
+    reach: float
+
+
+def _root(square: Array) -> Array:
+    """A square root whose derivative at zero is zero: it is only used in odd powers of three and more."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _in_disc(s: Array, b2: Array) -> Array:
+    """The part of s on the chord of the unit disc at the distance b from the centre."""
+    half = jnp.sqrt(jnp.where(b2 < 1, 1 - b2, 1))
+    return jnp.where(b2 < 1, jnp.clip(s, -half, half), 0)
+
+
+def _lucy_value(q2: Array) -> Array:
+    return jnp.where(q2 < 1, 5 / jnp.pi * (1 - 6 * q2 + 8 * q2 * _root(q2) - 3 * q2**2), 0)
+
+
+def _lucy_line(s: Array, b2: Array) -> Array:
+    s, passes = _in_disc(s, b2), b2 > 1e-100
+    s2, b = s**2, jnp.sqrt(jnp.where(passes, b2, 1))
+    q2 = b2 + s2
+    odd = s * _root(q2) * (2 * q2 + 3 * b2) + jnp.where(passes, 3 * b2**2 * jnp.arcsinh(s / b), 0)  # 8 ∫ q³
+    return 5 / jnp.pi * (s - s * (6 * b2 + 2 * s2) + odd - s * (3 * b2**2 + 2 * b2 * s2 + 0.6 * s2**2))
+
+
+GAUSSIAN = Kernel(
+    value=lambda q2: jnp.exp(-q2 / 2) / (2 * jnp.pi),
+    line=lambda s, b2: jnp.exp(-b2 / 2) * erf(s / np.sqrt(2.0).item()) / (8 * jnp.pi) ** 0.5,
+    second_moment=1.0,
+    reach=6.0,
+)
+LUCY = Kernel(_lucy_value, _lucy_line, 5 / 56, 1.0)
+HEAVISIDE = Kernel(
+    value=lambda q2: jnp.where(q2 < 1, 1 / jnp.pi, 0).astype(q2.dtype),
+    line=lambda s, b2: _in_disc(s, b2) / jnp.pi,
+    second_moment=1 / 4,
+    reach=1.0,
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class CoarseGraining:
+    """A coarse-graining function G of some width; made by ``gaussian``, ``lucy`` and ``heaviside``.
+
+    ======  ======  ====  ======================================
+    field   shape   unit  meaning
+    ======  ======  ====  ======================================
+    width   ()      σ     length by which the kernel is stretched
+    kernel  static  –     the function at unit width
+    ======  ======  ====  ======================================
+    """
+
+    width: float | Array
+    kernel: Kernel = field(metadata={"static": True})
+
+    def value(self, separations: Float[Array, "n 2"]) -> Float[Array, " n"]:
+        """G at the separations of a point from the grains, in 1/σ²."""
+        per_width, (x, y) = 1 / self.width, separations.T
+        return self.kernel.value((x * x + y * y) * per_width**2) * per_width**2
+
+    def segment(
+        self, separations: Float[Array, "n 2"], normals: Float[Array, "n 2"], lengths: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """∫₀¹ G along branches of some directions and positive lengths, seen from their middles, in 1/σ²."""
+        per_width, (x, y), (nx, ny) = 1 / self.width, separations.T, normals.T
+        along, across, half = nx * x + ny * y, (nx * y - ny * x) * per_width, lengths / 2
+        start, end, line, b2 = (along - half) * per_width, (along + half) * per_width, self.kernel.line, across**2
+        return (line(end, b2) - line(start, b2)) * (per_width / lengths)
+
+    @property
+    def second_moment(self) -> float | Array:
+        """∫ G x² d²r = ∫ G y² d²r, in σ²."""
+        return self.kernel.second_moment * self.width**2
+
+    @property
+    def reach(self) -> float | Array:
+        """Distance beyond which G vanishes or, for the Gaussian, may be left out, in σ."""
+        return self.kernel.reach * self.width
+
+
+def gaussian(width: float | Array) -> CoarseGraining:
+    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w: smooth everywhere, not cut off within the cell."""
+    return _of_width(width, GAUSSIAN)
+
+
+def lucy(radius: float | Array) -> CoarseGraining:
+    """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c: compact, with two continuous derivatives."""
+    return _of_width(radius, LUCY)
+
+
+def heaviside(radius: float | Array) -> CoarseGraining:
+    """The average over a disc of radius c, 1/(πc²): fields jump where a grain enters, so no derivatives."""
+    return _of_width(radius, HEAVISIDE)
+
+
+def _of_width(width: float | Array, kernel: Kernel) -> CoarseGraining:
+    words = "positive and at most what fits into the cell"
+    require_number("the width of the coarse-graining", width, lambda x: (x > 0) & np.isfinite(x), words)
+    return CoarseGraining(width, kernel)

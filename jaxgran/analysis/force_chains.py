@@ -1,0 +1,313 @@
+"""Force chains: clusters of grains that push at once, their life times, their forces and the fabric of their contacts.
+
+A contact is *loaded* when it carries an impulse; a *cluster* is a set of grains that loaded contacts connect.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jaxgran.analysis.series import Curve, Measured, Sums, by_time, centres, histograms, ratio, series, with_errors
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.model.cell import minimum_image
+
+_DIRECTIONS = 12  # on the half circle, for the mean force at an angle
+
+
+class Loaded(NamedTuple):
+    """The loaded contacts of all times in one list.
+
+    ==========  =============  =====  ========================================
+    field       shape          unit   meaning
+    ==========  =============  =====  ========================================
+    time        (loaded,)      –      number of the snapshot
+    i, j        (loaded,)      –      grains in contact
+    force       (loaded,)      mσγ̇²   p/dt
+    normals     (loaded, 2)    –      from grain j to grain i
+    distances   (loaded,)      σ      distance of the centres
+    ==========  =============  =====  ========================================
+    """
+
+    time: Int[np.ndarray, " loaded"]
+    i: Int[np.ndarray, " loaded"]
+    j: Int[np.ndarray, " loaded"]
+    force: Float[np.ndarray, " loaded"]
+    normals: Float[np.ndarray, "loaded 2"]
+    distances: Float[np.ndarray, " loaded"]
+
+    def moments(self) -> Float[np.ndarray, "loaded 2 2"]:
+        """σ^a F^b of each contact, the contact stress being their sum over the area."""
+        return (self.force * self.distances)[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
+
+
+class PairForces(NamedTuple):
+    """The pairs of grains that push each other at some time of a series, and their mean forces over all its times.
+
+    =============  ========  =====  ===================================================================
+    field          shape     unit   meaning
+    =============  ========  =====  ===================================================================
+    i, j           (pairs,)  –      grains, i < j
+    force          (pairs,)  mσγ̇²   mean over the times of p/dt, zero at times without a load
+    cluster_share  (pairs,)  –      share of the force that acts within clusters of three or more grains
+    =============  ========  =====  ===================================================================
+    """
+
+    i: Int[np.ndarray, " pairs"]
+    j: Int[np.ndarray, " pairs"]
+    force: Float[np.ndarray, " pairs"]
+    cluster_share: Float[np.ndarray, " pairs"]
+
+
+class Clusters(NamedTuple):
+    """Clusters of each time; labels are unique in the series.
+
+    ======  ===============  ====  ==================================================================
+    field   shape            unit  meaning
+    ======  ===============  ====  ==================================================================
+    labels  (times, grains)  –     number of the cluster of each grain
+    sizes   (times, grains)  –     grains in the cluster of each grain, 1 for one without a load
+    ======  ===============  ====  ==================================================================
+    """
+
+    labels: Int[np.ndarray, "times grains"]
+    sizes: Int[np.ndarray, "times grains"]
+
+
+class ClusterShare(NamedTuple):
+    """Shares of clusters of three or more grains in the loaded contacts, and in their force, pressure and shear stress.
+
+    The pressure is Σ tr(σF)/2 and the shear stress −Σ σ^x F^y of the contacts. Clusters of two are binary collisions:
+    there F = F_bc exactly, so only these shares can make the force ratio exceed one.
+    """
+
+    contacts: Measured
+    force: Measured
+    pressure: Measured
+    shear_stress: Measured
+
+
+class Persistence(NamedTuple):
+    """Probability that grains joined at t are joined at t + τ, and the τ (strain) at which it falls to 1/e.
+
+    ``contact``: joined by a loaded contact; ``cluster``: in the same cluster. A life time shorter than the first lag is
+    interpolated towards C(0) = 1 and only tells that order of magnitude; one longer than the last lag is NaN.
+    """
+
+    contact: Curve
+    cluster: Curve
+    contact_lifetime: Measured
+    cluster_lifetime: Measured
+
+
+class Fabric(NamedTuple):
+    """Anisotropies of the loaded contacts; angles are those of the normals, in radians in (−π/2, π/2].
+
+    =================  ======  ====  ====================================================================
+    field              shape   unit  meaning
+    =================  ======  ====  ====================================================================
+    tensor             (2, 2)  –     fabric tensor ⟨n n⟩
+    anisotropy         ()      –     a_c of the density of directions (1 + a_c cos 2(θ − θ_c))/2π
+    direction          ()      rad   θ_c
+    force_anisotropy   ()      –     a_n of the mean force at an angle, f₀(1 + a_n cos 2(θ − θ_n))
+    force_direction    ()      rad   θ_n
+    stress_anisotropy  ()      –     (Σ₁ − Σ₂)/(Σ₁ + Σ₂), principal values of the contact stress
+    =================  ======  ====  ====================================================================
+    """
+
+    tensor: Measured
+    anisotropy: Measured
+    direction: Measured
+    force_anisotropy: Measured
+    force_direction: Measured
+    stress_anisotropy: Measured
+
+
+def loaded_contacts(seen: Snapshot) -> Loaded:
+    """The contacts of all times that carry an impulse."""
+    frames = series(seen)
+    time, slot = np.nonzero(frames.contacts.used & (frames.impulses > 0))
+    force = frames.impulses[time, slot] / frames.timestep[time]
+    picked = (x[time, slot] for x in (frames.contacts.normals, frames.contacts.distances))
+    return Loaded(time, frames.contacts.i[time, slot], frames.contacts.j[time, slot], force, *picked)
+
+
+def clusters(seen: Snapshot) -> Clusters:
+    """Clusters of grains that loaded contacts connect, at each time."""
+    times, grains = series(seen).state.positions.shape[:2]
+    load = loaded_contacts(seen)
+    edges = load.time * grains + load.i, load.time * grains + load.j
+    graph = coo_array((np.ones(load.time.size), edges), shape=(times * grains, times * grains))
+    labels = connected_components(graph, directed=False)[1]
+    sizes = np.bincount(labels)[labels]
+    return Clusters(labels.reshape(times, grains), sizes.reshape(times, grains))
+
+
+def pair_forces(seen: Snapshot) -> PairForces:
+    """Mean force between each two grains over a series: with one snapshot a time step, impulse over elapsed time."""
+    load, sizes = loaded_contacts(seen), clusters(seen).sizes
+    times, grains = sizes.shape
+    keys = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
+    pairs, pair = np.unique(keys, return_inverse=True)
+    in_cluster = sizes[load.time, load.i] > 2
+    total, clustered = (np.bincount(pair, load.force * w, minlength=pairs.size) for w in (1, in_cluster))
+    return PairForces(pairs // grains, pairs % grains, total / times, ratio(clustered, total))
+
+
+def cluster_sizes(seen: Snapshot, edges: ArrayLike | None = None) -> Curve:
+    """Share of the clusters of two or more grains that have a size, averaged over the whole numbers in each bin.
+
+    The edges of the bins are whole numbers, each bin containing its lower one; without them, every size is one.
+    """
+    sizes = clusters(seen).sizes
+    edges = np.arange(2, max(sizes.max(), 2) + 2) if edges is None else np.asarray(edges)
+    time = np.repeat(np.arange(len(sizes)), sizes.shape[1])
+    once = np.where(sizes > 1, 1 / sizes, 0)  # so that the grains of a cluster make one
+    sums = {"n": histograms(len(sizes), time, sizes.ravel(), edges, once.ravel()), "all": once.sum(axis=1)}
+    found = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
+    return Curve(centres(edges) - 0.5, *found)
+
+
+def cluster_share(seen: Snapshot) -> ClusterShare:
+    """What clusters of three or more grains carry of the contacts, forces and contact stress."""
+    load, sizes = loaded_contacts(seen), clusters(seen).sizes
+    moments = load.moments()
+    pressure, shear = (moments[:, 0, 0] + moments[:, 1, 1]) / 2, -moments[:, 0, 1]
+    carried = np.stack([np.ones_like(load.force), load.force, pressure, shear], axis=-1)
+    in_cluster = (sizes[load.time, load.i] > 2)[:, None]
+    sums = {
+        "all": by_time(len(sizes), load.time, carried),
+        "many": by_time(len(sizes), load.time, carried * in_cluster),
+    }
+    found = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
+    return ClusterShare(*(Measured(*both) for both in zip(*found, strict=True)))
+
+
+def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence:
+    """How long contacts and clusters last: the intermittent correlation function, in which a pair may part in between.
+
+    Args:
+      seen: a series at equal distances of strain, best one at every time step.
+      interval: strain between its snapshots.
+      lags: numbers of snapshots from 1 to less than the times, in rising order.
+
+    Source: D. C. Rapaport, Mol. Phys. 50, 1151 (1983), for bonds.
+    """
+    labels, load = clusters(seen).labels, loaded_contacts(seen)
+    times, grains = labels.shape
+    bond = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
+    bonds = coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
+
+    def joined(lag: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs joined both at t and at t + lag, for each t, by contact and by cluster."""
+        now, later = labels[: times - lag].astype(np.int64), labels[lag:].astype(np.int64)
+        _, first, common = np.unique(now * (labels.max() + 1) + later, return_index=True, return_counts=True)
+        pairs = np.bincount(first // grains, common * (common - 1) / 2, minlength=times)
+        return np.pad(np.asarray(bonds[: times - lag].multiply(bonds[lag:]).sum(axis=1)).ravel(), (0, lag)), pairs
+
+    at = np.append(0, lags)
+    both = np.stack([np.stack(joined(lag), axis=-1) for lag in at.tolist()], axis=1)  # (times, lags, 2)
+    before = (np.arange(times)[:, None] < times - at)[:, :, None]  # the t that have a t + lag
+    sums = {"both": both, "once": both[:, :1] * before}
+
+    def estimate(s: Sums) -> Sums:
+        curves = ratio(s["both"], s["once"])
+        return {"curves": curves, **{name: _fold(at, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}}
+
+    found = with_errors(estimate, sums)
+    contact, cluster = (Curve(at * interval, *(x[:, k] for x in found["curves"])) for k in (0, 1))
+    lifetimes = (Measured(*(np.asarray(x * interval) for x in found[name])) for name in ("contact", "cluster"))
+    return Persistence(contact, cluster, *lifetimes)
+
+
+def force_distribution(seen: Snapshot, edges: ArrayLike) -> Curve:
+    """Probability density P of F/⟨F⟩ over the loaded contacts, in bins with the given edges; its integral is one."""
+    load, edges = loaded_contacts(seen), np.asarray(edges)
+    times = len(series(seen).impulses)
+    counts = histograms(times, load.time, load.force * load.force.size / load.force.sum(), edges)
+    sums = {"n": counts, "all": np.bincount(load.time, minlength=times)}
+    found = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
+    return Curve(centres(edges), *found)
+
+
+def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
+    """Correlation g_F(r) = ⟨F F'⟩(r)/⟨F⟩² − 1 of loaded contacts of one time whose contact points are r apart.
+
+    ⟨F⟩ is the mean over the series, so what all forces of a snapshot have in common stays as a constant at large r.
+    The edges of the bins, in σ, are below half the side.
+    """
+    frames, load, edges = series(seen), loaded_contacts(seen), np.asarray(edges)
+    radii, times = frames.state.grains.radii, len(frames.impulses)
+    reach = radii[load.time, load.i] + radii[load.time, load.j]
+    share = radii[load.time, load.j] / reach * load.distances
+    points = frames.state.positions[load.time, load.j] + share[:, None] * load.normals
+    both, pairs = np.zeros((2, times, len(edges) - 1))
+    for t in range(times):
+        here, force = points[load.time == t], load.force[load.time == t]
+        a, b = np.triu_indices(len(here), 1)
+        r = np.linalg.norm(minimum_image(here[a] - here[b], frames.state.side[t], frames.state.tilt[t]), axis=-1)
+        pairs[t], both[t] = np.histogram(r, edges)[0], np.histogram(r, edges, weights=force[a] * force[b])[0]
+    alone = np.stack([np.ones_like(load.force), load.force], axis=-1)
+    sums = {"both": both, "pairs": pairs, "alone": by_time(times, load.time, alone)}
+
+    def estimate(s: Sums) -> Sums:
+        mean = ratio(s["alone"][..., 1:], s["alone"][..., :1])
+        return {"g": ratio(ratio(s["both"], s["pairs"]), mean**2) - 1}
+
+    return Curve(centres(edges), *with_errors(estimate, sums)["g"])
+
+
+def fabric(seen: Snapshot) -> Fabric:
+    """Fabric tensor and the anisotropies of contacts and forces.
+
+    For discs of about one size the stress follows from them: (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, with the product kept
+    (a_c + a_n)/(2 + a_c a_n), where all principal directions agree. The mean force at an angle is taken in
+    bins of 15°; the anisotropies of force are NaN if one of them is empty.
+
+    Source: L. Rothenburg and R. J. Bathurst, Géotechnique 39, 601 (1989).
+    """
+    load, times = loaded_contacts(seen), len(series(seen).impulses)
+    angle = np.arctan2(load.normals[:, 1], load.normals[:, 0]) % np.pi
+    edges = np.linspace(0, np.pi, _DIRECTIONS + 1)
+    angle = np.minimum(angle, np.nextafter(np.pi, 0))  # a tiny negative angle rounds to π
+    sums = {
+        "nn": by_time(times, load.time, load.normals[:, :, None] * load.normals[:, None, :]),
+        "stress": by_time(times, load.time, load.moments()),
+        "contacts": histograms(times, load.time, angle, edges),
+        "force": histograms(times, load.time, angle, edges, load.force),
+    }
+    wide = np.pi / _DIRECTIONS
+    wave = np.stack([np.cos(2 * centres(edges)), np.sin(2 * centres(edges))]) * wide / np.sin(wide)  # undoes the bins
+
+    def estimate(s: Sums) -> Sums:
+        normals, stress = (ratio(x, np.trace(x, axis1=-2, axis2=-1)[..., None, None]) for x in (s["nn"], s["stress"]))
+        force = ratio(s["force"], s["contacts"])
+        (contact, direction), (deviator, _) = (_mode(x[..., 0, 0] - 0.5, x[..., 0, 1]) for x in (normals, stress))
+        second, force_direction = _mode(*((force * w).sum(axis=-1) for w in wave))
+        return {
+            "tensor": normals,
+            "anisotropy": 4 * contact,
+            "direction": direction,
+            "force_anisotropy": ratio(2 * second, force.sum(axis=-1)),
+            "force_direction": force_direction,
+            "stress_anisotropy": 2 * deviator,
+        }
+
+    return Fabric(**with_errors(estimate, sums))
+
+
+def _mode(x: Any, y: Any) -> tuple[Any, Any]:
+    """Amplitude of a second Fourier mode and its angle."""
+    return np.hypot(x, y), np.arctan2(y, x) / 2
+
+
+def _fold(at: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Where a curve (..., points), one at its first point, first falls to 1/e; NaN if it does not."""
+    below = curve < 1 / np.e
+    k = np.maximum(np.argmax(below, axis=-1), 1)
+    low, high = (np.take_along_axis(curve, n[..., None], axis=-1)[..., 0] for n in (k, k - 1))
+    share = ratio(high - 1 / np.e, high - low)
+    return np.where(below.any(axis=-1), at[k - 1] + share * (at[k] - at[k - 1]), np.nan)

@@ -1,0 +1,155 @@
+"""How fast the derivatives of a flow grow with strain, and how near a run comes to points that have none.
+
+Colliding discs are chaotic: a change of the restitution changes the state exponentially in the strain. A derivative of
+the state is therefore exact and of no use beyond a horizon at which it exceeds the size of the state itself.
+
+Within the fixed time steps of a run the state is a smooth function of its parameters, except where it jumps: a contact
+of the solve neither presses nor parts, or a pair becomes a contact at the very end of a step. There left and right
+derivatives differ, and the one returned is that of the contacts found.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxgran.contact.delassus import delassus_product, diagonal
+from jaxgran.contact.network import first_contact_time
+from jaxgran.dynamics.plain import State, advance, require_state
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.model.cell import displacement, relative_velocity
+from jaxgran.model.flow import ShearFlow, require_strain, require_whole
+
+_MOST_POINTS = 10**6
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Growth:
+    """Growth of ∂(state)/∂α along a flow.
+
+    ==========  =========  ====  ==================================================================
+    field       shape      unit  meaning
+    ==========  =========  ====  ==================================================================
+    strain      (points,)  –     strain since the beginning, where the derivative is zero
+    derivative  (points,)  –     root mean square over the grains of |∂(position)/∂α| in σ and
+                                 |∂(velocity)/∂α| in σγ̇, together
+    status      (points,)  –     worst status since the beginning
+    ==========  =========  ====  ==================================================================
+    """
+
+    strain: Float[Array, "*b points"]
+    derivative: Float[Array, "*b points"]
+    status: Int[Array, "*b points"]
+
+
+def growth(flow: ShearFlow, state: State, strain: float | Array, count: int, moving_contacts: bool = True) -> Growth:
+    """The derivative of a flow with respect to its restitution at equal distances of strain.
+
+    Args:
+      flow: parameters, with a small ``tolerance`` (1e-8 or less).
+      state: the flow at the beginning.
+      strain: strain in all.
+      count: number of points, static.
+      moving_contacts: whether contacts move in time, see ``dynamics``.
+
+    Raises:
+      ValueError: the strain is shorter than a time step for each point.
+    """
+    require_state(flow, state)
+    require_whole("count", count, 1, _MOST_POINTS, "as memory is limited")
+    require_strain(flow, strain, count)
+    return _growth(flow, state, strain, count, moving_contacts)
+
+
+@partial(jax.jit, static_argnames=("count", "moving_contacts"))
+def _growth(flow: ShearFlow, state: State, strain: Array, count: int, moving_contacts: bool) -> Growth:
+    steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
+    edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
+
+    def part(at, steps: Array):
+        (now, change), status = at
+
+        def run(alpha, positions, velocities, tilt):
+            start = State(now.grains, positions, velocities, now.side, tilt)
+            end, tally = advance(replace(flow, restitution=alpha), start, steps, moving_contacts=moving_contacts)
+            return (end.positions, end.velocities, end.tilt), tally.status
+
+        alpha = jnp.asarray(flow.restitution, now.side.dtype)
+        start = (alpha, now.positions, now.velocities, now.tilt)
+        (x, c, tilt), (dx, dc, dtilt), worst = jax.jvp(run, start, (jnp.ones_like(alpha), *change), has_aux=True)
+        status = jnp.maximum(status, worst)
+        size = jnp.sqrt(jnp.mean(jnp.sum(dx**2 + (dc / flow.shear_rate) ** 2, axis=-1)))
+        return ((State(now.grains, x, c, now.side, tilt), (dx, dc, dtilt)), status), (size, status)
+
+    none = (jnp.zeros_like(state.positions), jnp.zeros_like(state.velocities), jnp.zeros_like(state.tilt))
+    _, (sizes, status) = lax.scan(part, ((state, none), jnp.int32(0)), jnp.diff(edges).astype(jnp.int32))
+    return Growth(edges[1:] * flow.shear_rate * flow.timestep, sizes, status)
+
+
+def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float, float]:
+    """Rate λ of |∂(state)/∂α| ∝ exp(λ γ), per unit strain, with its standard error.
+
+    The rate of each run is the least-squares slope over the later three quarters of its strain, as the derivative is
+    zero at the beginning; the error is that of the mean over runs.
+
+    Args:
+      strain: (points,).
+      derivative: (runs, points), of two or more runs.
+    """
+    later = strain >= strain[-1] / 4
+    slopes = np.polyfit(strain[later], np.log(derivative[:, later]).T, 1)[0]
+    return float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
+
+
+class Margins(NamedTuple):
+    """How far each step of a run is from a change of its contacts, zero at a point without a derivative.
+
+    ==========  ========  ==============================================================================
+    field       shape     meaning
+    ==========  ========  ==============================================================================
+    pressing    (times,)  least over the contacts of the larger of W_kk p_k and the velocity at which the
+                          contact parts, over the root mean square velocity of approach; infinite without
+                          contacts
+    activation  (times,)  least over the pairs of the distance, in time steps, between the time at which
+                          the pair touches and the end of the look-ahead that makes it a contact
+    ==========  ========  ==============================================================================
+    """
+
+    pressing: Float[Array, " times"]
+    activation: Float[Array, " times"]
+
+
+@partial(jax.jit, static_argnums=0)
+def margins(activation_fraction: float, series: Snapshot) -> Margins:
+    """Margins of the steps of a run, from a snapshot of every step (``snapshot_series`` with a count of its steps).
+
+    All pairs of grains are compared, so memory and time grow as N².
+
+    Args:
+      activation_fraction: that of the flow, static.
+      series: snapshots with a leading (times,) axis.
+    """
+
+    def one(seen: Snapshot) -> tuple[Array, Array]:
+        state, contacts = seen.state, seen.contacts
+        count = state.grains.radii.size
+        impulses = seen.impulses / (1 + seen.restitution)
+        pushed = diagonal(contacts, count) * impulses
+        parting = delassus_product(contacts, impulses, count) + contacts.approach
+        used = jnp.sum(contacts.used.astype(pushed.dtype))
+        scale = jnp.sqrt(jnp.sum(contacts.approach**2) / jnp.maximum(1, used))
+        strict = jnp.where(contacts.used, jnp.maximum(pushed, parting), jnp.inf)
+        i, j = jnp.triu_indices(count, 1)
+        separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)
+        velocities = relative_velocity(state.velocities, i, j, separations, seen.shear_rate)
+        time, _ = first_contact_time(separations, velocities, state.grains.radii[i] + state.grains.radii[j])
+        late = jnp.abs(time / seen.timestep - activation_fraction)
+        return jnp.min(strict) / jnp.where(scale > 0, scale, 1), jnp.min(late)
+
+    return Margins(*lax.map(one, series))

@@ -1,0 +1,92 @@
+"""Averages over a series of snapshots on the host, with standard errors.
+
+Every average over times comes with its standard error, by the jackknife over blocks of successive times, as the times
+are correlated (``statistics``).
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.model.cell import minimum_image
+from jaxgran.statistics import jackknife
+
+Sums = Mapping[str, Any]  # arrays, or scalars of NumPy, by name
+
+BLOCKS = 32  # of successive times, for the standard errors
+
+
+class Measured(NamedTuple):
+    """An average over the times of a series and its standard error, arrays of one shape; NaN where nothing was seen."""
+
+    value: np.ndarray
+    error: np.ndarray
+
+
+class Curve(NamedTuple):
+    """A measured function, three arrays of shape (points,): where, its value, and the standard error of the value."""
+
+    at: np.ndarray
+    value: np.ndarray
+    error: np.ndarray
+
+
+def series(seen: Snapshot) -> Any:
+    """The Snapshot in NumPy arrays (it declares those of JAX), with a (times,) axis also where one time was given."""
+    seen = jax.tree.map(np.asarray, seen)
+    return seen if seen.state.side.ndim else jax.tree.map(lambda x: x[None], seen)
+
+
+def with_errors(estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]) -> dict[str, Measured]:
+    """Estimates from sums of shape (times, ...) and their standard errors by the jackknife over blocks of times.
+
+    ``estimate`` maps sums with any leading axes in place of the times to named estimates with the same axes. The times
+    are joined in at most ``BLOCKS`` blocks, and these in larger ones, so that correlation between times counts.
+    """
+    times = len(next(iter(sums.values())))
+    blocks = min(times, BLOCKS)
+    first = np.arange(blocks) * times // blocks
+    value, error = jackknife(
+        estimate, {name: np.add.reduceat(np.asarray(x, float), first, axis=0)[None] for name, x in sums.items()}
+    )
+    return {name: Measured(x, np.asarray(error[name])) for name, x in value.items()}
+
+
+def ratio(over: Any, under: Any) -> np.ndarray:
+    """A quotient that is NaN, without a warning, where nothing was counted."""
+    over, under = np.broadcast_arrays(over, under)
+    return np.divide(over, under, out=np.full(over.shape, np.nan), where=under != 0)
+
+
+def all_pairs(frames: Any) -> Iterator[tuple[np.ndarray, np.ndarray, Float[np.ndarray, "pairs 2"]]]:
+    """For each time of a series: grains i < j of every pair, and the minimum-image separation from j to i."""
+    i, j = np.triu_indices(frames.state.positions.shape[1], 1)
+    for positions, side, tilt in zip(frames.state.positions, frames.state.side, frames.state.tilt, strict=True):
+        yield i, j, minimum_image(positions[i] - positions[j], side, tilt)
+
+
+def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sums of the values of each time, (times, ...)."""
+    sums = np.zeros((times, *values.shape[1:]))
+    np.add.at(sums, time, values)
+    return sums
+
+
+def histograms(
+    times: int, time: np.ndarray, x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None
+) -> Float[np.ndarray, "times bins"]:
+    """A histogram of each time; bins contain their lower edge."""
+    bins = len(edges) - 1
+    place = np.searchsorted(edges, x, side="right") - 1
+    inside = (place >= 0) & (place < bins)
+    weights = np.ones(inside.sum()) if weights is None else weights[inside]
+    counts = np.bincount(time[inside] * bins + place[inside], weights, minlength=times * bins)
+    return counts.reshape(times, bins)
+
+
+def centres(edges: np.ndarray) -> np.ndarray:
+    return (edges[:-1] + edges[1:]) / 2

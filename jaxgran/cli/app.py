@@ -1,0 +1,84 @@
+"""Command line: ``jaxgran map``, ``plot``, ``run``, ``fit`` and ``info``; each has a module of its own.
+
+Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finished, but a point carries a bad status;
+130 interrupted.
+"""
+
+import os
+import sys
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+# XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+from jaxgran.cli.arguments import examples
+from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
+from jaxgran.cli.info import INFO_EXAMPLES, info_command
+from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
+from jaxgran.cli.mistakes import UsageError, by_option, in_words
+from jaxgran.cli.run import RUN_EXAMPLES, run_command
+from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, stop
+from jaxgran.model.flow import InputError
+
+EXAMPLES = {
+    "Where binary collisions are all there is, and where they are not": "jaxgran map",
+    "One flow, with a movie of it": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
+    "The options of a command": "jaxgran run --help",
+}
+COMMANDS = {
+    "map": (map_command, "Map the force ratio over a plane of flows.", MAP_EXAMPLES),
+    "plot": (plot_command, "Draw the figures of a map again.", PLOT_EXAMPLES),
+    "run": (run_command, "Run one flow, average it, film it.", RUN_EXAMPLES),
+    "fit": (fit_command, "Infer a restitution, or the law of a map.", FIT_EXAMPLES),
+    "info": (info_command, "Print what a report of a bug needs.", INFO_EXAMPLES),
+}
+
+app = typer.Typer(
+    epilog=examples(EXAMPLES),
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for name, (command, in_short, shown_commands) in COMMANDS.items():
+    app.command(name, short_help=in_short, epilog=examples(shown_commands))(command)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"jaxgran {version('jaxgran')}")
+        raise typer.Exit
+
+
+@app.callback()
+def jaxgran(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Flows of rigid, frictionless discs in simple shear by contact dynamics."""
+
+
+def main() -> None:
+    """Entry point: mistakes in the input end with one sentence and exit status 2."""
+    try:
+        status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
+    except InputError as mistake:
+        stop(by_option(str(mistake), _options()))
+    except UsageError as mistake:
+        stop(in_words(mistake, sys.argv[1:]))
+    except typer.Abort:
+        status = INTERRUPTED
+    except OSError as error:
+        stop(f"stopped by the file system, {error.strerror or error}.", NO_FILE)
+    if status == INTERRUPTED:  # what typer makes of Ctrl-C
+        stop("interrupted.", INTERRUPTED)
+    raise SystemExit(status)
+
+
+def _options() -> frozenset[str]:
+    """The options of all commands."""
+    commands = getattr(typer.main.get_command(app), "commands", {}).values()
+    return frozenset(option for command in commands for one in command.params for option in one.opts)

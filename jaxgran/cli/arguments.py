@@ -1,0 +1,65 @@
+"""Options of the commands: lists of numbers, the word auto, choices that exclude each other; examples of a help."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import typer
+
+from jaxgran.model.flow import MAX_REPLICAS, InputError, shown
+
+FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
+
+RelativeError = Annotated[
+    float | None,
+    typer.Option(
+        "--error",
+        help="Relative standard error of force ratio and stresses to reach, in place of --strain.",
+    ),
+]
+
+
+def number_list(text: str, name: str) -> tuple[float, ...]:
+    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included."""
+    try:
+        if ":" in text:
+            start, stop, count = text.split(":")
+            steps = int(count) - 1
+            if not 1 <= steps < MAX_REPLICAS:
+                raise ValueError(count)
+            return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
+        return tuple(float(x) for x in text.split(","))
+    except ValueError:
+        raise InputError(
+            f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to "
+            f"{MAX_REPLICAS}, not {shown(text)}."
+        ) from None
+
+
+def numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | str | None:
+    """One number, several, or the word auto, of an option that may be absent."""
+    if text is None or text == "auto":
+        return text
+    numbers = number_list(text, name)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
+def batch_size(text: str) -> int | Literal["auto"]:
+    """The number of replicas that run together, or the word auto."""
+    if text == "auto":
+        return "auto"
+    if not text.isdecimal() or len(text) > 9 or int(text) < 1:
+        raise InputError(f"batch must be auto or a whole number of at least 1, below a billion, not {shown(text)}.")
+    return int(text)
+
+
+def first_strain(strain: float | None, error: float | None) -> float | None:
+    """The strain to begin with: the one given, or a short one where an error is given in its place."""
+    if strain is not None and error is not None:
+        raise InputError("--strain and --error exclude each other: give one of them.")
+    return strain if error is None else FIRST_STRAIN
+
+
+def examples(commands: Mapping[str, str]) -> str:
+    """The end of a help text: commands by what they do."""
+    lines = [line for words, command in commands.items() for line in (f"  {words}:", f"    {command}")]
+    return "\b\n" + "\n".join(["Examples:", *lines])

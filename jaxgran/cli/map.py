@@ -1,0 +1,157 @@
+"""The commands ``map`` and ``plot``: a plane of restitutions and packing fractions, and its figures."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich import box
+from rich.table import Table
+
+from jaxgran.cli.arguments import RelativeError, batch_size, first_strain, number_list, numbers_or_auto
+from jaxgran.cli.measure import by_timestep, finish, measured
+from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
+from jaxgran.model.flow import Activation, InputError, Solver, shown
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {
+        "restitution": "0.2,0.35,0.5,0.65,0.8",
+        "packing_fraction": "0.5,0.6,0.65,0.7,0.75,0.79",
+        "grains": 256,
+        "seeds": 2,
+        "timestep": 1e-3,
+        "strain": 8.0,
+    },
+    "paper": {
+        "restitution": "0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9,0.98",
+        "packing_fraction": "0.1,0.2,0.3,0.4,0.5,0.56,0.6,0.65,0.7,0.75,0.8,0.82",
+        "grains": 400,
+        "seeds": 4,
+        "timestep": 1e-5,
+        "strain": 4.0,
+    },
+}
+
+MAP_EXAMPLES = {
+    "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
+    "A plane of your own, at a time step that suits it": "jaxgran map --restitution 0.1,0.5,0.9 "
+    "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
+    "Until every point is good to 2 %, and on after an interruption": "jaxgran map --error 0.02 --resume",
+}
+PLOT_EXAMPLES = {
+    "The figures of a map again, beside it": "jaxgran plot jaxgran_map.nc",
+    "In another folder": "jaxgran plot ratio.nc --output figures",
+}
+
+
+def map_command(
+    preset: Annotated[Literal["quick", "paper"], typer.Option(help="Starting point for all other options.")] = "quick",
+    restitution: Annotated[
+        str | None, typer.Option(help="List of restitutions: 0.1,0.5,0.9 or start:stop:count.")
+    ] = None,
+    packing_fraction: Annotated[str | None, typer.Option(help="List of packing fractions, up to 0.83.")] = None,
+    grains: Annotated[int | None, typer.Option(help="Grains of a replica.")] = None,
+    seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
+    timestep: Annotated[
+        str | None,
+        typer.Option(help="Time step of the sample, in 1/shear rate, auto, or a list that adds a dimension."),
+    ] = None,
+    equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
+    strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
+    error: RelativeError = None,
+    tolerance: Annotated[
+        str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
+    ] = None,
+    target_error: Annotated[
+        float, typer.Option(help="Relative error of the stresses that auto aims at, 1e-4 to 0.1.")
+    ] = 0.02,
+    solver: Annotated[
+        Solver | None, typer.Option(help="Iteration of the contact solve. [default: barzilai-borwein]")
+    ] = None,
+    activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
+    batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a running Dask cluster, such as tcp://127.0.0.1:8786.")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
+    like: Annotated[
+        Path | None, typer.Option(help="Dataset whose map is repeated; other options override its choices.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
+) -> None:
+    """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
+    if scheduler is not None and workers is not None:
+        raise InputError("--scheduler and --workers exclude each other: give one of them.")
+    given = {
+        "restitution": restitution,
+        "packing_fraction": packing_fraction,
+        "grains": grains,
+        "seeds": seeds,
+        "timestep": numbers_or_auto(timestep, "timestep"),
+        "equilibrate": equilibrate,
+        "strain": first_strain(strain, error),
+        "error": error,
+        "tolerance": numbers_or_auto(tolerance, "tolerance"),
+        "solver": solver,
+        "activation": activation,
+    }
+    chosen = (PRESETS[preset] if like is None else _like(like)) | {
+        name: value for name, value in given.items() if value is not None
+    }
+    for name in ("restitution", "packing_fraction"):
+        if isinstance(chosen[name], str):
+            chosen[name] = number_list(chosen[name], name)
+    data, interrupted = measured(chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler)
+
+    from jaxgran.plotting.ratio import save_figures
+
+    pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
+    for one in by_timestep(data):
+        print_table(_ratio_table(one))
+    finish(data, [output, *pictures], interrupted, can_resume=True)
+
+
+def plot_command(
+    file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
+    output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
+) -> None:
+    """Draw the figures of a map that has been run."""
+    from jaxgran.maps.dataset import read_dataset
+    from jaxgran.plotting.ratio import save_figures
+
+    data = read_dataset(file)
+    folder = file.parent if output is None else output
+    if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
+        raise InputError(f"output must be a folder that exists and can be written to, not {shown(str(folder))}.")
+    say_written(save_figures(data, folder / file.stem))
+
+
+def _like(file: Path) -> dict[str, Any]:
+    """The choices of the map in a file; what else could change its numbers is said on standard error."""
+    configured_jax()
+    from jaxgran.maps.dataset import choices_of, differences, read_dataset
+    from jaxgran.maps.settings import MapSettings
+
+    data = read_dataset(file)
+    chosen = choices_of(data)
+    others = differences(data, MapSettings(**chosen))
+    if others:
+        say(f"not as in {file}: {'; '.join(others)}.")
+    return chosen
+
+
+def _ratio_table(data) -> Table:
+    timestep, rule = data.attrs["timestep"], data.attrs["activation"]
+    title = f"Force ratio at dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left")
+    table.add_column("packing fraction")
+    for alpha in data.restitution.values:
+        table.add_column(f"{alpha:g}", justify="right", no_wrap=True)
+    for nu in data.packing_fraction.values:
+        row = data.sel(packing_fraction=nu)
+        marks = ["" if status == 0 else " *" for status in row.status.values]
+        cells = zip(row.force_ratio.values, row.force_ratio_stderr.values, marks, strict=True)
+        table.add_row(f"{nu:g}", *(with_error(value, error) + mark for value, error, mark in cells))
+    return table

@@ -1,0 +1,169 @@
+"""A map or a run from its choices to its file: progress, checkpoint, and what is said in the end."""
+
+import os
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxgran.cli.progress import progress
+from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, say, say_written, stop
+
+_MEANINGS = {
+    "iteration_limit": "some contact solve ended above the tolerance",
+    "not_steady": "temperature and pressure still drifted when the sample began, take more grains",
+    "deep_overlap": "some grains overlapped by more than 1e-2 diameters, take a shorter time step",
+    "infeasible": "no impulses satisfy the contact law, the packing is jammed",
+    "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
+    "nonfinite": "a position, velocity or impulse is not a finite number",
+    "not_run": "the point was given up",
+}
+
+
+def measured(
+    chosen: dict[str, Any],
+    batch: int | Literal["auto"],
+    workers: int | None,
+    output: Path | None,
+    quiet: bool,
+    target_error: float = 0.02,
+    resume: bool | None = None,
+    scheduler: str | None = None,
+    record: Callable | None = None,
+):
+    """Run a map with progress, write its dataset, and return it and whether it was interrupted.
+
+    Where ``resume`` is not None a checkpoint is kept beside the output, and continued if ``resume`` is True. What
+    ``record`` is, ``replicas`` says.
+    """
+    jax = configured_jax()
+    from jaxgran.maps.checkpoint import Checkpoint
+    from jaxgran.maps.dataset import check_output, map_dataset, write_dataset
+    from jaxgran.maps.settings import MapSettings, automatic
+    from jaxgran.maps.sweep import check_batches, predicted_cost, replicas, usable_cores
+
+    if output is not None:
+        check_output(output)
+    numbers, automatic_choice = automatic(chosen, target_error)
+    settings = MapSettings(**numbers)
+    if automatic_choice:
+        say(f"chosen: {automatic_choice}")
+    on_cpu = jax.default_backend() == "cpu"
+    check_batches(batch, 1 if workers is None else workers)
+    count = len(settings.flows()) * settings.seeds
+    workers = min(count, workers or (usable_cores() if on_cpu else 1))
+    costs = [predicted_cost(flow) for flow in settings.flows()]
+    checkpoint = None if output is None or resume is None else Checkpoint(output, settings, resume)
+    results = {} if checkpoint is None else dict(checkpoint.done)
+    run: dict[str, Any] = {
+        "automatic_choice": automatic_choice,
+        "command": os.fsencode(shlex.join(["jaxgran", *sys.argv[1:]])).decode(errors="backslashreplace"),
+        "workers": workers,
+        "resumed_replicas": len(results),
+    }
+    if resume:
+        _say_resumed(checkpoint, count)
+
+    start, interrupted, finished = time.perf_counter(), False, False
+    try:
+        with progress(costs, settings.seeds, quiet) as meter:
+            meter.resumed(point for point, _ in results)
+            running = replicas(settings, batch, workers, meter.steps, checkpoint, say, scheduler, record)
+            try:
+                for key, replica in running:
+                    results[key] = replica
+                    meter.replica(key[0])
+            except KeyboardInterrupt:
+                interrupted = True
+            finally:
+                running.close()
+        seconds = time.perf_counter() - start
+        speed = {"wall_time_seconds": seconds, "replica_steps_per_second": meter.done_steps / seconds}
+        data = map_dataset(settings, results, run | speed)
+        if output is not None and results:
+            write_dataset(data, output)
+        finished = len(results) == count
+    except OSError as error:
+        kept = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
+        stop(f"stopped by the file system, {error.strerror or error}{kept}.", NO_FILE)
+    finally:
+        if checkpoint is not None:
+            checkpoint.close(finished)
+    return data, interrupted
+
+
+def _say_resumed(checkpoint, count: int) -> None:
+    journals = len(checkpoint.journals())
+    say(f"continued: {len(checkpoint.done)} of {count} replicas are done, {journals} batches are under way.")
+    if checkpoint.damaged:
+        say(f"damaged and computed anew: {', '.join(checkpoint.damaged)}.")
+
+
+def by_timestep(data) -> list:
+    """The part of a map for each of its time steps, which is the attribute ``timestep`` of the part."""
+    if "timestep" not in data.dims:
+        return [data]
+    return [data.sel(timestep=dt).assign_attrs(timestep=dt) for dt in data.timestep.values.tolist()]
+
+
+def _bad_points(data) -> dict[str, list[str]]:
+    """Points by the name of their bad status."""
+    names = dict(
+        zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
+    )
+    bad: dict[str, list[str]] = {}
+    parts = by_timestep(data)
+    for part in parts:
+        which = f", time step {part.attrs['timestep']:g}" if len(parts) > 1 else ""
+        for nu in part.packing_fraction.values:
+            for alpha in part.restitution.values:
+                name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
+                if name != "ok":
+                    bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g}{which})")
+    return bad
+
+
+def _say_imprecise(data) -> None:
+    """Say where the error that was asked for has not been reached."""
+    from jaxgran.sampling.sample import ERROR_OBSERVABLES
+
+    if "error" not in data.attrs:
+        return
+    worst = max(float((data[f"{name}_stderr"] / abs(data[name])).max()) for name in ERROR_OBSERVABLES)
+    strain = data.strain_by_seed
+    say(
+        f"relative standard errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
+        f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
+    )
+
+
+def _say_retried(data) -> None:
+    """Say how many replicas have shorter time steps than asked for, because they had come to nothing."""
+    asked = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
+    retried = int((data.timestep_by_seed < 0.75 * asked).sum())
+    if retried:
+        say(f"retried with half the time step: {retried} replicas, see timestep_by_seed.")
+
+
+def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
+    """Say what was written and what went wrong, and exit with the status that tells it."""
+    started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
+    written = [path for path in written if started and path.exists()]
+    say_written(written)
+    _say_imprecise(data)
+    _say_retried(data)
+    bad = _bad_points(data)
+    if interrupted:
+        missing = len(bad.get("not_run", []))
+        saved = "; what is done is saved" if written else ""
+        resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
+        stop(
+            f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}", INTERRUPTED
+        )
+    if bad:
+        which = "the flow has" if data.status.size == 1 else "points marked * have"
+        words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
+        meanings = "; ".join(f"{name.replace('_', ' ')}: {_MEANINGS[name]}" for name in bad if name in _MEANINGS)
+        stop(f"finished, but {which} a bad status. {words}. What that means: {meanings}.", BAD_STATUS)

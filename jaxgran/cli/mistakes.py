@@ -1,0 +1,82 @@
+"""Mistakes on the command line as one sentence in the words of a user: the option, what was given, what is accepted."""
+
+import re
+from typing import Any
+
+import typer
+
+from jaxgran.model.flow import shown
+
+UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
+_LONGEST = 500  # letters of a sentence, of which a mistake may quote more
+_NUMBERS = {"integer": "a whole number", "number": "a number"}
+_MEANT = {
+    "--alpha": "--restitution",
+    "-a": "--restitution",
+    "--nu": "--packing-fraction",
+    "--phi": "--packing-fraction",
+    "--density": "--packing-fraction",
+    "--dt": "--timestep",
+    "--time-step": "--timestep",
+    "-n": "--grains",
+    "-N": "--grains",
+    "--seed": "--seeds",
+    "--jobs": "--workers",
+    "-j": "--workers",
+    "--gif": "--movie",
+    "--out": "--output",
+    "-o": "--output",
+}
+
+
+def by_option(sentence: str, options: frozenset[str]) -> str:
+    """A sentence that begins with a parameter, with the option that sets it in place of its name."""
+    name, _, rest = sentence.partition(" ")
+    option = "--" + name.replace("_", "-")
+    return f"{option} {rest}" if option in options and re.match("must |goes ", rest) else sentence
+
+
+def in_words(mistake: Any, arguments: list[str]) -> str:
+    """What typer says of arguments that it cannot read, as one sentence, and where to look for those there are."""
+    context = getattr(mistake, "ctx", None)
+    words = " ".join(_words(mistake, arguments).split()).rstrip(".?")
+    words = words if len(words) <= _LONGEST else f"{words[: _LONGEST // 2]} … {words[5 - _LONGEST // 2 :]}"
+    return f"{words}: see {'jaxgran' if context is None else context.command_path} --help."
+
+
+def _words(mistake: Any, arguments: list[str]) -> str:
+    words = mistake.format_message()
+    parameter, option = getattr(mistake, "param", None), getattr(mistake, "option_name", None)
+    if words.startswith("No such option") and option is not None:
+        known = [one for one in (mistake.possibilities or []) if one != "--help"]
+        accepted = {name for one in mistake.ctx.command.params for name in one.opts}
+        meant = _MEANT[option] if _MEANT.get(option) in accepted else next(iter(known), None)
+        return f"there is no option {option}" + (f", perhaps {meant} is meant" if meant else "")
+    if words.startswith("Missing") and parameter is not None:
+        return f"{parameter.opts[0] if parameter.opts[0].startswith('-') else parameter.name.upper()} must be given"
+    found = re.match("No such command '(.*?)'(?:. Did you mean '(.*)')?", words, re.DOTALL)
+    if found:
+        command, meant = found.groups()
+        return f"there is no command {shown(command)}" + (f", perhaps {meant} is meant" if meant else "")
+    found = re.match(r"Got unexpected extra argument\(?s?\)? \((.*)\)", words, re.DOTALL)
+    if found:
+        return f"{shown(found[1])} stands alone, and values follow their options; a list has commas and no spaces"
+    found = re.search("should be a valid (integer|number)", words)
+    if found and parameter is not None:
+        given = _given(arguments, parameter.opts[0])
+        return f"{parameter.opts[0]} must be {_NUMBERS[found[1]]}" + ("" if given is None else f", not {shown(given)}")
+    found = re.match(r"Invalid value for '(\S+)': (?:Value error, )?(.*) is not one of (.*)", words, re.DOTALL)
+    if found:
+        return f"{found[1]} must be one of {found[3].rstrip('.')}, not {found[2]}"
+    return words.replace("Value error, ", "")
+
+
+def _given(arguments: list[str], option: str) -> str | None:
+    """What was given for an option, the last time."""
+    following = {k: word for k, word in enumerate(arguments[1:])}
+    given = [
+        word.removeprefix(f"{option}=") if word.startswith(f"{option}=") else following.get(k)
+        for k, word in enumerate(arguments)
+        if word == option or word.startswith(f"{option}=")
+    ]
+    return given[-1] if given else None

@@ -1,0 +1,128 @@
+"""The command ``run``: one flow, its averages, and its frames as a trajectory or a movie."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.table import Table
+
+from jaxgran.cli.arguments import RelativeError, first_strain, numbers_or_auto
+from jaxgran.cli.measure import finish, measured
+from jaxgran.cli.progress import counted
+from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
+from jaxgran.model.flow import InputError, require_number, shown
+
+MOST_RECORDED = 100_000  # of a trajectory
+
+RUN_EXAMPLES = {
+    "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
+    "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
+    "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 --packing-fraction 0.7 "
+    "--trajectory flow.gsd --every 0.01",
+}
+
+
+def run_command(
+    restitution: Annotated[float, typer.Option(help="Restitution, 0 to 1.")],
+    packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
+    grains: Annotated[int, typer.Option(help="Number of grains.")] = 256,
+    strain: Annotated[float | None, typer.Option(help="Sampled strain. [default: 5]")] = None,
+    error: RelativeError = None,
+    timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
+    trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
+    every: Annotated[
+        float | None,
+        typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.04 with --error]"),
+    ] = None,
+    movie: Annotated[
+        Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
+) -> None:
+    """Run one flow to its steady state, sample it, and print its averages with their errors."""
+    step = numbers_or_auto(timestep, "timestep")
+    if isinstance(step, tuple):
+        raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
+    first = first_strain(strain, error)
+    chosen = {
+        "restitution": (restitution,),
+        "packing_fraction": (packing_fraction,),
+        "grains": grains,
+        "seeds": 1,
+        "timestep": step,
+        "strain": 5.0 if first is None else first,
+        "error": error,
+    }
+    recorder, frames = _recorder(trajectory, movie, every, chosen["strain"])
+    record = None if recorder is None else recorder.recording
+    data, interrupted = measured(chosen, "auto", 1, output, quiet, record=record)
+    print_table(_summary_table(data))
+    if recorder is not None and recorder.frames:
+        if trajectory is not None:
+            say(f"wrote {trajectory}: {recorder.frames} frames")
+        if movie is not None:
+            _write_movie(movie, frames, quiet)
+    finish(data, [output] if output else [], interrupted)
+
+
+def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, strain: float):
+    """What records the flow frame by frame, None where no file is given; and the frames that it keeps for a movie."""
+    if trajectory is None and movie is None:
+        if every is not None:
+            raise InputError(
+                "--every is the strain between frames: add --trajectory FILE.gsd or --movie FILE.gif to have any."
+            )
+        return None, None
+    configured_jax()
+    from jaxgran.io.trajectory import check_trajectory, write_frame
+    from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
+    from jaxgran.sampling.recorder import Recorder
+
+    if every is not None:
+        most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
+        least, most = strain / most_frames, strain
+        words = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
+        require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)
+    kept, frames = [], Frames()
+    if trajectory is not None:
+        check_trajectory(trajectory)
+        kept.append(partial(write_frame, trajectory))
+    if movie is not None:
+        check_movie(movie)
+        kept.append(frames.keep)
+    return Recorder(strain / 100 if every is None else every, *kept), frames
+
+
+def _write_movie(movie: Path, frames, quiet: bool) -> None:
+    from jaxgran.plotting.movie import write_movie
+
+    if not quiet:
+        say(f"drawing {len(frames.scenes)} frames")
+    write_movie(movie, frames, follow=iter if quiet else partial(counted, words="frames"))
+    say(f"wrote {movie}: {len(frames.scenes)} frames")
+
+
+def _summary_table(data) -> Table:
+    from jaxgran.sampling.observables import OBSERVABLES, TENSORS
+
+    table = Table(box=box.SIMPLE)
+    for name in ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory"):
+        table.add_column(name)
+    point = data.isel(packing_fraction=0, restitution=0)
+    strain = float(point.strain_by_seed.sum())
+    for name in OBSERVABLES:
+        if name not in TENSORS:
+            unit = OBSERVABLES[name][1]
+            cell = with_error(float(point[name]), float(point[f"{name}_stderr"]))
+            correlation = (
+                float(point[f"{name}_correlation_strain"]) if f"{name}_correlation_strain" in point else math.nan
+            )
+            samples = strain / correlation
+            theory = float(point[f"theory_{name}"]) if f"theory_{name}" in point else math.nan
+            numbers = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
+            table.add_row(name.replace("_", " "), cell, "" if unit == "1" else unit, *numbers)
+    return table

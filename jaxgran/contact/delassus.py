@@ -1,0 +1,82 @@
+"""The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an iteration by.
+
+W is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal velocities that
+follow. Three diagonals D stand for it in the projected methods of ``methods``:
+
+- ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks make it diverge.
+- ``count_bound``: z_i/m_i + z_j/m_j with z_b the number of contacts of grain b (mass splitting). Since
+  |Σ ±n x|² ≤ z Σ x², W ⪯ D.
+- ``spectral_bound``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the largest eigenvalue of A_b = Σ n nᵀ over the contacts of
+  grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D;
+  and λ(A_b) ≤ z_b, so it is never worse than the count.
+
+An isolated pair has D = W in all three.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran.contact.network import Contacts
+
+
+def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, "grains 2"]:
+    """Total impulse Hᵀp on every grain."""
+    along = contacts.normals * impulses[:, None]
+    return _gathered(contacts, along, -along, grains)
+
+
+def in_clusters(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Bool[Array, " contacts"]:
+    """Which contacts carry an impulse in a cluster of three or more grains: one of their grains feels another one.
+
+    Where neither does, the total impulse of both grains is that of the contact to the bit. This costs no search and no
+    scatter of its own, since whoever applies the impulses needs the totals anyway.
+    """
+    total = grain_impulses(contacts, impulses, grains)
+    along = contacts.normals * impulses[:, None]
+    others = jnp.any((total[contacts.i] != along) | (total[contacts.j] != -along), axis=-1)
+    return (impulses > 0) & others
+
+
+def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, " contacts"]:
+    """Change W p of the relative normal velocities that the impulses cause."""
+    total = grain_impulses(contacts, impulses, grains)
+    change = total[contacts.i] * contacts.inverse_mass_i[:, None] - total[contacts.j] * contacts.inverse_mass_j[:, None]
+    return jnp.sum(contacts.normals * change, axis=-1)
+
+
+def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
+    """Diagonal of W; one in unused slots, as in all three, so that it can be divided by."""
+    return jnp.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, 1)
+
+
+def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
+    """Diagonal D with W ⪯ D from the numbers of contacts of the grains."""
+    one = contacts.used.astype(contacts.normals.dtype)[:, None]
+    count = _gathered(contacts, one, one, grains)[:, 0]
+    bound = count[contacts.i] * contacts.inverse_mass_i + count[contacts.j] * contacts.inverse_mass_j
+    return jnp.where(contacts.used, bound, 1)
+
+
+def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
+    """Diagonal D with W ⪯ D from the 2×2 matrices of the grains."""
+    nx, ny = contacts.normals[:, 0], contacts.normals[:, 1]
+    outer = jnp.stack([nx * nx, nx * ny, ny * ny], axis=-1)
+    total = _gathered(contacts, outer, outer, grains)
+    xx, xy, yy = total[:, 0], total[:, 1], total[:, 2]
+    largest = largest_eigenvalue(xx, xy, yy)
+    bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
+    return jnp.where(contacts.used, bound, 1)
+
+
+def largest_eigenvalue(xx: Array, xy: Array, yy: Array) -> Array:
+    """The larger eigenvalue of symmetric 2×2 matrices."""
+    return (xx + yy + jnp.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
+
+
+def _gathered(
+    contacts: Contacts, at_i: Float[Array, "contacts k"], at_j: Float[Array, "contacts k"], grains: int
+) -> Float[Array, "grains k"]:
+    """Sums over the contacts of every grain: one scatter over all ends costs less than one for each."""
+    ends: Int[Array, " two_contacts"] = jnp.concatenate([contacts.i, contacts.j])
+    total = jnp.zeros((grains, at_i.shape[1]), at_i.dtype)
+    return total.at[ends].add(jnp.concatenate([at_i, at_j]))

@@ -1,0 +1,266 @@
+"""PairList: near pairs with frozen separations, and how long the list is valid.
+
+Separations are stored once, when a list is built. In coordinates that move with the sheared cell they follow
+from the displacements δ of the grains since then and from the strain γ since then, without images or tilt:
+
+    Δy = Δy₀ + δy_i − δy_j,    Δx = Δx₀ + δx_i − δx_j + γ Δy,    dδx/dt = c_x − γ c_y,  dδy/dt = c_y.
+
+There are two lists. The outer one has a large skin and is searched seldom; the near one, which every event reads,
+is filtered from it often. A list with skin s holds every pair whose gap was at most s when it was built. Two
+grains within a distance r now have |Δy| ≤ r, so no such pair is missed as long as its gap is at most
+
+    s − 2 max|δ| (1 + |γ_ref|) − r |γ − γ_ref|
+
+with δ counted from the build of the list and γ_ref the strain of the frame at that time. So the outer list is judged
+before a near list is filtered from it, with r the largest diameter and the skin of the near list; the near list itself
+is judged in ``dynamics`` by a bound on the speed at which a gap closes, which is cheaper and as safe.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from jaxgran.contact.cell_list import cell_list_pairs, largest_cutoff, set_bit
+from jaxgran.model.cell import displacement, remap_tilt, sheared, wrap
+from jaxgran.model.control_flow import any_replica, where_active
+from jaxgran.model.grains import Grains
+
+ALL_PAIRS_LIMIT = 512  # above this number of grains the search uses a cell list
+NEAR_PAIRS_PER_GRAIN = 4
+OUTER_PAIRS_PER_GRAIN = 10
+_WORD, _FEW_WORDS = 32, 128
+_FILL = 0.8  # share of a buffer that the expected number of pairs may take
+_SKIN_SHARES = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1)  # tried in turn where the grains cluster and a buffer is too small
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PairList:
+    """Pairs i, j that may touch, with their separations when the frame was frozen; empty slots lie far apart.
+
+    ===========  ===========  ====  ==========================================
+    field        shape        unit  meaning
+    ===========  ===========  ====  ==========================================
+    i, j         (pairs,)     –     grains of the pair
+    separations  (pairs, 2)   σ     r_i − r_j (nearest image) in the frozen frame
+    reach        (pairs,)     σ     sum of the radii, 0 in an empty slot
+    skin         ()           σ     largest gap of a pair at the time of the build
+    overflow     ()           –     True where pairs were left out
+    ===========  ===========  ====  ==========================================
+    """
+
+    i: Int[Array, " pairs"]
+    j: Int[Array, " pairs"]
+    separations: Float[Array, "pairs 2"]
+    reach: Float[Array, " pairs"]
+    skin: Float[Array, ""]
+    overflow: Bool[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Frame:
+    """Motion since the separations were frozen: displacements (grains, 2) in σ and strain ()."""
+
+    displacements: Float[Array, "grains 2"]
+    strain: Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Both lists and the frame that their separations are frozen in.
+
+    ===========  ===========  ====  =====================================================
+    field        shape        unit  meaning
+    ===========  ===========  ====  =====================================================
+    outer        PairList     –     all pairs within a large skin
+    near         PairList     –     those of them within a small skin
+    frame        Frame        –     motion since the frame was frozen
+    near_frame   Frame        –     that motion when the near list was built
+    positions    (grains, 2)  σ     positions when the frame was frozen
+    tilt         ()           –     tilt of the cell when the frame was frozen
+    ===========  ===========  ====  =====================================================
+    """
+
+    outer: PairList
+    near: PairList
+    frame: Frame
+    near_frame: Frame
+    positions: Float[Array, "grains 2"]
+    tilt: Float[Array, ""]
+
+
+def separations_now(pairs: PairList, frame: Frame) -> Float[Array, "pairs 2"]:
+    """Separations r_i − r_j of the pairs after the motion of the frame."""
+    d = pairs.separations + frame.displacements[pairs.i] - frame.displacements[pairs.j]
+    return sheared(d, frame.strain)
+
+
+def consumed_skin(frame: Frame, since: Frame, distance: Array) -> Float[Array, ""]:
+    """How much of the skin of a list built at ``since`` the motion up to ``frame`` may have used.
+
+    It holds for pairs that are now within the given distance (of their centres).
+    """
+    moved = jnp.sqrt(jnp.max(jnp.sum((frame.displacements - since.displacements) ** 2, axis=-1)))
+    return 2 * moved * (1 + jnp.abs(since.strain)) + distance * jnp.abs(frame.strain - since.strain)
+
+
+def present(hood: Neighbourhood, side: Array) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
+    """Positions of the grains now, wrapped into the cell, and its tilt."""
+    y = hood.positions[:, 1] + hood.frame.displacements[:, 1]
+    x = hood.positions[:, 0] + hood.frame.displacements[:, 0] + hood.frame.strain * y
+    tilt = hood.tilt + hood.frame.strain
+    remapped = remap_tilt(tilt)
+    return wrap(jnp.stack([x, y], axis=-1), side, remapped), remapped
+
+
+def neighbourhood(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> Neighbourhood:
+    """Both lists, built from the positions; the frame starts here."""
+    still = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
+    outer = _outer_pairs(positions, grains, side, tilt)
+    near = _near_pairs(outer, still, outer.skin, grains, side)
+    return Neighbourhood(outer, near, still, still, positions, tilt)
+
+
+def refresh(hood: Neighbourhood, grains: Grains, side: Array, stale: Bool[Array, ""]) -> Neighbourhood:
+    """The neighbourhood with a new near list where it is ``stale``, and all of it anew where the outer list is used up.
+
+    Args:
+      hood: the present lists.
+      grains, side: the grains and the side of their cell.
+      stale: whether this replica needs it; others of the batch keep what they have.
+    """
+    still = Frame(jnp.zeros_like(hood.positions), jnp.zeros_like(hood.tilt))
+    nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
+    left = hood.outer.skin - consumed_skin(hood.frame, still, 2 * jnp.max(grains.radii) + nominal)
+    left = jax.lax.stop_gradient(left)
+    search = stale & ~(left >= nominal)
+
+    def searched(_):
+        positions, tilt = present(hood, side)
+        return where_active(search, neighbourhood(positions, grains, side, tilt), filtered(_))
+
+    def filtered(_):
+        near = _near_pairs(hood.outer, hood.frame, left, grains, side)
+        new = Neighbourhood(hood.outer, near, hood.frame, hood.frame, hood.positions, hood.tilt)
+        return where_active(stale, new, hood)
+
+    return jax.lax.cond(any_replica(search), searched, filtered, None)
+
+
+def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
+    """Indices of the first ``size`` True entries, padded with the length of the mask.
+
+    Rank and select on words of 32 bits: the word that holds the k-th True entry follows from the running number of
+    set bits, its place in the word by halving. An order of magnitude cheaper than ``jnp.nonzero`` inside a step.
+
+    Examples:
+      >>> first_true(jnp.array([False, True, True, False, True]), 4).tolist()
+      [1, 2, 4, 5]
+    """
+    return set_bits(bit_words(mask), size, mask.size)
+
+
+def bit_words(mask: Bool[Array, " m"]) -> UInt32[Array, " words"]:
+    """The mask in words of 32 bits, the first entry in the lowest bit."""
+    words = -(-mask.size // _WORD)
+    bits = jnp.pad(mask, (0, words * _WORD - mask.size)).reshape(words, _WORD)
+    weights = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(bits, weights[None, :], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+
+
+def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Array, " size"]:
+    """Positions of the first ``size`` set bits, padded with ``length``."""
+    count = words.size
+    if size == 1:
+        lowest = jax.lax.population_count((words & -words) - jnp.uint32(1)).astype(jnp.int32)
+        return jnp.min(jnp.where(words > 0, jnp.arange(count, dtype=jnp.int32) * _WORD + lowest, length))[None]
+    set_in_word = jax.lax.population_count(words).astype(jnp.int32)
+    wanted = jnp.arange(size, dtype=jnp.int32)
+    if count <= _FEW_WORDS:
+        triangle = jnp.tril(jnp.ones((count, count), bool))
+        running = jnp.sum(jnp.where(triangle, set_in_word[None, :], 0), axis=1, dtype=jnp.int32)
+        word = jnp.sum(running[None, :] <= wanted[:, None], axis=1, dtype=jnp.int32)
+    else:
+        running = jnp.cumsum(set_in_word, dtype=jnp.int32)
+        word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
+    found = jnp.minimum(word, count - 1)
+    place = set_bit(words[found], wanted - (running - set_in_word)[found])
+    return jnp.where(word < count, found * _WORD + place, length)
+
+
+def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Array, ""]:
+    """The skin at which a homogeneous flow fills a buffer to its expected share; at most half the cell."""
+    density = grains.radii.size / side**2
+    reach = jnp.sqrt(2 * _FILL * pairs_per_grain / (jnp.pi * density))
+    return jnp.minimum(reach - 1, widest_skin(grains, side))
+
+
+def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
+    """The largest skin that lists of these grains can have: nearest images are unique, and the grid of cells serves."""
+    count, reach = grains.radii.size, side / 2
+    if count > ALL_PAIRS_LIMIT:
+        reach = jnp.minimum(reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count)))
+    return reach - 2 * jnp.max(grains.radii)
+
+
+def _capacity(pairs_per_grain: int, count: int) -> int:
+    return min(pairs_per_grain * count, count * (count - 1) // 2)
+
+
+def _select(gaps: Float[Array, " m"], largest_skin: Array, capacity: int):
+    """Indices of the pairs with a gap within the largest skin that the buffer allows, that skin, and overflow."""
+    skins = largest_skin * jnp.asarray(_SKIN_SHARES, gaps.dtype)
+    counts = jnp.stack([jnp.sum(gaps <= skin, dtype=jnp.int32) for skin in skins])
+    fits = counts <= capacity
+    skin = skins[jnp.argmax(fits)]
+    index = first_true(gaps <= skin, capacity)
+    return index, skin, ~jnp.any(fits)
+
+
+def _pair_list(i, j, separations, index, grains: Grains, skin, overflow) -> PairList:
+    """The pairs at ``index``; an index past the end is an empty slot."""
+    filled = index < separations.shape[0]
+    index = jnp.where(filled, index, 0)
+    i, j = jnp.where(filled, i(index), 0), jnp.where(filled, j(index), 0)
+    return PairList(
+        i=i,
+        j=j,
+        separations=jnp.where(filled[:, None], separations[index], jnp.asarray([[1e6, 0]], separations.dtype)),
+        reach=jnp.where(filled, grains.radii[i] + grains.radii[j], 0),
+        skin=skin,
+        overflow=overflow,
+    )
+
+
+def _near_pairs(outer: PairList, frame: Frame, skin_left: Array, grains: Grains, side: Array) -> PairList:
+    """The pairs of the outer list that are near now, with the frozen separations of the outer list."""
+    distance = jnp.sqrt(jnp.sum(separations_now(outer, frame) ** 2, axis=-1))
+    largest = jnp.minimum(_nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side), skin_left)
+    capacity = _capacity(NEAR_PAIRS_PER_GRAIN, grains.radii.size)
+    index, skin, overflow = _select(distance - outer.reach, largest, capacity)
+    near = _pair_list(lambda k: outer.i[k], lambda k: outer.j[k], outer.separations, index, grains, skin, overflow)
+    return PairList(near.i, near.j, near.separations, near.reach, skin, overflow | outer.overflow)
+
+
+def _outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairList:
+    """All pairs within the outer skin, by comparing all pairs or, for many grains, through a cell list."""
+    count = positions.shape[0]
+    capacity = _capacity(OUTER_PAIRS_PER_GRAIN, count)
+    largest = _nominal_skin(OUTER_PAIRS_PER_GRAIN, grains, side)
+    if count > ALL_PAIRS_LIMIT:
+        i, j, missed = cell_list_pairs(positions, side, tilt, largest + 2 * jnp.max(grains.radii), capacity)
+        separations = displacement(positions[i], positions[j], side, tilt)
+        reach = jnp.where(i == j, -jnp.inf, grains.radii[i] + grains.radii[j])
+        gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach
+        index, skin, overflow = _select(gaps, largest, capacity)
+        return _pair_list(lambda k: i[k], lambda k: j[k], separations, index, grains, skin, overflow | missed)
+    separations = displacement(positions[:, None], positions[None, :], side, tilt)
+    gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - grains.radii[:, None] - grains.radii[None, :]
+    gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
+    index, skin, overflow = _select(gaps, largest, capacity)
+    flat = separations.reshape(-1, 2)
+    return _pair_list(lambda k: k // count, lambda k: k % count, flat, index, grains, skin, overflow)

@@ -1,0 +1,198 @@
+"""Impulses of a contact network: the loop that runs a projected method until its residual is small.
+
+With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact law of a step is
+
+    u⁺ = u⁻ + W p,    0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0.
+
+Its solution is p = (1 + α) p₀, where p₀ solves it at α = 0; so only 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0 is ever solved.
+
+Derivatives do not go through the iteration. On the contacts that press, A = {p₀ > 0}, the solution satisfies
+W_AA p₀ + u⁻_A = 0, and every small change keeps it so where no contact is about to press or to part:
+
+    W_AA dp₀ = −(dW p₀ + du⁻)_A,    dp₀ = 0 elsewhere.
+
+This linear system is solved by conjugate gradients, in forward and in reverse mode, whose memory does not depend on the
+iterations. Where W_AA is singular, as in a cluster with more contacts than degrees of freedom, velocities after the
+step have this derivative and the impulses are not unique, nor are their derivatives: one solution is returned. The
+set A is that of the solution found, so derivatives want a small tolerance (1e-8 or less).
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.sparse.linalg import cg
+from jaxtyping import Array, Float, Int
+
+from jaxgran.contact.delassus import delassus_product, diagonal
+from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import METHODS, Iterate, dot
+from jaxgran.model.control_flow import any_replica, where_active
+from jaxgran.model.flow import Solver
+from jaxgran.model.status import Status
+
+JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+_DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
+_DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Solution:
+    """Result of one contact solve.
+
+    ==========  ===========  ====  ======================================================
+    field       shape        unit  meaning
+    ==========  ===========  ====  ======================================================
+    impulses    (contacts,)  mσγ̇   impulses p₀ at restitution zero, never negative
+    response    (contacts,)  σγ̇    velocity change W p₀ of the contacts
+    residual    ()           –     ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
+    iterations  ()           –     products with W
+    status      ()           –     ok, iteration_limit, infeasible or nonfinite
+    ==========  ===========  ====  ======================================================
+    """
+
+    impulses: Float[Array, " contacts"]
+    response: Float[Array, " contacts"]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 6))
+def solve(
+    contacts: Contacts,
+    grains: int,
+    shear_rate: float | Array,
+    tolerance: float | Array,
+    max_iterations: int | Array,
+    relaxation: float | Array,
+    method: Solver,
+    active: Array,
+) -> Solution:
+    """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
+
+    Args:
+      contacts: the network.
+      grains: number of grains.
+      shear_rate: γ̇; sets the absolute floor of the residual.
+      tolerance: relative residual to reach.
+      max_iterations: cap; beyond it the best iterate is returned with a status.
+      relaxation: ω of the Jacobi methods; the others do not use it.
+      method: name of a projected method, see ``methods``.
+      active: whether this replica has something to solve; others of its batch return zero impulses.
+
+    Impulses and response have derivatives with respect to the network, see the module; all else has none.
+    """
+    b, own = contacts.approach, diagonal(contacts, grains)
+    if b.size == 1:
+        return _single_contact(b, own, active)
+    rule = METHODS[method]
+    bound = rule.bound(contacts, grains)
+    scale = jnp.sqrt(dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
+    target = tolerance * scale + 10 * jnp.finfo(b.dtype).eps * shear_rate
+    relaxation = jnp.asarray(relaxation, b.dtype)
+
+    def unfinished(now: _Progress):
+        going = ~(now.residual <= target) & (now.at.iterations < max_iterations) & jnp.isfinite(now.residual)
+        return active & (going | (now.at.iterations == 0))
+
+    def iterate(now: _Progress) -> _Progress:
+        at = now.at
+        start, step = rule.propose(at, relaxation)
+        impulses = jnp.maximum(0, start[0] - step * (start[1] + b) / bound)
+        point = jnp.stack([impulses, delassus_product(contacts, impulses, grains)])
+        error = jnp.minimum(own * impulses, point[1] + b)
+        residual = jnp.sqrt(dot(error, error))
+        better = residual < at.best_residual
+        best_residual = jnp.where(better, residual, at.best_residual)
+        memory = rule.learn(at, start, point, bound, best_residual)
+        new = _Progress(
+            at=Iterate(point, at.point, memory, best_residual, at.iterations + 1),
+            residual=residual,
+            best=jnp.where(better, point, now.best),
+        )
+        return where_active(unfinished(now), new, now)
+
+    zero, infinite = jnp.zeros((2, b.size), b.dtype), jnp.asarray(jnp.inf, b.dtype)
+    memory = tuple(jnp.asarray(value, b.dtype) for value in rule.memory)
+    start = Iterate(zero, zero, memory, infinite, jnp.int32(0))
+    end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, _Progress(start, infinite, zero))
+    impulses, response = end.best
+
+    def is_jammed():
+        last, moved = end.at.point  # the best iterate may be an early one, whose impulses have not grown yet
+        return dot(last, moved) < JAMMED_RESPONSE * -dot(b, last)
+
+    capped = active & ~(end.residual <= target)
+    jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
+    status = jnp.where(capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok)
+    floor = jnp.maximum(scale, target)  # zero where what approaches does so by rounding, without shear
+    return Solution(
+        impulses=impulses,
+        response=response,
+        residual=jnp.where(active, end.at.best_residual / jnp.where(floor > 0, floor, 1), 0),
+        iterations=end.at.iterations,
+        status=jnp.where(active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status).astype(jnp.int32),
+    )
+
+
+@solve.defjvp
+def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    contacts, shear_rate, tolerance, max_iterations, relaxation, active = primals
+    solution = solve(contacts, grains, shear_rate, tolerance, max_iterations, relaxation, method, active)
+    impulses, pressing = solution.impulses, solution.impulses > 0
+    own = diagonal(contacts, grains)
+
+    def response(normals: Array, inverse_mass_i: Array, inverse_mass_j: Array) -> Array:
+        network = replace(contacts, normals=normals, inverse_mass_i=inverse_mass_i, inverse_mass_j=inverse_mass_j)
+        return delassus_product(network, impulses, grains)
+
+    def of_pressing(change: Array) -> Array:
+        """W_AA on the contacts that press, and the identity on the others."""
+        felt = delassus_product(contacts, jnp.where(pressing, change, 0), grains)
+        return jnp.where(pressing, felt, change)
+
+    def solved(operator, wanted: Array) -> Array:
+        change, _ = cg(
+            operator,
+            wanted,
+            tol=_DERIVATIVE_TOLERANCE,
+            maxiter=_DERIVATIVE_ITERATIONS * impulses.size,
+            M=lambda x: x / own,
+        )
+        missed = wanted - operator(change)
+        good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
+        return jnp.where(good, change, jnp.nan)
+
+    places = ("normals", "inverse_mass_i", "inverse_mass_j")
+    change = tangents[0]
+    at, along = (tuple(getattr(x, name) for name in places) for x in (contacts, change))
+    _, turned = jax.jvp(response, at, along)
+    wanted = jnp.where(pressing, -(turned + change.approach), 0)
+    impulse_change = lax.custom_linear_solve(of_pressing, wanted, solved, symmetric=True)
+    none: Any = np.zeros((), jax.dtypes.float0)
+    return solution, Solution(
+        impulses=impulse_change,
+        response=turned + delassus_product(contacts, impulse_change, grains),
+        residual=jnp.zeros_like(solution.residual),
+        iterations=none,
+        status=none,
+    )
+
+
+def _single_contact(b: Float[Array, "1"], own: Float[Array, "1"], active: Array) -> Solution:
+    """The exact solution of a network of one contact, for which the iteration would need one product."""
+    impulses = jnp.where(active, jnp.maximum(0, -b / own), 0)
+    status = jnp.where(jnp.isnan(impulses[0]), Status.nonfinite, Status.ok).astype(jnp.int32)
+    return Solution(impulses, own * impulses, jnp.zeros((), b.dtype), active.astype(jnp.int32), status)
+
+
+class _Progress(NamedTuple):
+    at: Iterate
+    residual: Array
+    best: Array  # (2, contacts): the point of the smallest residual

@@ -1,0 +1,83 @@
+"""Sums over every time step of what a function of one's own finds in it, in the pass that advances the flow.
+
+The engine jumps over the steps in which no contact approaches: the grains fly, and nothing else happens. Such a flight
+is looked at once, at its beginning and without contacts, and counts as the number of its steps. A step whose contacts
+act is looked at with their network and its impulses, before they act, and counts as one. So the weights add up to the
+number of steps; what contacts do is summed exactly, and what the flying grains do to first order: their velocities
+change by the strain of a flight, which ends with the next collision anywhere in the cell.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.contact.network import Contacts
+from jaxgran.model.flow import InputError, shown
+
+_NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
+Look = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
+
+
+class Observed(NamedTuple):
+    """Sums over the time steps so far, a pytree of arrays, and whether the contacts of the present step are in them."""
+
+    sums: Any
+    acted: Float[Array, ""]
+
+
+def nothing_observed(look: Look, slots: int, dtype: jnp.dtype) -> Observed:
+    """The sums of no time at all.
+
+    Raises:
+      InputError: what is found is no pytree of arrays, or their shapes follow the number of slots for contacts.
+    """
+
+    def found(slots: int) -> Any:
+        def numbers() -> Any:
+            values = look(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
+            for x in jax.tree.leaves(values):
+                if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
+                    raise InputError(f"observe must return real numbers, not {shown(x)}.")
+            return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), dtype), values)
+
+        return jax.eval_shape(numbers)
+
+    few, many = found(1), found(slots)
+    if few != many:
+        raise InputError("observe must return sums over the contacts: a step has slots for more or fewer of them.")
+    return Observed(jax.tree.map(lambda x: jnp.zeros(x.shape, dtype), few), jnp.zeros((), dtype))
+
+
+def with_flight(own: Observed, look: Look, steps: Array) -> Observed:
+    """The sums with a flight of so many steps; where the contacts of its first step acted, that step is in already."""
+    dtype = own.acted.dtype
+    weight = steps.astype(dtype) - own.acted
+    found = look(_no_contacts(1, dtype), jnp.zeros(1, dtype))
+    return Observed(_added(own.sums, found, weight), jnp.zeros_like(own.acted))
+
+
+def with_contacts(own: Observed, look: Look, network: Contacts, impulses: Array) -> Observed:
+    """The sums with the present step, whose contacts act."""
+    return Observed(_added(own.sums, look(network, impulses), jnp.ones_like(own.acted)), jnp.ones_like(own.acted))
+
+
+def _added(sums: Any, found: Any, weight: Array) -> Any:
+    return jax.tree.map(lambda old, x: old + weight * jnp.asarray(x).astype(old.dtype), sums, found)
+
+
+def _no_contacts(slots: int, dtype: jnp.dtype) -> Contacts:
+    zeros, none = jnp.zeros(slots, dtype), jnp.zeros(slots, jnp.int32)
+    return Contacts(
+        i=none,
+        j=none,
+        normals=jnp.zeros((slots, 2), dtype),
+        distances=jnp.ones(slots, dtype),
+        approach=zeros,
+        inverse_mass_i=zeros,
+        inverse_mass_j=zeros,
+        used=jnp.zeros(slots, bool),
+    )

@@ -1,0 +1,219 @@
+"""A closure for flows beyond kinetic theory: its stresses times fitted corrections, and a law of the force ratio.
+
+With ε = 1 − α² the energy that a collision loses, x = −ln(1 − ν/ν_J) the crowding and ν_J the packing fraction of
+jamming,
+
+    ln(P/P_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · a
+    ln(μ/μ_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · b,  μ = τ/P
+    ln(force ratio − 1) = (1, 1 − α, ln(1 − α), x, (1 − α) x) · c
+
+The theory is that of anisotropic Gaussian velocities. Both corrections of stresses vanish with ν and as α → 1; the
+excess of the force ratio is positive, vanishes as α → 1, and grows at jamming as a power of ν_J − ν. The powers of ε
+are a choice, made by the errors of points left out: one correction of all α < 1, one of strongly dissipative flows.
+Friction is fitted in place of the shear stress because the noise of τ and P is common and nearly cancels in it.
+
+The laws of the stresses are linear in their coefficients, and fitted by linear least squares; that of the force ratio
+is not, because F itself and not ln(F − 1) has Gaussian errors, and L-BFGS minimises its squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxgran.model.flow import MAX_PACKING_FRACTION, InputError, require, require_number, shown
+from jaxgran.theory.kinetic_theory import Scalar, gaussian_moments
+
+Numbers = Array | np.ndarray
+
+LAWS = ("pressure", "macroscopic_friction", "force_ratio")
+NEEDED = (*LAWS, *(f"{name}_stderr" for name in LAWS))
+"""Variables of a map that a closure needs."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Law:
+    """Fitted coefficients of one law, for the logarithm of what it predicts.
+
+    ============  ==============  ======================================================================
+    coefficients  (terms,)
+    deviations    (terms, terms)  a square root D of their covariance, D Dᵀ, which loses fewer digits
+    scatter       ()              standard deviation of the points about the law beyond their own errors
+    ============  ==============  ======================================================================
+    """
+
+    coefficients: Float[Numbers, " terms"]
+    deviations: Float[Numbers, "terms terms"]
+    scatter: Float[Numbers, ""]
+
+    @property
+    def covariance(self) -> Float[Numbers, "terms terms"]:
+        """Covariance of the coefficients."""
+        return self.deviations @ self.deviations.T
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Closure:
+    """Three fitted laws and the plane in which they were fitted; a pytree, so that it passes through ``jit``.
+
+    ======================  ====  ===========================================================================
+    pressure                Law   of P over that of theory, 6 terms
+    macroscopic_friction    Law   of τ/P over that of theory, 6 terms
+    force_ratio             Law   of ⟨F⟩/⟨F_bc⟩, 5 terms
+    restitution_range       (2,)  smallest and largest of the fitted points
+    packing_fraction_range  (2,)  the same
+    jamming_fraction        ()    ν_J
+    timestep                ()    of the fitted map, in 1/γ̇, on which its force ratios depend; NaN if unknown
+    ======================  ====  ===========================================================================
+    """
+
+    pressure: Law
+    macroscopic_friction: Law
+    force_ratio: Law
+    restitution_range: Float[Numbers, " 2"]
+    packing_fraction_range: Float[Numbers, " 2"]
+    jamming_fraction: Float[Numbers, ""]
+    timestep: Float[Numbers, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Prediction:
+    """What a closure predicts, in units of m = σ = γ̇ = 1; each field has the shape of the flows asked for.
+
+    ==============  ============================================================================
+    force_ratio     ⟨F⟩/⟨F_bc⟩
+    pressure        half the trace of the stress, contacts and kinetic
+    shear_stress    positive, contacts and kinetic
+    …_stderr        standard errors of a measurement without noise about the prediction: from the
+                    covariance of the coefficients and the scatter of the points about the law
+    extrapolated    outside the fitted restitutions or packing fractions: the errors mean little
+    ==============  ============================================================================
+    """
+
+    force_ratio: Float[Array, "*flows"]
+    pressure: Float[Array, "*flows"]
+    shear_stress: Float[Array, "*flows"]
+    force_ratio_stderr: Float[Array, "*flows"]
+    pressure_stderr: Float[Array, "*flows"]
+    shear_stress_stderr: Float[Array, "*flows"]
+    extrapolated: Bool[Array, "*flows"]
+
+
+def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> Prediction:
+    """Predict force ratio and stresses; differentiable, and for ``jit`` and ``vmap``.
+
+    ================  ==========  ==================================================================
+    closure           Closure
+    restitution       (*flows)    0 ≤ α < 1; as α → 1 the stresses are those of theory, which diverge
+    packing_fraction  (*flows)    0 < ν ≤ 0.83, of a shape that broadcasts with that of α
+    returns           Prediction  with ``extrapolated`` set outside the fitted ranges
+    raises            InputError  a number is outside its range; traced numbers are not judged
+    ================  ==========  ==================================================================
+    """
+    require_closure(closure)
+    require("restitution", restitution, lambda x: (x >= 0) & (x < 1), "at least 0 and below 1")
+    require_fraction(packing_fraction)
+    return _predictions(closure, *broadcast(restitution=restitution, packing_fraction=packing_fraction))
+
+
+@jax.jit
+def _predictions(closure: Closure, alpha: Array, nu: Array) -> Prediction:
+    return each(partial(prediction, closure), alpha, nu)
+
+
+def prediction(closure: Closure, alpha: Array, nu: Array) -> Prediction:
+    closure = of_type(closure, alpha.dtype)
+    logs, variances = log_laws(closure, alpha, nu)
+    pressure, shear_stress, ratio = jnp.exp(jnp.stack([logs[0], logs[0] + logs[1], logs[2]]))
+    errors = jnp.sqrt(jnp.stack([variances[0], variances[0] + variances[1], variances[2]]))
+    return Prediction(
+        force_ratio=ratio,
+        pressure=pressure,
+        shear_stress=shear_stress,
+        force_ratio_stderr=ratio * errors[2],
+        pressure_stderr=pressure * errors[0],
+        shear_stress_stderr=shear_stress * errors[1],
+        extrapolated=_outside(alpha, closure.restitution_range) | _outside(nu, closure.packing_fraction_range),
+    )
+
+
+def stress_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Array:
+    """Terms of the corrections of pressure and friction, (..., 6)."""
+    loss, crowding = 1 - alpha**2, -jnp.log1p(-nu / jamming_fraction)
+    density = jnp.stack([nu, crowding, crowding**2], axis=-1)
+    return jnp.concatenate([loss[..., None] * density, loss[..., None] ** 6 * density], axis=-1)
+
+
+def excess_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Array:
+    """Terms of the logarithm of the force ratio's excess over one, (..., 5)."""
+    crowding = -jnp.log1p(-nu / jamming_fraction)
+    rest = 1 - alpha
+    return jnp.stack([jnp.ones_like(rest), rest, jnp.log(rest), crowding, rest * crowding], axis=-1)
+
+
+def log_laws(closure: Closure, alpha: Array, nu: Array) -> tuple[Array, Array]:
+    """Logarithms of pressure, friction and force ratio of one flow, and their variances, each (3,)."""
+    theory = gaussian_moments(alpha, nu)
+    base = jnp.log(jnp.stack([theory.pressure, theory.shear_stress / theory.pressure]))
+    stress, excess = (terms(alpha, nu, closure.jamming_fraction) for terms in (stress_terms, excess_terms))
+    log_excess = excess @ closure.force_ratio.coefficients
+    corrections = jnp.stack([stress @ law.coefficients for law in (closure.pressure, closure.macroscopic_friction)])
+    logs = jnp.concatenate([base + corrections, jax.nn.softplus(log_excess)[None]])
+    gradients = stress, stress, jax.nn.sigmoid(log_excess) * excess
+    laws = closure.pressure, closure.macroscopic_friction, closure.force_ratio
+    variances = [
+        jnp.sum((gradient @ law.deviations) ** 2) + law.scatter**2
+        for gradient, law in zip(gradients, laws, strict=True)
+    ]
+    return logs, jnp.stack(variances)
+
+
+def _outside(value: Array, span: Numbers) -> Array:
+    slack = 8 * jnp.finfo(value.dtype).eps
+    return (value < span[0] - slack) | (value > span[1] + slack)
+
+
+def require_closure(closure: Closure) -> None:
+    if not isinstance(closure, Closure):
+        raise InputError(f"closure must be a Closure, as fit_closure returns, not {shown(closure)}.")
+
+
+def require_fraction(packing_fraction: Scalar) -> None:
+    words = f"above 0 and at most {MAX_PACKING_FRACTION}"
+    require("packing_fraction", packing_fraction, lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION), words)
+
+
+def require_jamming(jamming_fraction: float) -> None:
+    words = f"a number above {MAX_PACKING_FRACTION} and at most 1"
+    require_number("jamming_fraction", jamming_fraction, lambda x: (x > MAX_PACKING_FRACTION) & (x <= 1), words)
+
+
+def broadcast(**numbers: Scalar | np.ndarray) -> list[Array]:
+    """Numbers as arrays of one floating-point type and one shape."""
+    shapes = {name: np.shape(x) for name, x in numbers.items()}
+    try:
+        shape = np.broadcast_shapes(*shapes.values())
+    except ValueError:
+        words = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise InputError(f"the numbers must have shapes that broadcast, not {words}.") from None
+    dtype = jnp.result_type(float, *numbers.values())
+    return [jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in numbers.values()]
+
+
+def each(function: Callable, *arrays: Array):
+    """A function of scalars at every entry of arrays of one shape."""
+    results = jax.vmap(function)(*(x.reshape(-1) for x in arrays))
+    return jax.tree.map(lambda x: x.reshape(arrays[0].shape), results)
+
+
+def of_type(closure: Closure, dtype: jnp.dtype) -> Closure:
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), closure)

@@ -1,0 +1,219 @@
+"""Fit of a closure to a map: linear least squares for the stresses, L-BFGS for the force ratio."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import xarray as xr
+from jaxtyping import Array
+from scipy.optimize import brentq
+
+from jaxgran.inference.closure import (
+    LAWS,
+    NEEDED,
+    Closure,
+    Law,
+    broadcast,
+    excess_terms,
+    require_jamming,
+    stress_terms,
+)
+from jaxgran.maps.schema import require_map
+from jaxgran.model.flow import MAX_PACKING_FRACTION, InputError
+from jaxgran.model.status import Status
+from jaxgran.sampling.timestep import JAMMING
+from jaxgran.theory.kinetic_theory import gaussian_moments
+
+FEWEST_POINTS, FEWEST_VALUES = 12, 3  # points of a map, and values of each axis among them
+_LEAST_ERROR = 1e-4  # relative, of a measured value: blocks without a single cluster agree by chance
+_ROUNDS = 50  # of fits and scatters, at most; they end when the scatter changes by less than _SAME
+_SAME = 1e-5
+_MAX_ITERATIONS, _SMALLEST_GRADIENT = 200, 1e-4  # of L-BFGS, in standard errors of the coefficients
+
+
+def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
+    """Fit the closure to a ratio map.
+
+    Weights come from the standard errors of the points and a scatter of the points about the law, of each law the one
+    at which χ² is its number of degrees of freedom, or none.
+
+    ================  ===============================  ==============================================================
+    data              (packing_fraction, restitution)  `pressure`, `macroscopic_friction` and `force_ratio` with
+                                                       `_stderr`, and `status`; points of status ok count, the
+                                                       shortest of several time steps, and α < 1
+    jamming_fraction  ()                               ν_J, above 0.83; by default that of a random quench of the
+                                                       size distribution of maps
+    returns           Closure
+    raises            InputError                       fewer than 12 points, or than 3 values of α or of ν
+    ================  ===============================  ==============================================================
+
+    Source: scatter by R. C. Paule and J. Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
+    """
+    require_map(data, *NEEDED)
+    require_jamming(jamming_fraction)
+    points = closure_points(data)
+    require_enough(points, FEWEST_POINTS)
+    return fit_points(points, jamming_fraction)
+
+
+class Points(NamedTuple):
+    """Points of a map that a closure is fitted to.
+
+    place                          (points,)    in the raveled map, ν before α
+    restitution, packing_fraction  (points,)
+    logs, errors                   (points, 3)  logarithms of the quantities in ``LAWS`` and their standard errors
+    theory                         (points, 2)  logarithms of the pressure and the friction of theory
+    timestep                       float        NaN if unknown
+    """
+
+    place: np.ndarray
+    restitution: np.ndarray
+    packing_fraction: np.ndarray
+    logs: np.ndarray
+    errors: np.ndarray
+    theory: np.ndarray
+    timestep: float
+
+    def chosen(self, which: np.ndarray) -> Points:
+        """Some of the points."""
+        return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "timestep"})
+
+
+def closure_points(data: xr.Dataset) -> Points:
+    """The points that :func:`fit_closure` fits: of status ok, positive, with errors, and not elastic."""
+    data = finest(data)
+    alpha, nu = (data[name].astype(float).values for name in ("restitution", "packing_fraction"))
+    nu, alpha = (x.ravel() for x in np.meshgrid(nu, alpha, indexing="ij"))
+    values, errors = (table(data, [f"{name}{end}" for name in LAWS]) for end in ("", "_stderr"))
+    known = np.isfinite(errors).all(axis=1) & (values > 0).all(axis=1) & np.isfinite(values).all(axis=1)
+    known &= (alpha < 1) & (nu > 0) & (nu <= MAX_PACKING_FRACTION)
+    if "status" in data:
+        known &= table(data, ["status"])[:, 0] == Status.ok
+    nu, alpha, values, errors = (x[known] for x in (nu, alpha, values, errors))
+    theory = jax.vmap(gaussian_moments)(*broadcast(restitution=alpha, packing_fraction=nu))
+    pressure, shear_stress = (np.asarray(x, float) for x in (theory.pressure, theory.shear_stress))
+    return Points(
+        place=np.flatnonzero(known),
+        restitution=alpha,
+        packing_fraction=nu,
+        logs=np.log(values),
+        errors=np.maximum(errors / values, _LEAST_ERROR),
+        theory=np.log(np.stack([pressure, shear_stress / pressure], axis=1)),
+        timestep=float(data.timestep if "timestep" in data.coords else data.attrs.get("timestep", np.nan)),
+    )
+
+
+def fit_points(points: Points, jamming_fraction: float) -> Closure:
+    alpha, nu, jamming = points.restitution, points.packing_fraction, np.asarray(jamming_fraction, float)
+    stress, excess = (np.asarray(f(alpha, nu, jamming), float) for f in (stress_terms, excess_terms))
+    laws = [
+        _fit(stress, points.logs[:, k] - points.theory[:, k], points.errors[:, k], _linear_coefficients)
+        for k in range(2)
+    ]
+    return Closure(
+        *laws,
+        force_ratio=_fit(excess, points.logs[:, 2], points.errors[:, 2], _excess_coefficients),
+        restitution_range=np.array([alpha.min(), alpha.max()]),
+        packing_fraction_range=np.array([nu.min(), nu.max()]),
+        jamming_fraction=jamming,
+        timestep=np.asarray(points.timestep),
+    )
+
+
+class _Solved(NamedTuple):
+    """coefficients (terms,), prediction (points,) and its derivative by the coefficients (points, terms)."""
+
+    coefficients: np.ndarray
+    predicted: np.ndarray
+    gradient: np.ndarray
+
+
+def _fit(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray, solve: Callable[..., _Solved]) -> Law:
+    """Fit with a scatter that makes χ² the number of degrees of freedom, or none where χ² is below it."""
+    freedom, scatter, before, rounds = len(logs) - terms.shape[1], 0.0, np.inf, 0
+    solved = solve(terms, logs, errors)
+    while abs(scatter - before) >= _SAME and rounds < _ROUNDS:
+        before, scatter = scatter, _scatter(logs - solved.predicted, errors, freedom)
+        solved, rounds = solve(terms, logs, np.hypot(errors, scatter)), rounds + 1
+    triangle = np.linalg.qr(solved.gradient / np.hypot(errors, scatter)[:, None], mode="r")
+    return Law(solved.coefficients, np.linalg.inv(triangle), np.asarray(scatter))
+
+
+def _scatter(residuals: np.ndarray, errors: np.ndarray, freedom: int) -> float:
+    def too_much(scatter: float) -> float:
+        return float(np.sum(residuals**2 / (errors**2 + scatter**2)) - freedom)
+
+    most = float(np.sqrt(np.sum(residuals**2) / freedom))
+    return cast(float, brentq(too_much, 0.0, most)) if too_much(0.0) > 0 else 0.0
+
+
+def _linear_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solved:
+    coefficients = np.linalg.lstsq(terms / errors[:, None], logs / errors)[0]
+    return _Solved(coefficients, terms @ coefficients, terms)
+
+
+def _excess_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solved:
+    """Least squares of ln F = ln(1 + exp(terms · c)), from those of the logarithm of the excess.
+
+    The iteration is over c in units of its standard errors, where the squares are nearly a sphere.
+    """
+    excess = np.maximum(np.expm1(logs), errors)
+    start = _linear_coefficients(terms, np.log(excess), errors * (1 + excess) / excess).coefficients
+    triangle = np.linalg.qr(_slope(terms @ start)[:, None] * terms / errors[:, None], mode="r")
+    units = np.linalg.inv(triangle)
+    numbers = [jnp.asarray(x, float) for x in (terms @ start, terms @ units, logs, errors)]
+    with jax.numpy_dtype_promotion("standard"):  # optax relies on it
+        change = _least_squares(*numbers)
+    coefficients = start + units @ np.asarray(change, float)
+    log_excess = terms @ coefficients
+    return _Solved(coefficients, np.logaddexp(0, log_excess), _slope(log_excess)[:, None] * terms)
+
+
+def _slope(log_excess: np.ndarray) -> np.ndarray:
+    return np.exp(log_excess - np.logaddexp(0, log_excess))
+
+
+@jax.jit
+def _least_squares(start: Array, terms: Array, logs: Array, errors: Array) -> Array:
+    """Change of the coefficients, (terms,), at which the squares of ln F are least, by L-BFGS."""
+
+    def cost(change):
+        return jnp.sum(((jax.nn.softplus(start + terms @ change) - logs) / errors) ** 2) / 2
+
+    solver = optax.lbfgs()
+
+    def unfinished(carry: Any):
+        _, _, gradient, iteration = carry
+        return (jnp.linalg.norm(gradient) > _SMALLEST_GRADIENT) & (iteration < _MAX_ITERATIONS)
+
+    def iterate(carry: Any) -> Any:
+        change, state, _, iteration = carry
+        value, gradient = optax.value_and_grad_from_state(cost)(change, state=state)
+        update, state = solver.update(gradient, state, change, value=value, grad=gradient, value_fn=cost)
+        return optax.apply_updates(change, update), state, gradient, iteration + 1
+
+    change = jnp.zeros(terms.shape[1], terms.dtype)
+    return jax.lax.while_loop(unfinished, iterate, (change, solver.init(change), change + jnp.inf, 0))[0]
+
+
+def finest(data: xr.Dataset) -> xr.Dataset:
+    return data.sortby("timestep").isel(timestep=0) if "timestep" in data.dims else data
+
+
+def table(data: xr.Dataset, names: list[str]) -> np.ndarray:
+    """Variables as columns, (points, names), ν before α."""
+    return np.stack([data[n].transpose("packing_fraction", "restitution").values.ravel() for n in names], axis=1)
+
+
+def require_enough(points: Points, fewest: int) -> None:
+    alphas, nus = (len(np.unique(x)) for x in (points.restitution, points.packing_fraction))
+    if len(points.place) < fewest or min(alphas, nus) < FEWEST_VALUES:
+        raise InputError(
+            f"a closure needs at least {fewest} points of status ok, at {FEWEST_VALUES} restitutions below 1 and "
+            f"{FEWEST_VALUES} packing fractions, and there are {len(points.place)} at {alphas} and {nus}."
+        )

@@ -1,0 +1,205 @@
+"""Dense flow as one law: friction and packing fraction as power laws of the inertial number, fitted to a map.
+
+Without friction between the grains, μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c: a packing of frictionless grains at the
+onset of flow still has a friction μ₀, from the anisotropy of its contacts.
+
+Source: GDR MiDi, Eur. Phys. J. E 14, 341 (2004); without friction P.-E. Peyneau and J.-N. Roux, Phys. Rev. E 78,
+011307 (2008), who find μ₀ ≈ 0.10 and exponents near 0.4 for spheres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+from scipy.optimize import curve_fit
+
+from jaxgran.maps.schema import require_map
+from jaxgran.model.flow import InputError, require_number
+from jaxgran.model.status import Status
+
+LARGEST_INERTIAL_NUMBER, SMALLEST_PACKING_FRACTION = 0.3, 0.7  # of a dense flow
+FEWEST_POINTS, FEWEST_PACKING_FRACTIONS = 4, 3  # for the three parameters of a law
+NEEDED = ("inertial_number", "inertial_number_stderr", "macroscopic_friction", "macroscopic_friction_stderr")
+"""Variables of a map that a friction law needs."""
+
+_EXPONENTS = (0.05, 4.0)
+_ROUNDS = 30  # of the effective variance, at most
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """A fitted law y = offset + coefficient · I^exponent.
+
+    ============  ======  ==========================================================
+    parameters    (3,)    offset, coefficient, exponent
+    covariance    (3, 3)  of the parameters, times χ² where that is above one;
+                          infinite where the points do not determine the exponent
+    chi_squared           reduced: per degree of freedom
+    points                number of points
+    span          (2,)    smallest and largest inertial number
+    ============  ======  ==========================================================
+    """
+
+    parameters: np.ndarray
+    covariance: np.ndarray
+    chi_squared: float
+    points: int
+    span: tuple[float, float]
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Standard errors of the parameters, (3,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def determined(self) -> bool:
+        """Whether the exponent is larger than its standard error, so that the parameters mean something."""
+        return bool(self.standard_errors[2] < self.parameters[2])
+
+    def __call__(self, inertial_number: np.ndarray) -> np.ndarray:
+        return _power(inertial_number, *self.parameters)
+
+
+@dataclass(frozen=True)
+class FrictionLaw:
+    """μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c of dense points: all of them, and those of each restitution.
+
+    ``packing_fraction`` has the coefficient −k. ``by_restitution`` holds the laws of the restitutions with enough
+    points.
+    """
+
+    friction: PowerLaw
+    packing_fraction: PowerLaw
+    by_restitution: Mapping[float, FrictionLaw] = field(default_factory=dict)
+
+
+def friction_law(
+    data: xr.Dataset,
+    largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
+    smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
+) -> FrictionLaw:
+    """Fit friction and packing fraction as power laws of the inertial number to the dense points of a map.
+
+    Least squares, in which the variance of a point is that of y plus that of I times the squared slope of the law: the
+    effective variance, found by repetition. Errors of μ and I count as independent.
+
+    =========================  ===============================  =====================================================
+    data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
+                                                                `_stderr`, and `status`; the shortest of several time
+                                                                steps is fitted
+    largest_inertial_number                                     of a dense point
+    smallest_packing_fraction                                   of a dense point: nearly elastic flows have a small I
+                                                                because they are hot, although they are not dense
+    returns                    FrictionLaw
+    raises                     ValueError                       fewer than four dense points with status ok, or at
+                                                                fewer than three packing fractions
+    =========================  ===============================  =====================================================
+    """
+    require_map(data, *NEEDED)
+    for name, limit in (
+        ("largest_inertial_number", largest_inertial_number),
+        ("smallest_packing_fraction", smallest_packing_fraction),
+    ):
+        require_number(name, limit, lambda x: ~np.isnan(x), "a number")
+    points = dense_points(data, largest_inertial_number, smallest_packing_fraction)
+    if not enough(points):
+        raise InputError(
+            f"a friction law needs at least {FEWEST_POINTS} points of status ok at {FEWEST_PACKING_FRACTIONS} packing "
+            f"fractions, with I <= {largest_inertial_number:g} and packing fraction >= {smallest_packing_fraction:g}, "
+            f"and this map has {points.sizes['point']} at {len(np.unique(points.packing_fraction))}."
+        )
+    alphas = points.restitution.values
+    parts = {float(alpha): points.isel(point=alphas == alpha) for alpha in np.unique(alphas)}
+    laws = {alpha: FrictionLaw(*_fits(part)) for alpha, part in parts.items() if enough(part)}
+    return FrictionLaw(*_fits(points), laws)
+
+
+def is_dense(
+    data: xr.Dataset,
+    largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
+    smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
+) -> xr.DataArray:
+    """Where a map has the points that :func:`friction_law` fits: dense, of status ok, and with errors."""
+    known = np.isfinite(data.macroscopic_friction)
+    known &= (data.inertial_number_stderr > 0) & (data.macroscopic_friction_stderr > 0)
+    dense = (data.inertial_number <= largest_inertial_number) & (data.packing_fraction >= smallest_packing_fraction)
+    return known & dense & (data.status == Status.ok if "status" in data else True)
+
+
+def dense_points(
+    data: xr.Dataset,
+    largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
+    smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
+) -> xr.Dataset:
+    """The points that :func:`friction_law` fits, along one dimension ``point``."""
+    if "timestep" in data.dims:
+        data = data.sortby("timestep").isel(timestep=0)
+    dense = is_dense(data, largest_inertial_number, smallest_packing_fraction)
+    points = data[list(NEEDED)].assign(dense=dense)
+    points = points.stack(point=("packing_fraction", "restitution"), create_index=False)
+    return points.isel(point=points.dense.values)
+
+
+def enough(points: xr.Dataset) -> bool:
+    """Whether dense points determine the three parameters of a law."""
+    fractions = len(np.unique(points.packing_fraction))
+    return points.sizes["point"] >= FEWEST_POINTS and fractions >= FEWEST_PACKING_FRACTIONS
+
+
+def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
+    number, number_error = points.inertial_number.values, points.inertial_number_stderr.values
+    friction, friction_error = points.macroscopic_friction.values, points.macroscopic_friction_stderr.values
+    fraction = points.packing_fraction.values
+    return (
+        _fit(number, friction, number_error, friction_error, sign=1.0),
+        _fit(number, fraction, number_error, np.zeros_like(fraction), sign=-1.0),
+    )
+
+
+def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float) -> PowerLaw:
+    """Return the law through points with errors in both coordinates, whose coefficient has a sign."""
+    low, high = ([-np.inf, 0.0, _EXPONENTS[0]], [np.inf, np.inf, _EXPONENTS[1]])
+    scale = x.max()  # of the inertial number, so that coefficient and offset are of one size
+    parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error
+
+    def law(number, offset, coefficient, exponent):
+        return _power(number, offset, sign * coefficient, exponent)
+
+    def slopes(number, _, coefficient, exponent):
+        power = number**exponent
+        return np.stack([np.ones_like(number), sign * power, sign * coefficient * power * np.log(number)], axis=-1)
+
+    found = True
+    for _ in range(_ROUNDS):
+        before, (_, coefficient, exponent) = parameters, parameters
+        slope = coefficient * exponent * (x / scale) ** (exponent - 1)
+        deviation = np.maximum(np.hypot(y_error, slope * x_error / scale), 1e-9)
+        try:
+            parameters, covariance = curve_fit(
+                law, x / scale, y, before, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes
+            )
+        except RuntimeError:  # it found no end, because the points do not determine the exponent
+            found = False
+            break
+        if np.allclose(parameters, before, rtol=1e-6):
+            break
+    chi_squared = np.sum(((y - law(x / scale, *parameters)) / deviation) ** 2) / max(1, len(x) - 3)
+    offset, coefficient, exponent = parameters
+    determined = found and coefficient > 0.0 and _EXPONENTS[0] * 1.01 < exponent < _EXPONENTS[1] * 0.99
+    coefficient = sign * coefficient * scale**-exponent  # of the law of x, not of x / scale
+    to_x = np.diag([1.0, sign * scale**-exponent, 1.0])
+    to_x[1, 2] = -coefficient * np.log(scale)
+    return PowerLaw(
+        parameters=np.array([offset, coefficient, exponent]),
+        covariance=max(1.0, chi_squared) * to_x @ covariance @ to_x.T if determined else np.diag(np.full(3, np.inf)),
+        chi_squared=float(chi_squared),
+        points=len(x),
+        span=(float(x.min()), float(x.max())),
+    )
+
+
+def _power(number: np.ndarray, offset: float, coefficient: float, exponent: float) -> np.ndarray:
+    return offset + coefficient * number**exponent

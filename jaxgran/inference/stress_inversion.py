@@ -1,0 +1,138 @@
+"""The restitution of grains from the stresses of their flow, through a closure."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxgran.inference.closure import Closure, broadcast, each, log_laws, of_type, require_closure, require_fraction
+from jaxgran.model.flow import require
+from jaxgran.theory.kinetic_theory import Scalar
+
+_GRID, _FINER = 33, 16  # restitutions at which a law is evaluated, and between two of them at which it is interpolated
+_REFINEMENTS = 10  # Gauss–Newton steps from the best of the grid
+
+
+class RestitutionEstimate(NamedTuple):
+    """A restitution found from stresses.
+
+    ===========  ===========================================================================================
+    restitution  within the range of the closure
+    stderr       root mean square distance of α from the estimate, over the range, weighted by the likelihood
+                 exp(−χ²/2): the usual standard error at one sharp minimum, and honest at a flat or a second one
+    chi_squared  of pressure and friction about the closure, with one degree of freedom inside the range
+    determined   the standard error is smaller than that of a guess, the range over √12; where not, the stresses
+                 hardly depend on the restitution there, as in dense flow of α < 0.6
+    ===========  ===========================================================================================
+    """
+
+    restitution: Float[Array, "*flows"]
+    stderr: Float[Array, "*flows"]
+    chi_squared: Float[Array, "*flows"]
+    determined: Bool[Array, "*flows"]
+
+
+def restitution_from_stresses(
+    closure: Closure,
+    packing_fraction: Scalar,
+    pressure: Scalar,
+    shear_stress: Scalar,
+    pressure_stderr: Scalar = 0.0,
+    shear_stress_stderr: Scalar = 0.0,
+    correlation: Scalar = 0.0,
+) -> RestitutionEstimate:
+    """Estimate the restitution of a flow from its stresses alone.
+
+    Least squares of the logarithms of pressure and friction over α within the range of the closure, weighted by the
+    covariance of the measurement plus that of the closure there: the best of a grid, refined by Gauss–Newton.
+
+    ===================  ===================  =====================================================================
+    closure              Closure
+    packing_fraction     (*flows)             0 < ν ≤ 0.83
+    pressure             (*flows)             total, in units of m = σ = γ̇ = 1
+    shear_stress         (*flows)             the same, positive
+    pressure_stderr      (*flows)             standard errors, in the same units
+    shear_stress_stderr  (*flows)
+    correlation          (*flows)             of the two errors, −1 to 1; it is near 0.95 where both are averages of
+                                              one run, and then friction, their quotient, is known far better
+    returns              RestitutionEstimate  the shapes broadcast
+    raises               InputError           a number is outside its range
+    ===================  ===================  =====================================================================
+    """
+    require_closure(closure)
+    require_fraction(packing_fraction)
+    for name, value in (("pressure", pressure), ("shear_stress", shear_stress)):
+        require(name, value, lambda x: (x > 0) & np.isfinite(x), "positive numbers")
+    for name, value in (("pressure_stderr", pressure_stderr), ("shear_stress_stderr", shear_stress_stderr)):
+        require(name, value, lambda x: (x >= 0) & np.isfinite(x), "numbers of at least 0")
+    require("correlation", correlation, lambda x: (x >= -1) & (x <= 1), "between -1 and 1")
+    numbers = broadcast(
+        packing_fraction=packing_fraction,
+        pressure=pressure,
+        shear_stress=shear_stress,
+        pressure_stderr=pressure_stderr,
+        shear_stress_stderr=shear_stress_stderr,
+        correlation=correlation,
+    )
+    return _estimates(closure, *numbers)
+
+
+@jax.jit
+def _estimates(closure: Closure, *numbers: Array) -> RestitutionEstimate:
+    return each(partial(estimate_restitution, closure), *numbers)
+
+
+def estimate_restitution(
+    closure: Closure,
+    nu: Array,
+    pressure: Array,
+    shear_stress: Array,
+    pressure_stderr: Array,
+    shear_stress_stderr: Array,
+    correlation: Array,
+) -> RestitutionEstimate:
+    closure = of_type(closure, nu.dtype)
+    first, second = pressure_stderr / pressure, shear_stress_stderr / shear_stress
+    common = correlation * first * second
+    noise = jnp.stack(  # of ln P and ln τ − ln P
+        [first**2, common - first**2, common - first**2, first**2 + second**2 - 2 * common]
+    ).reshape(2, 2)
+    observed = jnp.log(jnp.stack([pressure, shear_stress / pressure]))
+
+    def misfit(alpha):
+        logs, variances = log_laws(closure, alpha, nu)
+        return observed - logs[:2], noise + jnp.diag(variances[:2])
+
+    def refined(_, carry):
+        """One step, and at its start χ² and the error of α that its curvature means."""
+        alpha = carry[0]
+        (residual, covariance), (change, _) = jax.jvp(misfit, (alpha,), (jnp.ones_like(alpha),))
+        weights = jnp.linalg.solve(covariance, jnp.stack([residual, -change], axis=1))
+        curvature = jnp.maximum(-change @ weights[:, 1], jnp.finfo(alpha.dtype).tiny)
+        moved = alpha - change @ weights[:, 0] / curvature
+        moved = jnp.clip(moved, jnp.maximum(low, start - cell), jnp.minimum(high, start + cell))
+        return moved, residual @ weights[:, 0], curvature**-0.5
+
+    low, high = closure.restitution_range
+    cell = (high - low) / (_GRID - 1)
+    grid = low + cell * jnp.arange(_GRID, dtype=nu.dtype)
+    residuals, covariances = jax.vmap(misfit)(grid)
+    start = grid[jnp.argmin(jax.vmap(_weighted_square)(residuals, covariances))]
+    alpha, chi_squared, sharp = jax.lax.fori_loop(0, _REFINEMENTS, refined, (start, start, start))
+
+    fine = low + cell / _FINER * jnp.arange((_GRID - 1) * _FINER + 1, dtype=nu.dtype)
+    between = jax.vmap(lambda y: jnp.interp(fine, grid, y), in_axes=-1, out_axes=-1)
+    squares = jax.vmap(_weighted_square)(between(residuals), between(covariances.reshape(-1, 4)).reshape(-1, 2, 2))
+    likelihood = jax.nn.softmax(-squares / 2)
+    spread = jnp.sqrt(likelihood @ (fine - alpha) ** 2)
+    stderr = jnp.where(sharp < 2 * cell / _FINER, jnp.maximum(sharp, spread), spread)
+    return RestitutionEstimate(alpha, stderr, chi_squared, stderr < (high - low) / 12**0.5)
+
+
+def _weighted_square(residual: Array, covariance: Array) -> Array:
+    return residual @ jnp.linalg.solve(covariance, residual)

@@ -1,0 +1,107 @@
+"""Files that are there whole or not at all, and arrays on disc that know whether they are damaged.
+
+A file is written under a temporary name in the folder where it belongs, synced, and renamed to its place. A process
+that is killed leaves the old file or the new one, never half of one.
+
+Arrays are kept as HDF5 with the SHA-256 of the whole behind it, which other readers pass over. A file is put together
+and taken apart in memory: a full disc is then an ``OSError`` with a number, and the HDF5 library, which does not
+always survive it, never sees a damaged one. Dimensions have no names: naming them would take ten times as long as all
+the rest.
+"""
+
+import hashlib
+import io
+import json
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from jaxgran.model.flow import InputError, shown
+
+_DIGEST = hashlib.sha256().digest_size
+_LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside a file are longer
+
+
+class Damaged(Exception):
+    """A file that cannot be read, or whose content is not what was written."""
+
+
+def require_place(path: Path, option: str, ending: str) -> None:
+    """Raise an InputError that says what is accepted, unless a file of that ending can be written to ``path``."""
+    if path.suffix != ending:
+        raise InputError(f"{option} must be a file name that ends in {ending}, not {shown(str(path))}.")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise InputError(f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {shown(path.name)}.")
+    if os.path.isdir(path):
+        raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.")
+    if not os.path.isdir(path.parent):
+        raise InputError(f"{option} must be in a folder that exists, and {shown(str(path.parent))} does not.")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists():
+            with path.open("ab"):
+                pass
+    except OSError as error:
+        raise InputError(
+            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
+        ) from None
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """The name of a temporary file beside ``path``, to be written, that takes its place if nothing goes wrong."""
+    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        if os.name == "posix":  # elsewhere a folder cannot be opened
+            _sync(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
+    """Write named arrays, and what JSON can hold about them, as an HDF5 file with a checksum of it all."""
+    memory = io.BytesIO()
+    with h5py.File(memory, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)
+        file.attrs["names"] = json.dumps(list(arrays))
+        file.attrs["about"] = json.dumps(about, sort_keys=True)
+    content = memory.getvalue()
+    with replaced(path) as temporary:
+        temporary.write_bytes(content + hashlib.sha256(content).digest())
+
+
+def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
+    """What ``write_arrays`` wrote; raises ``Damaged`` where that is not what the file holds."""
+    try:
+        whole = path.read_bytes()
+    except OSError as error:
+        raise Damaged(f"{path.name} cannot be read: {error}") from error
+    content = whole[:-_DIGEST]
+    if hashlib.sha256(content).digest() != whole[-_DIGEST:]:
+        raise Damaged(f"{path.name} is not what was written")
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
+            return arrays, json.loads(str(file.attrs["about"]))
+    except (OSError, KeyError, ValueError) as error:  # whole, and yet none of ours
+        raise Damaged(f"{path.name} cannot be read: {error}") from error
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,283 @@
+"""Trajectories: a flow frame by frame in a GSD file, which OVITO, freud and HOOMD-blue read, and which is read back.
+
+GSD keeps single precision, centres its box at the origin, and spans it by (L, 0) and (tilt·L, L): the lattice of the
+sheared cell. What single precision would lose stands beside it, so that a state comes back bit for bit.
+
+=============================  ==============  ======  =================================================================
+chunk                          shape           unit    meaning
+=============================  ==============  ======  =================================================================
+configuration/step             (1,)            –       time steps since the first frame
+configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
+particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
+particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; the laboratory's
+                                                       are c + γ̇ y x̂, up to the velocity of the origin
+particles/diameter, /mass      (grains,)       σ, m    diameters and masses
+bonds/group                    (bonds, 2)      –       pairs of grains that push each other in the step to come
+log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt
+log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
+log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
+log/particles/exact_radius     (grains,)       σ       radii; in the first frame alone, as the next
+log/particles/exact_mass       (grains,)       m       masses
+log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
+log/jaxgran/strain             (1,)            –       strain since the first frame
+log/jaxgran/timestep           (1,)            1/γ̇     dt
+log/jaxgran/shear_rate         (1,)            1/t     γ̇
+log/jaxgran/restitution        (1,)            –       α
+=============================  ==============  ======  =================================================================
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxgran.dynamics.plain import State
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.io.atomic import replaced, require_place
+from jaxgran.model.cell import centred, remap_tilt, wrap
+from jaxgran.model.flow import InputError, shown
+from jaxgran.model.grains import Grains
+
+_SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd refuse
+_NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
+_NEEDED = {"position": "positions", "velocity": "velocities"}
+_EXACT = "log/particles/exact_"
+_READ = (
+    *(f"configuration/{name}" for name in ("step", "dimensions", "box")),
+    *(f"particles/{name}" for name in ("N", "position", "velocity", "diameter", "mass")),
+    *(f"{_EXACT}{name}" for name in ("position", "velocity", "radius", "mass")),
+    *(f"log/jaxgran/{name}" for name in ("side", "tilt", *_NUMBERS)),
+)
+Chunks = dict[str, Any]  # arrays by name: what a file tells of a frame
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Trajectory:
+    """The states of a flow at the frames of a file, in the precision of the file, and the numbers of the flow.
+
+    ================  =========  =====  ============================================================
+    field             shape      unit   meaning
+    ================  =========  =====  ============================================================
+    state             State      –      states with a leading (frames,) axis, contacts yet to act
+    step              (frames,)  –      time steps since the first frame
+    strain            (frames,)  –      strain since the first frame
+    timestep          ()         1/γ̇    dt
+    shear_rate        ()         1/t    γ̇
+    restitution       ()         –      α
+    packing_fraction  ()         –      ν
+    ================  =========  =====  ============================================================
+
+    All are arrays of numpy, which keep double precision where JAX is in single. Strain, time step, shear rate and
+    restitution are NaN where the file of another program does not tell them.
+    """
+
+    state: State
+    step: Int[np.ndarray, " frames"]
+    strain: Float[np.ndarray, " frames"]
+    timestep: Float[np.ndarray, ""]
+    shear_rate: Float[np.ndarray, ""]
+    restitution: Float[np.ndarray, ""]
+    packing_fraction: Float[np.ndarray, ""]
+
+
+def check_trajectory(path: Path) -> None:
+    """Raise a ValueError in one sentence where a trajectory could not be written to ``path``."""
+    require_place(path, "trajectory", ".gsd")
+    if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library opens no others
+        raise InputError(f"trajectory must be a file name in UTF-8, not {shown(str(path))}.")
+
+
+def start_trajectory(path: Path, seen: Snapshot) -> None:
+    """Write the first frame of a trajectory, in place of any file that is there."""
+    with replaced(path) as temporary:
+        _write(temporary, "x", seen, 0)
+
+
+def append_frame(path: Path, seen: Snapshot, step: int) -> None:
+    """Add a frame to a trajectory that ``start_trajectory`` has begun.
+
+    Args:
+      path: GSD file.
+      seen: one snapshot of the flow.
+      step: time steps since the first frame.
+    """
+    _write(path, "r+", seen, step)
+
+
+def write_frame(path: Path, seen: Snapshot, step: int) -> None:
+    """Write a frame to a trajectory, which begins with that of step 0 and is whole after every one."""
+    if step == 0:
+        start_trajectory(path, seen)
+    else:
+        append_frame(path, seen, step)
+
+
+def _library() -> tuple[Any, Any]:
+    """The file layer and the HOOMD schema of the GSD library, loaded when a trajectory is first used."""
+    return import_module("gsd.fl"), import_module("gsd.hoomd")
+
+
+def _write(path: Path, mode: str, seen: Snapshot, step: int) -> None:
+    fl, hoomd = _library()
+    with fl.open(
+        str(path), mode, application="jaxgran", schema="hoomd", schema_version=_SCHEMA_VERSION
+    ) as file:  # closed after every frame, so that nothing waits in memory
+        hoomd.HOOMDTrajectory(file).append(_frame(seen, step))
+
+
+def _frame(seen: Snapshot, step: int):
+    """What a frame holds, for the GSD library."""
+    _, hoomd = _library()
+    state = jax.tree.map(np.asarray, seen.state)
+    side, tilt = state.side.item(), state.tilt.item()
+    impulses = np.asarray(seen.impulses)
+    loaded = np.flatnonzero(impulses > 0)
+    timestep, shear_rate = np.asarray(seen.timestep).item(), np.asarray(seen.shear_rate).item()
+    frame = hoomd.Frame()
+    frame.configuration.step = step
+    frame.configuration.dimensions = 2
+    frame.configuration.box = [side, side, 0, tilt, 0, 0]
+    frame.particles.N = len(state.positions)
+    frame.particles.position = _in_space(centred(state.positions, side, tilt))
+    frame.particles.velocity = _in_space(state.velocities)
+    frame.particles.diameter = 2 * state.grains.radii
+    frame.particles.mass = state.grains.masses
+    frame.bonds.N = len(loaded)
+    frame.bonds.types = ["contact"]
+    frame.bonds.typeid = np.zeros(len(loaded), np.uint32)
+    frame.bonds.group = np.stack([np.asarray(seen.contacts.i)[loaded], np.asarray(seen.contacts.j)[loaded]], axis=-1)
+    of_all_frames = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
+    of_grains = {"exact_position": state.positions, "exact_velocity": state.velocities, **of_all_frames}
+    of_flow = {
+        "side": state.side,
+        "tilt": state.tilt,
+        "strain": step * timestep * shear_rate,
+        "timestep": timestep,
+        "shear_rate": shear_rate,
+        "restitution": np.asarray(seen.restitution, np.float64),
+    }
+    frame.log = {
+        "bonds/force": np.asarray(impulses[loaded] / timestep, np.float64),
+        **{f"particles/{name}": np.array(x) for name, x in of_grains.items()},  # copies, which can be written to
+        **{f"jaxgran/{name}": np.array([x]) for name, x in of_flow.items()},
+    }
+    return frame
+
+
+def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grains 3"]:
+    return np.pad(vectors, ((0, 0), (0, 1)))
+
+
+def read_trajectory(path: str | os.PathLike) -> Trajectory:
+    """The trajectory in a GSD file, bit for bit that of the flow where jaxgran wrote it.
+
+    The file of another program is read too: it must hold a square two-dimensional cell, sheared or not, with positions
+    and velocities, which are taken for peculiar ones. Diameters and masses are one where it does not tell them.
+
+    Args:
+      path: GSD file.
+
+    Returns:
+      The states of all frames and the numbers of the flow.
+
+    Raises:
+      ValueError: there is no such file, or it is no such trajectory; the sentence says why.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise InputError(f"path must be a file name, not {shown(path)}.")
+    name = shown(os.fspath(path))
+    if not os.path.isfile(path):
+        raise InputError(f"there is no file {name}.")
+    try:
+        frames = list(_frames(os.fspath(path)))
+    except InputError as lack:
+        raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {lack}.") from None
+    except Exception as error:  # a torn file may fail in any way
+        why = shown(str(error)).strip("'\"").rstrip(".")
+        raise InputError(f"{name} is not a GSD file that can be read: {why}.") from None
+    steps, numbers, states = zip(*frames, strict=True)
+    state = jax.tree.map(lambda *x: np.stack(x), *states)
+    areas = np.sum(np.pi * state.grains.radii[0] ** 2, dtype=np.float64)
+    return Trajectory(
+        state,
+        np.array(steps),
+        np.array([one["strain"] for one in numbers]),
+        *(np.array(numbers[0][name]) for name in _NUMBERS[1:]),
+        packing_fraction=areas / np.asarray(state.side[0], np.float64) ** 2,
+    )
+
+
+def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
+    """Step, numbers and state of every frame; an InputError in a few words where there is something it lacks."""
+    fl, _ = _library()
+    with fl.open(path, "r") as file:
+        if file.schema != "hoomd":
+            raise InputError(f"its schema is {shown(file.schema)}, and must be hoomd")
+        if file.nframes == 0:
+            raise InputError("it has no frames")
+        first = _chunks(file, 0, {})
+        if "particles/position" in first and file.find_matching_chunk_names("particles/velocity"):
+            first.setdefault("particles/velocity", np.zeros_like(first["particles/position"]))  # at rest in the first
+        for k in range(file.nframes):
+            frame = _chunks(file, k, first)
+            lack = _lack(frame, first)
+            if lack:
+                raise InputError(f"in frame {k} {lack}")
+            numbers = {name: float(frame.get(f"log/jaxgran/{name}", [np.nan])[0]) for name in _NUMBERS}
+            yield int(frame.get("configuration/step", [0])[0]), numbers, _state(frame)
+
+
+def _chunks(file: Any, frame: int, first: Chunks) -> Chunks:
+    """What a file tells of a frame, which is what it tells of the first where it does not say otherwise."""
+    here = {name: file.read_chunk(frame=frame, name=name) for name in _READ if file.chunk_exists(frame, name)}
+    return {**first, **here}
+
+
+def _lack(frame: Chunks, first: Chunks) -> str:
+    """What a frame lacks to be a State, in words; empty if nothing."""
+    grains, box = _grains(frame), frame.get("configuration/box", np.ones(6))
+    known = {name: x for name, x in frame.items() if name.startswith("particles/") and name != "particles/N"}
+    conditions = (
+        (grains > 0, "there are no grains"),
+        (grains == _grains(first), "the number of grains is another"),
+        (frame.get("configuration/dimensions", [3])[0] == 2, "the cell has three dimensions"),
+        (box[0] == box[1] and box[0] > 0, "the cell is not a square"),
+        *((f"particles/{name}" in frame, f"there are no {words}") for name, words in _NEEDED.items()),
+        (all(len(x) == grains for x in known.values()), "some number is not told of every grain"),
+        (all(np.isfinite(x).all() for x in (box, *known.values())), "some number is not finite"),
+        *((np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive") for x in ("diameter", "mass")),
+    )
+    return next((words for holds, words in conditions if not holds), "")
+
+
+def _grains(frame: Chunks) -> int:
+    return int(frame.get("particles/N", [0])[0])
+
+
+def _state(frame: Chunks) -> State:
+    """The state of a frame: the exact one if it is there, else what the chunks of any program tell."""
+    grains = _grains(frame)
+    if f"{_EXACT}position" in frame:
+        radii, masses, positions, velocities = (
+            frame[f"{_EXACT}{name}"] for name in ("radius", "mass", "position", "velocity")
+        )
+        side, tilt = (frame[f"log/jaxgran/{name}"][0] for name in ("side", "tilt"))
+        if not len(radii) == len(masses) == len(positions) == len(velocities) == grains:
+            raise ValueError("its exact numbers are not those of its grains")
+    else:
+        ones = np.ones(grains, np.float32)
+        radii, masses = frame.get("particles/diameter", ones) / 2, frame.get("particles/mass", ones)
+        side, tilt = frame["configuration/box"][0], np.asarray(remap_tilt(jnp.asarray(frame["configuration/box"][3])))
+        corner = jnp.asarray(frame["particles/position"][:, :2] + side / 2)
+        positions = np.asarray(wrap(corner, jnp.asarray(side), jnp.asarray(tilt)))
+        velocities = frame["particles/velocity"][:, :2]
+    parts: dict[str, Any] = {"positions": positions, "velocities": velocities, "side": side, "tilt": tilt}
+    return State(Grains(radii, masses), **parts)

@@ -1,0 +1,56 @@
+"""Tasks on the workers of a Dask cluster that is already running: one on this machine, or one that Slurm started.
+
+The cluster replaces workers that die and repeats their tasks, and gives a task up whose workers have died too often.
+"""
+
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, TypeVar
+
+from jaxgran.maps.pool import Died
+from jaxgran.model.flow import InputError
+
+T = TypeVar("T")
+_PATIENCE = "10s"  # to find the scheduler
+
+
+def run_on_cluster(
+    address: str,
+    function: Callable[..., T],
+    tasks: Sequence[tuple],
+    configure: Callable[..., None],
+    arguments: tuple,
+) -> Generator[tuple[int, T | Died]]:
+    """Run a function on the arguments of every task on a cluster, and yield what is done as it is.
+
+    Args:
+      address: of the scheduler, such as ``tcp://127.0.0.1:8786``.
+      function, tasks: as for ``pool.run_tasks``; the first tasks are the first to start.
+      configure, arguments: called on the worker before every task.
+
+    Raises:
+      ValueError: Dask is not installed, or nobody answers at the address.
+    """
+    try:
+        from dask.distributed import Client, KilledWorker, as_completed
+    except ImportError:
+        raise InputError("a scheduler needs Dask: pip install 'jaxgran[cluster]'.") from None
+    try:
+        client = Client(address, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}.") from None
+    with client:
+        futures = {
+            client.submit(_configured, configure, arguments, function, task, pure=False, priority=-number): number
+            for number, task in enumerate(tasks)
+        }
+        for future in as_completed(list(futures), loop=client.loop):
+            try:
+                yield futures[future], future.result()
+            except KilledWorker:
+                yield futures[future], Died("a batch has killed its workers too often")
+            future.release()
+
+
+def _configured(configure: Callable[..., None], arguments: tuple, function: Callable[..., Any], task: tuple) -> Any:
+    configure(*arguments)
+    return function(*task)

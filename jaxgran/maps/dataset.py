@@ -1,0 +1,276 @@
+"""The dataset of a ratio map: observables with errors on the grid, statuses, and every parameter of the run."""
+
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, fields
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import jax
+import numpy as np
+import xarray as xr
+
+from jaxgran.io.atomic import replaced, require_place
+from jaxgran.maps.schema import RATIO, what_lacks
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.flow import InputError, shown
+from jaxgran.model.status import Status
+from jaxgran.sampling.batch import stack
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.sampling.sample import Sample, correlation_strains, estimates
+from jaxgran.theory.kinetic_theory import gaussian_moments
+
+_THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
+NOT_RUN = -1
+Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
+THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
+_TENSOR_AXES = ("axis_a", "axis_b")
+_PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
+_AXES = {
+    "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
+    "packing_fraction": {"long_name": "packing fraction", "units": "1"},
+    "restitution": {"long_name": "restitution", "units": "1"},
+}
+
+
+class Replica(NamedTuple):
+    """Result of one replica: its sample, its worst status, and the strain that was sheared before the sample."""
+
+    sample: Sample
+    status: int
+    strain: float
+
+
+def map_dataset(
+    settings: MapSettings, results: Mapping[Key, Replica], run: Mapping[str, str | float | int]
+) -> xr.Dataset:
+    """The dataset of the replicas that are done; points without any are NaN with the status ``not_run``.
+
+    Args:
+      settings: the map.
+      results: replicas by point (in the order of the flows of the settings) and seed.
+      run: what else to store as attributes: command, wall time, speed.
+
+    Returns:
+      Observables, their standard errors and statuses on (packing_fraction, restitution), by seed with the dimension
+      ``seed`` behind these, and what kinetic theory predicts for those in ``THEORY``. Beside every average stands the
+      strain that counts as one independent sample of it. Where the time step of the settings is a list, ``timestep`` is
+      the first dimension of all.
+    """
+    point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
+    count, seeds = math.prod(shape), settings.seeds
+    values = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
+    errors = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
+    correlated = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
+    correlation = {name: np.full(count, np.nan) for name in correlated}
+    by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
+    status = np.full((count, seeds), NOT_RUN, np.int8)
+    strain, sampled, used = np.full((3, count, seeds), np.nan)
+    for (point, seed), replica in results.items():
+        status[point, seed], strain[point, seed] = replica.status, replica.strain
+        tally = replica.sample.tally
+        sampled[point, seed] = tally.duration.sum() * replica.sample.shear_rate
+        used[point, seed] = sampled[point, seed] / max(tally.steps.sum(), 1)
+        for name, value in replica.sample.averages.items():
+            by_seed[name][point, seed] = value
+    for point in range(count):
+        finite = [results[point, s] for s in range(seeds) if NOT_RUN < status[point, s] < Status.nonfinite]
+        if finite:
+            samples = [replica.sample for replica in finite]
+            value, error = estimates(samples)
+            for name in OBSERVABLES:
+                values[name][point], errors[name][point] = value[name], error[name]
+            independent = correlation_strains(samples)
+            for name in correlated:
+                correlation[name][point] = independent[name]
+
+    variables = {}
+    for name, (long_name, units) in OBSERVABLES.items():
+        tensor_dims = _TENSOR_AXES if name in TENSORS else ()
+        dims = point_dims + tensor_dims
+        attrs = {"long_name": long_name, "units": units}
+        variables[name] = (dims, values[name].reshape(*shape, *_tail(name)), attrs)
+        spread = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
+        about = {"long_name": f"{spread} of {long_name}", "units": units}
+        variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
+        if name in correlation:
+            about = {"long_name": f"strain of one independent sample of {long_name}", "units": "1"}
+            variables[f"{name}_correlation_strain"] = (dims, correlation[name].reshape(shape), about)
+        seed_dims = (*point_dims, "seed", *tensor_dims)
+        variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
+    predictions = _predictions(settings)
+    for name in THEORY:
+        long_name, units = OBSERVABLES[name]
+        about = {"long_name": f"kinetic theory's prediction of the {long_name}", "units": units, "theory": _THEORY_NAME}
+        variables[f"theory_{name}"] = (point_dims, predictions[name].reshape(shape), about)
+    flags = {
+        "long_name": "worst status of a point",
+        "flag_values": np.array([NOT_RUN, *Status], np.int8),
+        "flag_meanings": " ".join(["not_run", *(s.name for s in Status)]),
+    }
+    variables["status"] = (point_dims, _worst(status).reshape(shape), flags)
+    variables["status_by_seed"] = (
+        (*point_dims, "seed"),
+        status.reshape(*shape, seeds),
+        {**flags, "long_name": "status"},
+    )
+    variables["equilibration_strain_by_seed"] = (
+        (*point_dims, "seed"),
+        strain.reshape(*shape, seeds),
+        {"long_name": "strain sheared before the sample", "units": "1"},
+    )
+    variables["timestep_by_seed"] = (
+        (*point_dims, "seed"),
+        used.reshape(*shape, seeds),
+        {
+            "long_name": "time step of the sample, shorter than asked for where a replica was retried",
+            "units": "1 / shear rate",
+        },
+    )
+    variables["strain_by_seed"] = (
+        (*point_dims, "seed"),
+        sampled.reshape(*shape, seeds),
+        {"long_name": "sampled strain", "units": "1"},
+    )
+    coordinates = {
+        **{name: (name, list(values), _AXES[name]) for name, values in settings.axes.items()},
+        "seed": ("seed", np.arange(seeds), {"long_name": "seed of the random numbers"}),
+        "axis_a": ("axis_a", ["x", "y"], {"long_name": "direction of the centre-to-centre vector"}),
+        "axis_b": ("axis_b", ["x", "y"], {"long_name": "direction of the force"}),
+    }
+    return xr.Dataset(variables, coordinates, {**_attributes(settings), **run})
+
+
+def check_output(path: Path) -> None:
+    """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
+    require_place(path, "output", ".nc")
+    for file in (path.with_name(f"{path.stem}_{name}.png") for name in _PICTURES):
+        if os.path.isdir(file):
+            raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    if unfinished.exists() and not unfinished.is_dir():
+        raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")
+
+
+def write_dataset(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
+    path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
+    content = BytesIO()
+    data.to_netcdf(content, engine="h5netcdf")
+    with replaced(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """Read a dataset that ``write_dataset`` wrote; ValueError in one sentence where it is not one."""
+    if not os.path.isfile(path):
+        raise InputError(f"there is no file {shown(str(path))}.")
+    try:
+        with h5py.File(path, "r") as file:  # h5netcdf complains a second time about what it could not open
+            file.attrs.get("_nc3_strict")
+        data = xr.load_dataset(path, engine="h5netcdf")
+    except Exception as error:  # a torn file may fail in any way
+        why = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
+    lack = what_lacks(data, *RATIO, "status")
+    if lack:
+        raise InputError(f"{shown(str(path))} is not a ratio map: {lack}.")
+    return data
+
+
+def choices_of(data: xr.Dataset) -> dict[str, Any]:
+    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them."""
+    chosen: dict[str, Any] = {}
+    try:
+        for field in fields(MapSettings):
+            if field.name in data.dims:
+                chosen[field.name] = tuple(data[field.name].values.tolist())
+            elif field.name in data.attrs:
+                chosen[field.name] = np.asarray(data.attrs[field.name]).tolist()
+            elif field.name not in ("strain", "error"):  # one is there in place of the other
+                raise KeyError(field.name)
+        chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
+        return chosen | {
+            name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")
+        }
+    except KeyError as missing:
+        raise InputError(f"this dataset does not tell the {missing.args[0]} of its map.") from None
+
+
+def differences(data: xr.Dataset, settings: MapSettings) -> list[str]:
+    """What of the versions, the device and the precision of a dataset is other than here, in words."""
+    here = _attributes(settings)
+    names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
+    return [
+        f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"
+        for name in names
+        if name in data.attrs and data.attrs[name] != here[name]
+    ]
+
+
+def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
+    """Kinetic theory's steady shear at every point; NaN where it has none, as at α = 1."""
+    flows = stack(settings.flows())
+    numbers = flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity
+    theory = jax.vmap(gaussian_moments)(*numbers)
+    with np.errstate(invalid="ignore"):
+        values = {name: np.asarray(getattr(theory, name)) for name in THEORY}
+        return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
+
+
+def commit() -> str:
+    """The commit of the checkout that this package runs from, empty where it is none."""
+    folder = Path(__file__).parents[2]
+    if not (folder / ".git").exists():
+        return ""
+    with suppress(OSError):
+        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    return ""
+
+
+def _tail(name: str) -> tuple[int, ...]:
+    return (2, 2) if name in TENSORS else ()
+
+
+def _worst(status: np.ndarray) -> np.ndarray:
+    """Worst status over the seeds of each point; not run where a seed is missing and no other is worse than ok."""
+    worst = status.max(axis=1)
+    return np.where((status.min(axis=1) == NOT_RUN) & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
+
+
+def _attributes(settings: MapSettings) -> dict[str, Any]:
+    """Every parameter of the run, in types that NetCDF can hold."""
+    parameters = asdict(settings)
+    equilibrate, error = parameters.pop("equilibrate"), parameters.pop("error")
+    if error is not None:
+        parameters["error"] = error
+        del parameters["strain"]  # every seed has its own
+    flow = settings.flows()[0]
+    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
+    device = jax.devices()[0]
+    return {
+        "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
+        "Conventions": "CF-1.11",
+        **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
+        "equilibrate": "until steady" if equilibrate is None else equilibrate,
+        "timestep_unit": "1 / shear rate",
+        "strain_meaning": "sampled strain of each seed; where an error is given, see strain_by_seed",
+        "shear_rate": flow.shear_rate,
+        "polydispersity": flow.polydispersity,
+        "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
+        "max_iterations": flow.max_iterations,
+        "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
+        "device": f"{device.platform}: {device.device_kind}",
+        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "commit": commit(),
+        **{f"version_{name.replace('-', '_')}": version(name) for name in packages},
+    }

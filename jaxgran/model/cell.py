@@ -1,0 +1,87 @@
+"""The sheared periodic cell (Lees–Edwards): a square of side L whose image rows slide along x.
+
+The lattice vectors are (L, 0) and (tilt·L, L), with the tilt in [−½, ½): shearing by a whole period gives the
+same lattice, so the tilt is only ever known up to an integer. Velocities are peculiar (SLLOD): the same for all
+images of a grain; the image's velocity jump enters through γ̇·y of the separation.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
+    """Side L of the square cell in which the discs have the given packing fraction.
+
+    Examples:
+      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))  # four discs of diameter one, each in a square of its own
+      2.0
+    """
+    return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
+
+
+def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
+    """The same lattice with its tilt in [−½, ½).
+
+    Examples:
+      >>> float(remap_tilt(jnp.asarray(0.75)))
+      -0.25
+    """
+    return tilt - jnp.floor(tilt + 0.5)
+
+
+def displacement(
+    to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array
+) -> Float[Array, "*n 2"]:
+    """Minimum-image separation ``to − origin``; exact for separations shorter than half the side.
+
+    Examples:
+      The image below a grain at the top of a cell of side 10 has slid by a quarter of the side:
+
+      >>> top, bottom = jnp.array([0.5, 9.5]), jnp.array([0.5, 0.5])
+      >>> displacement(top, bottom, jnp.asarray(10.0), jnp.asarray(0.25)).tolist()
+      [-2.5, -1.0]
+    """
+    d = to - origin
+    rows = jnp.round(d[..., 1] / side)
+    x = d[..., 0] - rows * tilt * side
+    return jnp.stack([x - side * jnp.round(x / side), d[..., 1] - rows * side], axis=-1)
+
+
+def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
+    """The images of the positions with x and y in [0, L)."""
+    rows = jnp.floor(positions[:, 1] / side)
+    rows = jnp.where(positions[:, 1] - rows * side >= side, rows + 1, rows)  # a tiny negative y plus L rounds to L
+    x = positions[:, 0] - rows * tilt * side
+    x = x - side * jnp.floor(x / side)
+    return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(positions[:, 1] - rows * side, 0)], axis=-1)
+
+
+def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:
+    """The vectors with strain·y added to x."""
+    return jnp.stack([vectors[..., 0] + strain * vectors[..., 1], vectors[..., 1]], axis=-1)
+
+
+def relative_velocity(
+    velocities: Float[Array, "grains 2"],
+    i: Array,
+    j: Array,
+    separations: Float[Array, "pairs 2"],
+    shear_rate: float | Array,
+) -> Float[Array, "pairs 2"]:
+    """Relative velocity of grain i seen from (the image of) grain j in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
+    peculiar = velocities[i] - velocities[j]
+    return jnp.stack([peculiar[:, 0] + shear_rate * separations[:, 1], peculiar[:, 1]], axis=-1)
+
+
+def minimum_image(separations: Float[np.ndarray, "n 2"], side: float, tilt: float) -> Float[np.ndarray, "n 2"]:
+    """``cell.displacement`` of separations in NumPy: exact where they are shorter than half the side."""
+    rows = np.round(separations[:, 1] / side)
+    x = separations[:, 0] - rows * tilt * side
+    return np.stack([x - side * np.round(x / side), separations[:, 1] - rows * side], axis=-1)
+
+
+def centred(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "grains 2"]:
+    """The images of positions in [0, L) that lie in the sheared cell around the origin, the old centre of the cell."""
+    x, y = (positions - side / 2).T
+    return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)

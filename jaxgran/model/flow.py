@@ -1,0 +1,231 @@
+"""ShearFlow: the parameters of one simple shear flow, with their units and accepted ranges."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields
+from reprlib import Repr
+from typing import Any, Literal, get_args
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from jaxgran.model.display import Row, methods
+
+Activation = Literal["midpoint", "touching"]
+Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
+
+MAX_PACKING_FRACTION = 0.83
+MIN_GRAINS, MAX_GRAINS = 16, 10**7  # more would need some 20 GB
+MAX_REPLICAS = 10**6  # of a map
+MAX_STEPS = 2**31 - 1  # of a sample: they are counted in an int32
+SHORTEST_TIMESTEP = 1e-8  # in 1/shear_rate: the longest block of a run has fewer steps than MAX_STEPS
+
+
+class InputError(ValueError):
+    """A mistake in what a user gave; the message is one sentence that says what is accepted."""
+
+
+_STATIC = {"static": True}
+
+
+_UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
+
+
+def _rows(flow: "ShearFlow") -> list[Row]:
+    return [Row(name, getattr(flow, name), _UNITS.get(name, "")) for name in flow.__dataclass_fields__]
+
+
+@dataclass(frozen=True)
+class ShearFlow:
+    """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
+
+    Units: length in mean grain diameters σ, mass in masses m of a grain of diameter σ. ``grains``,
+    ``activation`` and ``solver`` are static; all else is traced, so that a change recompiles nothing and a
+    batch of flows is one ``ShearFlow`` whose numbers carry a leading ``(replicas,)`` axis.
+
+    ================  =================  ===============================================================
+    field             unit               meaning
+    ================  =================  ===============================================================
+    grains            –                  number of discs N, 16 to 1e7
+    restitution       –                  α in [0, 1], ratio of normal velocities after and before
+    packing_fraction  –                  ν in (0, 0.83], area of the grains over the area of the cell
+    timestep          1/shear_rate = 1   dt, at most 0.1
+    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where time has any unit, see ``cooling``
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; unused with grains of one's own
+    tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
+    max_iterations    –                  cap of one contact solve
+    activation        –                  "midpoint": contact if half a step of free flight overlaps;
+                                         "touching": contact if the grains overlap
+    relaxation        –                  ω in (0, 2) of the Jacobi methods
+    solver            –                  projected method of the contact solve, see ``methods``; with the default, a
+                                         processor may solve by the machine code of ``native``
+    ================  =================  ===============================================================
+
+    Raises:
+      InputError: (a ValueError) a number is outside its range; traced numbers are not judged.
+    """
+
+    grains: int = field(metadata=_STATIC)
+    restitution: float | jax.Array
+    packing_fraction: float | jax.Array
+    timestep: float | jax.Array
+    shear_rate: float | jax.Array = 1.0
+    polydispersity: float | jax.Array = 0.26
+    tolerance: float | jax.Array = 1e-4
+    max_iterations: int | jax.Array = 5000
+    relaxation: float | jax.Array = 1.8
+    activation: Activation = field(default="midpoint", metadata=_STATIC)
+    solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
+
+    __repr__, _repr_html_ = methods("ShearFlow", _rows)
+
+    def __post_init__(self):
+        require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
+        for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
+            value = getattr(self, name)
+            if not isinstance(value, str) or value not in allowed:
+                raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")
+        for name, (accepts, words) in _RANGES.items():
+            require(name, getattr(self, name), accepts, words)
+        shapes = sorted({np.shape(getattr(self, name)) for name in _RANGES} - {()})
+        if len(shapes) > 1:
+            raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {shown(shapes)}.")
+        timestep, shear_rate = _known(self.timestep), _known(self.shear_rate)
+        with np.errstate(over="ignore"):
+            too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
+        if too_long:
+            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {shown(self.timestep)}.")
+
+    @property
+    def activation_fraction(self) -> float:
+        """θ: the share of a step of free flight over which a pair must overlap to be a contact."""
+        return 0.5 if self.activation == "midpoint" else 0.0
+
+
+_TRACED, _FIXED = (
+    tuple(f.name for f in fields(ShearFlow) if bool(f.metadata.get("static")) is static) for static in (False, True)
+)
+
+
+def _unflatten(fixed: tuple, traced: Iterable) -> ShearFlow:
+    """A flow of any leaves, not judged: they may be derivatives, axes or placeholders."""
+    flow = object.__new__(ShearFlow)
+    for name, value in zip(_FIXED + _TRACED, (*fixed, *traced), strict=True):
+        object.__setattr__(flow, name, value)
+    return flow
+
+
+jax.tree_util.register_pytree_with_keys(
+    ShearFlow,
+    lambda flow: (
+        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED],
+        tuple(getattr(flow, name) for name in _FIXED),
+    ),
+    _unflatten,
+)
+
+_RANGES = {
+    "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
+    "packing_fraction": (
+        lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION),
+        f"above 0 and at most {MAX_PACKING_FRACTION}",
+    ),
+    "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
+    "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
+    "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
+    "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
+    "relaxation": (lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded"),
+    "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), "a whole number of at least 1"),
+}
+
+
+def _known(value: Any) -> np.ndarray | None:
+    """The value as an array, of numbers if it is a number or an array of them; None while it is traced."""
+    if isinstance(value, Tracer):
+        return None
+    key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
+    number = isinstance(value, (bool, int, float, np.generic, np.ndarray, jax.Array)) and not key
+    number = number and not isinstance(value, np.ma.MaskedArray)  # whose values need not mean anything
+    return np.asarray(value if number else None)
+
+
+def two_digits(value: float, up: bool) -> str:
+    """A positive number as 1.2e-03, rounded to the side of a limit on which it is still accepted."""
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
+
+
+_BRIEF = Repr()
+_BRIEF.maxother = _BRIEF.maxstring = 100
+
+
+def shown(value: Any) -> str:
+    """A value as one short line, for a sentence."""
+    try:
+        return " ".join(_BRIEF.repr(value).split())
+    except ValueError:  # of a whole number with thousands of digits
+        return f"this {type(value).__name__}"
+
+
+def require(name: str, value, accepts, words: str) -> None:
+    """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
+    known = _known(value)
+    if known is None:
+        return
+    if known.dtype.kind not in "iuf" or known.size == 0 or not np.all(accepts(known)):
+        raise InputError(f"{name} must be {words}, not {shown(value)}.")
+
+
+def listed(values: Any) -> Any:
+    """A list of numbers as the array it stands for; anything else, to be judged, as it is."""
+    numbers = isinstance(values, (list, tuple)) and all(
+        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
+        for x in values
+    )
+    return np.asarray(values, float) if numbers else values
+
+
+def require_number(name: str, value, accepts, words: str) -> None:
+    """The same for what must be a single number."""
+    require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
+
+
+def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
+    """Raise an InputError that says what is accepted, and why not more, unless the value is such a whole number."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} must be a whole number of at least {least}, not {shown(value)}.")
+    if value > most:
+        raise InputError(f"{name} must be at most {most}, {why}, not {shown(value)}.")
+
+
+def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
+    """Raise an InputError unless a strain is at least a time step for each part, and no more than can be counted."""
+    require_sheared(flow)
+    require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
+        step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
+        least, most = parts * step, MAX_STEPS * step
+        require("strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}")
+        require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
+
+
+def require_sheared(flow: ShearFlow) -> None:
+    """Raise an InputError where the flow is not sheared, for what counts in strain."""
+    words = "above 0 where strain is counted (for a flow without shear there is cooling)"
+    require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
+
+
+def require_flow(flow: Any) -> None:
+    """Raise an InputError unless this is one ShearFlow, not a batch."""
+    if not isinstance(flow, ShearFlow):
+        raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
+    if any(np.ndim(getattr(flow, name)) for name in _TRACED):
+        raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")
+
+
+def require_key(key: Any) -> None:
+    """Raise an InputError unless this is one random key of JAX."""
+    typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
+    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
+    if not typed and not raw:
+        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")

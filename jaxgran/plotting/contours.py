@@ -1,0 +1,209 @@
+"""Contours over the plane of 1 − α and ν: interpolation, levels, labels that keep clear, and the excess on top.
+
+A quantity is interpolated bilinearly between the grid points of a map. A cell with a corner that has no value is
+hatched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.path import Path as MplPath
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import StrMethodFormatter
+
+from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
+
+EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
+"""Contour values of the excess of the force ratio over one, those of Figure 2."""
+
+_EXCESS_COLOUR = "#00803c"
+_LINEAR_BELOW = 0.01  # excess under which its contour variable turns from logarithmic to linear
+_APART = 28.0  # points between the middles of two labels, a little more than the length of one
+_SUBDIVISIONS = 12  # steps of the bilinear interpolation between neighbouring grid points
+_DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
+_CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
+
+
+# ----------------------------------------------------------------------------------------------- plane
+
+
+def refined_axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Return 1 − α and ν at the places of an interpolated field."""
+    axes = 1.0 - data.restitution.values, data.packing_fraction.values
+    x, y = (_refinement(len(axis)) @ axis for axis in axes)
+    return x, y
+
+
+def interpolated(field: np.ndarray) -> np.ma.MaskedArray:
+    """Return the bilinear refinement of a field, masked where a missing point would contribute."""
+    rows, columns = (_refinement(count) for count in field.shape)
+    missing = ~np.isfinite(field)
+    values = rows @ np.where(missing, 0.0, field) @ columns.T
+    return np.ma.masked_array(values, mask=rows @ missing @ columns.T > 0.0)
+
+
+def _refinement(count: int) -> np.ndarray:
+    """Return the matrix (fine, count) of linear interpolation onto a subdivided axis."""
+    position = np.linspace(0.0, count - 1.0, (count - 1) * _SUBDIVISIONS + 1)
+    return np.maximum(0.0, 1.0 - np.abs(position[:, None] - np.arange(count)))
+
+
+def contour_variable(excess: np.ndarray) -> np.ndarray:
+    """Return asinh(excess/0.01): monotone, nearly log(excess) where it matters, defined below zero."""
+    return np.arcsinh(excess / _LINEAR_BELOW)
+
+
+def excess_field(data: xr.Dataset) -> np.ma.MaskedArray:
+    """Return the contour variable of the excess of the force ratio, interpolated."""
+    return interpolated(contour_variable(data.force_ratio.values - 1.0))
+
+
+def excess_value(level: float) -> float:
+    """Return the contour variable at an excess."""
+    return float(contour_variable(np.array(level)))
+
+
+def draw_level(
+    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, value: float, **style: Any
+) -> QuadContourSet | None:
+    """Draw the contour of a field at a value and return it; None where the field does not cross the value."""
+    if not (field.count() and field.min() < value < field.max()):
+        return None
+    drawn = axes.contour(x, y, field, [value], **style)
+    return drawn if len(drawn.get_paths()[0]) else None
+
+
+def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:
+    """Hatch what has no interpolated value, and draw the measured points as dots and the missing ones as crosses.
+
+    Points whose status is not `ok` have rings.
+    """
+    x, y = 1.0 - data.restitution.values, data.packing_fraction.values
+    if np.ma.is_masked(field):
+        area = Rectangle((x.min(), y.min()), np.ptp(x), np.ptp(y))
+        area.set(facecolor="none", edgecolor="0.75", hatch="/////", linewidth=0.0, zorder=0.5)
+        axes.add_patch(area)
+    axes.set_xlim(padded(x))
+    axes.set_ylim(padded(y))
+    x, y = np.meshgrid(x, y)
+    axes.plot(x[measured], y[measured], **_DOT, zorder=4)
+    axes.plot(x[~measured], y[~measured], **_CROSS, zorder=4)
+    bad = suspect(data)
+    mark_bad(axes, x[bad], y[bad])
+
+
+def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, entries: Iterable[Artist] = ()) -> None:
+    """Explain above the axes the symbols that occur in a plane, other entries between the dot and the ring."""
+    dot, cross = Line2D([], [], **_DOT, label="measured"), Line2D([], [], **_CROSS, label="no value")
+    handles = [dot] * bool(measured.any()) + list(entries)
+    handles += [ring_key()] * bool(suspect(data).any()) + [cross] * (not measured.all())
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=max(4, len(handles)),
+        fontsize=SMALL_SIZE,
+        frameon=False,
+        handlelength=1.2,
+        columnspacing=1.5,
+    )
+
+
+# ---------------------------------------------------------------------------------------------- labels
+
+
+def label_contours(
+    axes: Axes,
+    lines: Sequence[tuple[str, QuadContourSet]],
+    obstacles: Iterable[QuadContourSet] = (),
+    room: float = 0.0,
+) -> None:
+    """Write on each contour its text, where it is farthest from the other lines, the labels, the ends and the frame.
+
+    The layout must be fixed, so that distances on the page are known. A contour that has less room than `room` points
+    at its best place stays without its label.
+    """
+    to_page, pixels = axes.transData, axes.figure.dpi / 72.0  # of a point
+    paths = [to_page.transform_path(drawn.get_paths()[0]) for _, drawn in lines]
+    blocked = [_thinned(to_page.transform_path(path)) for drawn in obstacles for path in drawn.get_paths()]
+    labelled: list[np.ndarray] = []
+    for k, (text, drawn) in enumerate(lines):
+        others = [_thinned(path) for path in paths[:k] + paths[k + 1 :]] + [path for path in blocked if len(path)]
+        place, clearance = _open_place(paths[k], others, labelled, _APART * pixels, np.array(axes.bbox.extents))
+        if clearance < room * pixels:
+            continue
+        labelled.append(place)
+        x, y = to_page.inverted().transform(place)
+        labels = drawn.clabel(
+            fontsize=SMALL_SIZE + 0.5,
+            fmt=StrMethodFormatter(text),
+            inline_spacing=2,
+            manual=[(float(x), float(y))],
+            zorder=6,
+        )
+        for label in labels:
+            label.set_path_effects([withStroke(linewidth=2, foreground="white")])
+
+
+def _thinned(path: MplPath) -> np.ndarray:
+    """Return at most 400 vertices of a path, evenly taken."""
+    return np.asarray(path.vertices)[:: 1 + len(path) // 400]
+
+
+def _open_place(
+    path: MplPath, others: Sequence[np.ndarray], labelled: Sequence[np.ndarray], apart: float, frame: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the vertex of a path, in pixels, that keeps the largest clearance, and that clearance.
+
+    A label lies along its curve, so the ends of the curve and the frame are to be twice as far as other curves. Places
+    that are less than `apart` from a label count only where there is no other.
+    """
+    places = _thinned(path)
+    starts = np.flatnonzero(path.codes == MplPath.MOVETO)
+    ends = np.asarray(path.vertices)[np.concatenate([starts, starts - 1])]
+    to_frame = np.minimum(places - frame[:2], frame[2:] - places).min(axis=1)
+    clearances = [to_frame / 2, _distance(places, ends) / 2, *(_distance(places, other) for other in others)]
+    clearance = np.minimum.reduce(clearances)
+    for label in labelled:
+        clearance[np.linalg.norm(places - label, axis=1) < apart] *= 1e-3
+    best = np.argmax(clearance)
+    return places[best], float(clearance[best])
+
+
+def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the distance from each place to the nearest of the others."""
+    return np.linalg.norm(places[:, None] - others, axis=-1).min(axis=1)
+
+
+# ---------------------------------------------------------------------------------------------- excess
+
+
+def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, QuadContourSet]:
+    """Draw the contours of the excess of the force ratio over another field, wider for a larger excess."""
+    x, y = refined_axes(data)
+    field = excess_field(data)
+    styles = {level: excess_style("colors", "linewidths", level) for level in EXCESS_LEVELS}
+    lines = {level: draw_level(axes, x, y, field, excess_value(level), **style) for level, style in styles.items()}
+    return {level: line for level, line in lines.items() if line is not None}
+
+
+def excess_style(colour: str, width: str, level: float) -> dict[str, Any]:
+    """Return the style of the contour of an excess, for an artist that calls colour and width by these names."""
+    return {colour: _EXCESS_COLOUR, width: 0.8 + 0.5 * EXCESS_LEVELS.index(level), "alpha": 0.75, "zorder": 2.5}
+
+
+def excess_keys(levels: Iterable[float]) -> list[Artist]:
+    """Return the legend entries of the contours of the excess."""
+    return [
+        Line2D([], [], label=f"{'excess ' * (k == 0)}{level:.2f}", **excess_style("color", "linewidth", level))
+        for k, level in enumerate(levels)
+    ]

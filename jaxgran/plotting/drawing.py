@@ -1,0 +1,273 @@
+"""What all figures share: the order of a map, the marks of its points, captions and files.
+
+Figures are built without any global plotting state, so they need no display.
+"""
+
+from __future__ import annotations
+
+import os
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jaxgran.model.flow import InputError, shown
+
+LONGEST_NAME = 200  # bytes; file systems take 255, and the names of figures are longer
+LABEL_SIZE, TICK_SIZE, SMALL_SIZE = 9.0, 8.0, 7.0  # fonts, in points
+ALPHA_TITLE = "restitution α"
+ALPHA_LABEL = r"$1-\alpha$"
+NU_LABEL = r"packing fraction $\nu$"
+
+_MARKERS = "os^DvP<X>ph*"
+_LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
+_RING: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markersize": 8.5,
+    "markerfacecolor": "none",
+    "markeredgecolor": "#b2182b",
+    "markeredgewidth": 1.2,
+}
+
+
+# ---------------------------------------------------------------------------------------------- data
+
+
+def ordered(data: xr.Dataset, *names: str) -> xr.Dataset:
+    """Return force ratio, status and the named variables, with errors, as ([timestep,] packing_fraction, restitution).
+
+    All axes ascend. Variables that the map does not have are left out.
+    """
+    values = ("force_ratio", *names)
+    kept = [name for name in (*values, *(f"{name}_stderr" for name in values), "status") if name in data]
+    dims = [name for name in ("timestep", "packing_fraction", "restitution") if name in data.dims]
+    return data[kept].sortby(dims).transpose(*dims, ...).assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
+
+
+def finest(data: xr.Dataset) -> xr.Dataset:
+    """Return the shortest time step of an ordered map, as its attribute `timestep`."""
+    if "timestep" not in data.coords:
+        return data
+    data = data.isel(timestep=0) if "timestep" in data.dims else data
+    return data.assign_attrs(timestep=float(data.timestep))
+
+
+def is_plane(data: xr.Dataset) -> bool:
+    """Return whether a map has at least two restitutions and two packing fractions."""
+    return min(data.sizes["restitution"], data.sizes["packing_fraction"]) >= 2
+
+
+def require_plane(data: xr.Dataset) -> None:
+    """Raise a ValueError where a map is no plane."""
+    if not is_plane(data):
+        raise InputError(
+            "contours need at least two restitutions and two packing fractions, "
+            f"and this map has {data.sizes['restitution']} and {data.sizes['packing_fraction']}."
+        )
+
+
+def suspect(data: xr.Dataset) -> np.ndarray:
+    """Return where a point has a value, and a status that is not `ok`."""
+    return np.isfinite(data.force_ratio.values) & (_status_names(data) != "ok")
+
+
+def _status_names(data: xr.Dataset) -> np.ndarray:
+    """Return the name of every point's status, as text in the shape of the map."""
+    if "status" not in data:
+        return np.full(data.force_ratio.shape, "ok", dtype=object)
+    attrs = data.status.attrs
+    values = np.atleast_1d(attrs["flag_values"]).tolist()
+    names = dict(zip(values, attrs["flag_meanings"].split(), strict=True))
+    codes = data.status.values
+    return np.array([names.get(code, f"status {code}") for code in codes.flat], object).reshape(codes.shape)
+
+
+# ---------------------------------------------------------------------------------------------- curves
+
+
+def curve_styles(count: int) -> list[dict[str, Any]]:
+    """Return a colour, marker and line style for each curve; the colours also differ in grey."""
+    ramp = colormaps["viridis"](np.linspace(0.0, 0.82, count))
+    return [
+        {
+            "color": tuple(ramp[k]),
+            "marker": _MARKERS[k % len(_MARKERS)],
+            "linestyle": _LINE_STYLES[k % len(_LINE_STYLES)],
+        }
+        for k in range(count)
+    ]
+
+
+def draw_points(
+    axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, style: dict[str, Any], **errors: Any
+) -> None:
+    """Draw a curve with its error bars; a point of bad status is an open symbol in a ring."""
+    axes.errorbar(x, y, **style, **errors, markersize=4, linewidth=1.1, elinewidth=0.8, capsize=2)
+    axes.plot(
+        x[bad],
+        y[bad],
+        linestyle="none",
+        marker=style["marker"],
+        markersize=4,
+        markerfacecolor="white",
+        markeredgecolor=style["color"],
+        zorder=4,
+    )
+    mark_bad(axes, x[bad], y[bad])
+
+
+def mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """Put a ring around points whose status is not `ok`."""
+    if len(x):
+        axes.plot(x, y, **_RING, zorder=5)
+
+
+def curve_key(style: dict[str, Any], label: str) -> Line2D:
+    """Return the legend entry of a curve."""
+    return Line2D([], [], **style, markersize=4, linewidth=1.1, label=label)
+
+
+def ring_key() -> Line2D:
+    """Return the legend entry of the ring of bad status."""
+    return Line2D([], [], **_RING, label="status not ok")
+
+
+def add_curve_legend(figure: Figure, data: xr.Dataset, handles: Sequence[Line2D], title: str) -> None:
+    """Name the curves beside the axes, and explain the ring above them."""
+    figure.legend(
+        handles=handles,
+        title=title,
+        loc="outside right upper",
+        ncols=1 + (len(handles) - 1) // 16,
+        fontsize=SMALL_SIZE + 0.5,
+        title_fontsize=TICK_SIZE,
+        frameon=False,
+        handlelength=3.2,
+    )
+    add_ring_legend(figure, data)
+
+
+def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside upper left") -> None:
+    """Explain the ring above the axes, where a status is not `ok`."""
+    if suspect(data).any():
+        figure.legend(handles=[ring_key()], loc=place, fontsize=SMALL_SIZE, frameon=False)
+
+
+# ---------------------------------------------------------------------------------------------- forces
+
+
+def force_lines(
+    starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray, widths: np.ndarray, **style: Any
+) -> LineCollection:
+    """Return lines from centre to centre, (pairs, 2), with widths in points, and their images by lattice vectors."""
+    segments = np.stack([starts, starts + branches], axis=1)
+    images = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
+    return LineCollection(list(images), linewidths=np.tile(widths, len(shifts)), **style)
+
+
+# ------------------------------------------------------------------------------------- frame and text
+
+
+class ShownFigure(Figure):
+    """A figure that a notebook shows where it is the last line of a cell, though no global plotting state exists."""
+
+    def _repr_png_(self) -> bytes:
+        memory = BytesIO()
+        self.savefig(memory, format="png", dpi=110)
+        return memory.getvalue()
+
+
+def empty_figure(width: float, height: float) -> Figure:
+    """Return a figure of a size in inches that draws without a display."""
+    figure = ShownFigure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def scientific(value: float) -> str:
+    """Return a number as mathematical text, such as 3 × 10⁻⁴."""
+    mantissa, exponent = f"{value:.2e}".split("e")
+    power = rf"10^{{{int(exponent)}}}"
+    return power if float(mantissa) == 1.0 else rf"{float(mantissa):g}\times {power}"
+
+
+def status_note(data: xr.Dataset) -> str:
+    """Return how many points carry each status that is not `ok`."""
+    counts = Counter(name for name in _status_names(data).flat if name != "ok")
+    words = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
+    return textwrap.fill(f"Status not ok: {words}", width=75) if counts else ""
+
+
+def missing_note(measured: np.ndarray, how_drawn: str = "") -> str:
+    """Return how many points have no value."""
+    missing = int((~measured).sum())
+    return f"{missing} of {measured.size} points without a value{how_drawn}" if missing else ""
+
+
+def padded(values: np.ndarray) -> tuple[float, float]:
+    """Return the limits of an axis, with room for the symbols at its ends."""
+    margin = 0.025 * np.ptp(values) or 0.01
+    return float(values.min() - margin), float(values.max() + margin)
+
+
+def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequence[str]) -> None:
+    """Set the tick style, write the caption lines under the axes and say so where nothing was measured."""
+    for axes in figure.axes:
+        axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=TICK_SIZE)
+        if not measured.any():
+            box = {"facecolor": "white", "edgecolor": "none"}
+            where = {"transform": axes.transAxes, "ha": "center"}
+            axes.text(0.5, 0.6, "no measured values", fontsize=LABEL_SIZE, bbox=box, **where)
+    caption = "\n".join(line for line in (_run_description(data.attrs), *notes) if line)
+    figure.supxlabel(caption, fontsize=SMALL_SIZE)
+
+
+def _run_description(attrs: dict) -> str:
+    """Return the parameters without which a force ratio means nothing, in one line; several time steps have an axis."""
+    parts = [f"$N={attrs['grains']}$"] if "grains" in attrs else []
+    if attrs.get("seeds") is not None:
+        parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
+    if np.ndim(attrs.get("timestep", ())) == 0:
+        parts.append(rf"$\mathrm{{d}}t={scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
+    if "activation" in attrs:
+        parts.append(f"{attrs['activation']} activation")
+    if "strain" in attrs:
+        parts.append(f"strain {float(attrs['strain']):g} per seed")
+    return ", ".join(parts)
+
+
+def writable_stem(stem: Path | str) -> Path:
+    """Return folder and beginning of the names of figures, or raise an InputError where none can be written."""
+    if not isinstance(stem, (str, os.PathLike)):
+        raise InputError(f"stem must be folder and beginning of the file names, not {shown(stem)}.")
+    stem = Path(stem)
+    if len(os.fsencode(stem.name)) > LONGEST_NAME:
+        raise InputError(f"the names of figures must begin with at most {LONGEST_NAME} bytes, not {shown(stem.name)}.")
+    if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
+        raise InputError(
+            f"figures must be written to a folder that exists and can be written to, not {shown(str(stem.parent))}."
+        )
+    return stem
+
+
+def write(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG under a temporary name beside its place, then move it there."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        figure.savefig(temporary, format="png", dpi=200)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path

@@ -1,0 +1,286 @@
+"""Pictures of a flow at an instant: grains in their sheared cell by speed or pressure, and the forces between them.
+
+Lines join the centres of grains that push each other, as wide as the force is large: black where most of it acts
+within clusters of three or more grains, red, and much lighter in grey, where two grains collide that touch nobody else.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+
+from jaxgran.analysis.force_chains import pair_forces
+from jaxgran.analysis.series import series
+from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.model.cell import centred, minimum_image
+from jaxgran.model.flow import InputError, shown
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, force_lines, scientific
+
+Colour = Literal["speed", "pressure"]
+
+COLOUR_LABELS: dict[str, str] = {
+    "speed": r"peculiar speed $|c|$  ($\sigma\dot\gamma$)",
+    "pressure": r"contact pressure of a grain  ($m\dot\gamma^2$)",
+}
+COLOURS = {
+    "speed": LinearSegmentedColormap.from_list("speed", ["#ffffff", "#cfe4f0", "#8fbfd9"]),
+    "pressure": LinearSegmentedColormap.from_list("pressure", ["#ffffff", "#fbe3c0", "#eeb46c"]),
+}
+_CLUSTER: dict[str, Any] = {"color": "#1a1a1a", "capstyle": "round"}
+BINARY_COLOUR = "#e0552f"
+_BINARY: dict[str, Any] = {"color": BINARY_COLOUR, "capstyle": "round"}
+_WIDEST, _THINNEST = 5.0, 0.35  # points
+_FASTEST, _STRONGEST = 0.98, 0.95  # shares of the grains and of the forces that colours and widths tell apart
+_LEGEND: dict[str, Any] = {
+    "fontsize": SMALL_SIZE,
+    "frameon": False,
+    "ncols": 3,
+    "handlelength": 1.8,
+    "columnspacing": 1.4,
+}
+_LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+
+
+class Scene(NamedTuple):
+    """What a picture shows of a flow; the cell lies around the origin.
+
+    =================  ===========  =====  =======================================================
+    field              shape        unit   meaning
+    =================  ===========  =====  =======================================================
+    centres            (grains, 2)  σ      of the grains, within the cell
+    radii              (grains,)    σ      of the grains
+    speed              (grains,)    σγ̇     |c|, peculiar
+    pressure           (grains,)    mγ̇²    Σ F r/2πr² of the contacts of each grain
+    starts             (pairs, 2)   σ      centre of one grain of each pair that pushes
+    branches           (pairs, 2)   σ      from there to the centre of the other one
+    force              (pairs,)     mσγ̇²   mean over the times of the window
+    clustered          (pairs,)     –      whether most of it acts within clusters of three or more
+    side, tilt         ()           σ, –   of the cell
+    restitution        ()           –      α
+    packing_fraction   ()           –      ν
+    timestep           ()           1/γ̇    dt
+    times              ()           –      snapshots in the window
+    window             ()           –      strain that passes in it, less whole numbers between two snapshots
+    =================  ===========  =====  =======================================================
+    """
+
+    centres: Float[np.ndarray, "grains 2"]
+    radii: Float[np.ndarray, " grains"]
+    speed: Float[np.ndarray, " grains"]
+    pressure: Float[np.ndarray, " grains"]
+    starts: Float[np.ndarray, "pairs 2"]
+    branches: Float[np.ndarray, "pairs 2"]
+    force: Float[np.ndarray, " pairs"]
+    clustered: Bool[np.ndarray, " pairs"]
+    side: float
+    tilt: float
+    restitution: float
+    packing_fraction: float
+    timestep: float
+    times: int
+    window: float
+
+
+class Scale(NamedTuple):
+    """What the deepest colour and the widest line of a picture stand for; larger values look the same."""
+
+    colour: float
+    force: float
+
+
+def flow_figure(
+    seen: Snapshot, colour: Colour = "speed", strain: float | None = None, scale: Scale | None = None
+) -> Figure:
+    """A picture of a flow: its grains and the forces between them.
+
+    Args:
+      seen: one snapshot, whose forces are those of one time step; or a series with a (times,) axis, over which the
+        forces are averaged, and whose middle one is drawn. Few grains collide in a short time step: a series with a
+        snapshot for each of a hundred steps (``snapshot_series``) shows the collisions of that time.
+      colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain on its own area.
+      strain: since the start, to be named in the title.
+      scale: what the deepest colour and the widest line stand for, or None to choose by what there is.
+
+    Raises:
+      ValueError: ``seen`` is no such snapshot, it is not finite, or there is no such colour.
+    """
+    scene = scene_of(seen)
+    require_colour(colour)
+    figure = empty_figure(5.4, 5.4)
+    draw_picture(figure.subplots(), scene, colour, scale or common_scale([scene], colour), strain)
+    return figure
+
+
+def require_colour(colour: Any) -> None:
+    """Raise an InputError unless grains can be coloured by this."""
+    if colour not in get_args(Colour):
+        raise InputError(f"colour must be speed or pressure, not {shown(colour)}.")
+
+
+def scene_of(seen: Snapshot) -> Scene:
+    """What a picture shows of a snapshot, or of a series of them."""
+    if not isinstance(seen, Snapshot) or np.ndim(seen.state.side) > 1:
+        raise InputError(f"seen must be a Snapshot of one flow or a series of them, not {shown(type(seen).__name__)}.")
+    frames, pairs = series(seen), pair_forces(seen)
+    state, times = frames.state, len(frames.state.side)
+    middle = times // 2
+    positions, velocities, radii = (x[middle] for x in (state.positions, state.velocities, state.grains.radii))
+    if not (np.isfinite(positions).all() and np.isfinite(velocities).all()):
+        raise InputError("seen must be a flow of finite positions and velocities.")
+    side, tilt = state.side[middle].item(), state.tilt[middle].item()
+    places = centred(positions, side, tilt)
+    pushed = sum(np.bincount(grain, pairs.force, minlength=len(radii)) for grain in (pairs.i, pairs.j))
+    rate = frames.shear_rate[middle].item()
+    if not rate > 0:
+        raise InputError("seen must be of a sheared flow: its shear rate is the unit of the picture.")
+    step = frames.timestep[middle].item() * rate
+    return Scene(
+        centres=places,
+        radii=radii,
+        speed=np.hypot(*velocities.T) / rate,
+        pressure=pushed / (2 * np.pi * radii) / rate**2,
+        starts=places[pairs.j],
+        branches=minimum_image(positions[pairs.i] - positions[pairs.j], side, tilt),
+        force=pairs.force / rate**2,
+        clustered=pairs.cluster_share > 0.5,
+        side=side,
+        tilt=tilt,
+        restitution=frames.restitution[middle].item(),
+        packing_fraction=float(np.sum(np.pi * radii**2) / side**2),
+        timestep=step,
+        times=times,
+        window=times * (step if times == 1 else float(np.mean(np.diff(state.tilt) % 1))),
+    )
+
+
+def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
+    """A scale for several pictures that are to be compared."""
+    scenes = list(scenes)
+    values = np.concatenate([getattr(scene, colour) for scene in scenes])
+    forces = np.concatenate([scene.force for scene in scenes])
+    return Scale(_upper(values[values > 0], _FASTEST), _upper(forces, _STRONGEST))
+
+
+def _upper(values: np.ndarray, share: float) -> float:
+    return float(np.quantile(values, share)) if values.size else 1.0
+
+
+def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None) -> None:
+    """Draw a scene with its title, colour bar and legend."""
+    grains = draw_scene(axes, scene, colour, scale)
+    axes.set_title(title_of(scene, strain), fontsize=LABEL_SIZE)
+    beside = axes.inset_axes((1.02, 0.25, 0.022, 0.7))
+    bar = axes.figure.colorbar(grains, cax=beside, extend="max")
+    bar.set_label(COLOUR_LABELS[colour], fontsize=TICK_SIZE)
+    bar.ax.tick_params(labelsize=SMALL_SIZE)
+    axes.legend(handles=force_key(scale), loc="upper left", bbox_to_anchor=(0.0, 0.0), **_LEGEND)
+
+
+def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> ScalarMappable:
+    """Draw grains, forces, the cell and a scale bar; what reaches over the edge of the cell is cut and comes in again
+    on the other side."""
+    corners = scene.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    corners[:, 0] += scene.tilt * corners[:, 1]
+    cell = Polygon(corners, closed=True, facecolor="none", edgecolor="#404040", linewidth=0.9, zorder=4)
+    axes.add_patch(cell)
+    which, places = _images(scene)
+    grains = EllipseCollection(
+        2 * scene.radii[which],
+        2 * scene.radii[which],
+        np.zeros(which.size),
+        units="xy",
+        offsets=places,
+        offset_transform=axes.transData,
+        array=getattr(scene, colour)[which],
+        cmap=COLOURS[colour],
+        norm=Normalize(0, scale.colour),
+        edgecolor="#8c8c8c",
+        linewidth=0.4,
+        zorder=1,
+    )
+    shifts = scene.side * np.array([(a + scene.tilt * b, b) for a, b in _LATTICE])
+    lines = [
+        force_lines(
+            scene.starts[chosen],
+            scene.branches[chosen],
+            shifts,
+            np.clip(_WIDEST * scene.force[chosen] / scale.force, _THINNEST, _WIDEST),
+            zorder=order,
+            **style,
+        )
+        for chosen, style, order in ((scene.clustered, _CLUSTER, 2), (~scene.clustered, _BINARY, 3))
+    ]
+    for artist in (grains, *lines):
+        axes.add_collection(artist, autolim=False)
+        artist.set_clip_path(cell)
+    _frame(axes, scene)
+    return grains
+
+
+def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Grains and their images that reach into the cell: which grains they are, and where."""
+    shifts = np.array(_LATTICE, float)
+    places = scene.centres[:, None] + scene.side * np.stack(
+        [shifts[:, 0] + scene.tilt * shifts[:, 1], shifts[:, 1]], -1
+    )
+    y = places[..., 1]
+    x = places[..., 0] - scene.tilt * y
+    reach = scene.radii[:, None] * np.hypot(1, scene.tilt)
+    inside = (abs(x) <= scene.side / 2 + reach) & (abs(y) <= scene.side / 2 + scene.radii[:, None])
+    which, image = np.nonzero(inside)
+    return which, places[which, image]
+
+
+def _frame(axes: Axes, scene: Scene) -> None:
+    """Limits that hold the cell, no axes, and a scale bar."""
+    half = scene.side / 2
+    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
+    low = -half - 0.07 * scene.side
+    wide = 1.01 * half * (1 + abs(scene.tilt))
+    axes.set(xlim=(-wide, wide), ylim=(low - 0.03 * scene.side, half * 1.01), aspect="equal")
+    axes.set_axis_off()
+    start = -half * (1 + scene.tilt)
+    axes.plot([start, start + length], [low, low], color="black", linewidth=1.6, solid_capstyle="butt")
+    axes.annotate(
+        rf"{length} $\sigma$",
+        (start + length, low),
+        (4, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=TICK_SIZE,
+    )
+
+
+def force_key(scale: Scale) -> Sequence[Line2D]:
+    """The legend of the lines, and the force of the widest ones."""
+    widest = rf"$F\geq{scientific(float(f'{scale.force:.1e}'))}\,m\sigma\dot\gamma^2$"
+    keys = (
+        (_CLUSTER["color"], 2.5, "in clusters of 3 or more grains"),
+        (_BINARY["color"], 2.5, "binary collisions"),
+        ("#c4c4c4", _WIDEST, f"widest: {widest}"),
+    )
+    return [Line2D([], [], color=colour, linewidth=width, label=label) for colour, width, label in keys]
+
+
+def title_of(scene: Scene, strain: float | None = None) -> str:
+    """Parameters of the flow, and over what time its forces are taken."""
+    parts = [
+        rf"$\alpha={scene.restitution:g}$",
+        rf"$\nu={scene.packing_fraction:.4g}$",
+        rf"$N={len(scene.radii)}$",
+        rf"$\mathrm{{d}}t={scientific(scene.timestep)}/\dot\gamma$",
+    ]
+    if strain is not None:
+        parts.append(f"strain {strain:.3f}")
+    every_step = abs(scene.window / (scene.times * scene.timestep) - 1) < 1e-3
+    window = f"{scene.times} time steps, a strain of {scene.window:.3g}" if every_step else f"{scene.times} snapshots"
+    forces = "forces of one time step" if scene.times == 1 else f"mean forces over {window}"
+    return f"{', '.join(parts)}\n{forces}"

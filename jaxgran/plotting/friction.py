@@ -1,0 +1,147 @@
+"""The laws of dense flow against the points they are fitted to: friction and packing fraction by inertial number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from jaxgran.inference.friction_law import (
+    LARGEST_INERTIAL_NUMBER,
+    NEEDED,
+    SMALLEST_PACKING_FRACTION,
+    FrictionLaw,
+    PowerLaw,
+    dense_points,
+    enough,
+    friction_law,
+    is_dense,
+)
+from jaxgran.maps.schema import RATIO, require_map, what_lacks
+from jaxgran.plotting.drawing import (
+    LABEL_SIZE,
+    NU_LABEL,
+    SMALL_SIZE,
+    add_ring_legend,
+    curve_key,
+    curve_styles,
+    draw_points,
+    empty_figure,
+    finest,
+    finish,
+    missing_note,
+    ordered,
+    status_note,
+    suspect,
+)
+
+_FRICTION_NOTE = (
+    r"$\mu=\mu_0+aI^b$ and $\nu=\nu_c-kI^c$, fitted to the filled symbols: status ok, "
+    rf"$I\leq{LARGEST_INERTIAL_NUMBER:g}$, $\nu\geq{SMALLEST_PACKING_FRACTION:g}$"
+)
+
+
+def has_friction_law(data: xr.Dataset) -> bool:
+    """Return whether a map has what :func:`friction_figure` draws, with enough dense points."""
+    return not what_lacks(data, *NEEDED) and enough(dense_points(data))
+
+
+def friction_figure(data: xr.Dataset) -> Figure:
+    """Return friction and packing fraction against the inertial number, with the laws of dense flow.
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) as in :func:`jaxgran.inference.friction_law.friction_law`
+    returns  Figure                          the points fitted are filled, the others open; the
+                                             parameters of the laws are in the legends
+    raises   ValueError                      too few dense points
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO, *NEEDED)
+    data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
+    law = friction_law(data)
+    measured = np.isfinite(data.macroscopic_friction.values)
+    styles = dict(zip(data.restitution.values.tolist(), curve_styles(data.sizes["restitution"]), strict=True))
+    figure = empty_figure(width=8.6, height=4.4 + 0.16 * len(styles))
+    left, right = figure.subplots(1, 2)
+    for axes, name in ((left, "macroscopic_friction"), (right, "packing_fraction")):
+        axes.set_xscale("log")
+        for alpha, style in styles.items():
+            _draw_flows(axes, data.sel(restitution=alpha), name, style)
+        axes.set_xlabel(r"inertial number $I$", fontsize=LABEL_SIZE)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    left.set_ylabel(r"macroscopic friction $\mu$", fontsize=LABEL_SIZE)
+    right.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
+    _add_laws(left, law, styles, lambda one: one.friction, r"$\mu_0$, $a$, $b$")
+    _add_laws(right, law, styles, lambda one: one.packing_fraction, r"$\nu_c$, $k$, $c$")
+    add_ring_legend(figure, data)
+    finish(figure, data, measured, [_FRICTION_NOTE, status_note(data), missing_note(measured)])
+    return figure
+
+
+def _draw_flows(axes: Axes, curve: xr.Dataset, name: str, style: dict[str, Any]) -> None:
+    """Draw the points of one restitution against the inertial number, those that no law is fitted to open."""
+    number, stderr = curve.inertial_number.values, curve.inertial_number_stderr.values
+    value = np.broadcast_to(curve[name].values, number.shape)
+    errors = curve[f"{name}_stderr"].values if f"{name}_stderr" in curve else np.zeros_like(number)
+    mark = {"color": style["color"], "marker": style["marker"], "linestyle": "none"}
+    fitted = is_dense(curve).values
+    for chosen, face in ((fitted, style["color"]), (~fitted, "white")):
+        at = {"xerr": stderr[chosen], "yerr": errors[chosen]}
+        draw_points(axes, number[chosen], value[chosen], suspect(curve)[chosen], mark | {"mfc": face}, **at)
+
+
+def _add_laws(
+    axes: Axes,
+    law: FrictionLaw,
+    styles: Mapping[float, dict[str, Any]],
+    part: Callable[[FrictionLaw], PowerLaw],
+    names: str,
+) -> None:
+    """Draw the law of each restitution and that of all points, with their parameters in a legend under the axes."""
+    entries = {alpha: (f"{alpha:.4g}", style) for alpha, style in styles.items()}
+    laws: dict[float | None, FrictionLaw] = {**law.by_restitution, None: law}
+    handles = []
+    for key, (label, style) in (entries | {None: ("all", {"color": "black", "marker": "", "linestyle": "-"})}).items():
+        if key in laws:
+            fit = part(laws[key])
+            number = np.geomspace(*fit.span, 100)
+            axes.plot(number, fit(number), color=style["color"], linestyle=style["linestyle"], linewidth=1.1, zorder=1)
+            label = f"{label}: {parameters_text(fit)}"
+        else:
+            label = f"{label}: too few points"
+        handles.append(curve_key(style, label))
+    axes.legend(
+        handles=handles,
+        title=rf"restitution α: {names} (reduced $\chi^2$)",
+        alignment="left",
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.14),
+        fontsize=SMALL_SIZE,
+        title_fontsize=SMALL_SIZE,
+        frameon=False,
+        handlelength=3.2,
+    )
+
+
+def parameters_text(law: PowerLaw) -> str:
+    """Return offset, size of the coefficient and exponent of a law with their standard errors, and reduced χ²."""
+    if not law.determined:
+        return "not determined"
+    values = law.parameters * [1.0, np.sign(law.parameters[1]), 1.0]
+    parts = [_with_error(value, error) for value, error in zip(values, law.standard_errors, strict=True)]
+    return f"{', '.join(parts)} ({law.chi_squared:.2g})".replace("-", "−")
+
+
+def _with_error(value: float, error: float) -> str:
+    """Return a number and its standard error, to one digit of the error, or two where that begins with a one."""
+    magnitude = math.floor(math.log10(error)) if error > 0.0 else -3
+    digits = max(0, -magnitude + (error < 2.0 * 10.0**magnitude))
+    return f"{value:.{digits}f} ± {error:.{digits}f}"

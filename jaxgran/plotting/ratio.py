@@ -1,0 +1,327 @@
+"""The figures of a ratio map: curves of the force ratio, contours of its excess over one, and its time steps.
+
+All are drawn from the dataset of :func:`jaxgran.ratio_map`. Curves and contours follow Figures 1 and 2 of Lois,
+Lemaître and Carlson, *Momentum transport in granular flows*, and show the shortest time step of a map that has
+several; the third figure shows what the time step does. The force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is
+⟨F⟩/⟨F_bc⟩ − 1. What else :func:`save_figures` writes is in :mod:`jaxgran.plotting.theory` and
+:mod:`jaxgran.plotting.friction`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+
+from jaxgran.maps.schema import RATIO, require_map
+from jaxgran.model.flow import InputError
+from jaxgran.plotting.contours import (
+    EXCESS_LEVELS,
+    add_plane_legend,
+    contour_variable,
+    draw_level,
+    draw_plane,
+    excess_field,
+    excess_value,
+    interpolated,
+    label_contours,
+    refined_axes,
+)
+from jaxgran.plotting.drawing import (
+    ALPHA_LABEL,
+    ALPHA_TITLE,
+    LABEL_SIZE,
+    NU_LABEL,
+    TICK_SIZE,
+    add_curve_legend,
+    curve_key,
+    curve_styles,
+    draw_points,
+    empty_figure,
+    finest,
+    finish,
+    is_plane,
+    missing_note,
+    ordered,
+    padded,
+    require_plane,
+    scientific,
+    status_note,
+    suspect,
+    writable_stem,
+    write,
+)
+from jaxgran.plotting.friction import friction_figure, has_friction_law
+from jaxgran.plotting.theory import (
+    cluster_shares,
+    has_clusters,
+    has_theory,
+    theory_errors,
+)
+
+_MOST_TOGETHER = 8  # points whose curves share one panel of the time steps
+_LOG_SPAN = 2.5  # largest over smallest force ratio from which the axis is logarithmic
+_RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
+_BAND = "#e08214"
+
+
+def ratio_curves(data: xr.Dataset) -> Figure:
+    """Return the force ratio against the packing fraction, one curve per restitution (Figure 1).
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) `force_ratio`, `force_ratio_stderr` (dimensionless)
+                                             and, where present, the CF flag variable `status`;
+                                             the shortest of several time steps is drawn
+    returns  Figure                          error bars are one standard error; a point whose
+                                             status is not `ok` is an open symbol in a ring
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO)
+    data = finest(ordered(data))
+    figure = empty_figure(width=5.0, height=3.5)
+    axes = figure.add_subplot()
+    axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
+    styles = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
+    handles = [
+        _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}")
+        for value, style in styles
+    ]
+    _set_ratio_scale(axes, data.force_ratio.values)
+    axes.set_xlim(padded(data.packing_fraction.values))
+    axes.set_xlabel(NU_LABEL, fontsize=LABEL_SIZE)
+    axes.set_ylabel(_RATIO_LABEL, fontsize=LABEL_SIZE)
+    add_curve_legend(figure, data, handles, ALPHA_TITLE)
+    measured = np.isfinite(data.force_ratio.values)
+    finish(figure, data, measured, [status_note(data), missing_note(measured)])
+    return figure
+
+
+def ratio_contours(data: xr.Dataset) -> Figure:
+    """Return the contours of the excess force ratio in the plane of 1 − α and ν (Figure 2).
+
+    The contoured variable is asinh(excess/0.01), logarithmic for an excess well above 0.01 and linear
+    below, where noise may make it negative. It is interpolated bilinearly between the grid points; a cell
+    with a missing corner is hatched. The band of a level holds the points whose excess differs from it
+    by at most the interpolated standard error.
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) as in :func:`ratio_curves`
+    returns  Figure                          each level of `EXCESS_LEVELS` that the map reaches is
+                                             drawn and labelled; the others are named under the axes
+    raises   ValueError                      fewer than two restitutions or two packing fractions
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO)
+    require_plane(data)
+    data = finest(ordered(data))
+    x, y = refined_axes(data)
+    excess, stderr = data.force_ratio.values - 1.0, data.force_ratio_stderr.values
+    measured, field = np.isfinite(excess), excess_field(data)
+
+    figure = empty_figure(width=4.5, height=4.1)
+    axes = figure.add_subplot()
+    _shade(axes, x, y, field)
+    style = {"colors": "black", "linewidths": 1.1, "zorder": 3}
+    drawn = {level: draw_level(axes, x, y, field, excess_value(level), **style) for level in EXCESS_LEVELS}
+    lines = {level: line for level, line in drawn.items() if line is not None}
+    banded = _draw_bands(axes, x, y, excess, stderr, lines)
+    draw_plane(axes, data, field, measured)
+    axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
+    axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
+    band: list[Artist] = [Patch(facecolor=_BAND, alpha=0.45, label="± standard error")]
+    add_plane_legend(figure, data, measured, band * banded)
+    absent = [level for level in EXCESS_LEVELS if level not in lines]
+    notes = [_contour_note(absent), status_note(data), missing_note(measured, " (hatched)")]
+    finish(figure, data, measured, notes)
+    figure.canvas.draw()
+    label_contours(axes, [(f"{level:.2f}", line) for level, line in lines.items()])
+    return figure
+
+
+def ratio_against_timestep(data: xr.Dataset) -> Figure:
+    """Return the force ratio against the time step, a curve for each restitution and packing fraction.
+
+    Up to eight points share one panel. More have one for each packing fraction, with a force-ratio axis of its own.
+
+    ======== ========================================= =============================================
+    data     (timestep, packing_fraction, restitution) as in :func:`ratio_curves`; `timestep` in
+                                                       units of 1/γ̇
+    returns  Figure                                    error bars are one standard error; a point
+                                                       whose status is not `ok` is an open symbol in
+                                                       a ring
+    raises   ValueError                                fewer than two time steps
+    ======== ========================================= =============================================
+    """
+    require_map(data, *RATIO)
+    if not _has_timesteps(data):
+        raise InputError(
+            f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
+        )
+    data = ordered(data)
+    panels, title = _timestep_panels(data)
+    columns = math.ceil(math.sqrt(len(panels)))
+    rows = math.ceil(len(panels) / columns)
+    width, height = (5.0, 3.5) if len(panels) == 1 else (1.0 + 1.9 * columns, 1.0 + 1.6 * rows)
+    figure = empty_figure(width, height)
+    grid = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
+    handles: list[Line2D] = []
+    for axes, (name, curves) in zip(grid, panels, strict=False):
+        axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
+        styles = zip(curves, curve_styles(len(curves)), strict=True)
+        handles = [_draw_curve(axes, curve, "timestep", style, label) for (label, curve), style in styles]
+        _set_ratio_scale(axes, np.concatenate([curve.force_ratio.values for _, curve in curves]))
+        axes.set_title(name, fontsize=TICK_SIZE)
+    for axes in grid[len(panels) :]:
+        axes.remove()
+    for axes in grid[max(0, len(panels) - columns) : len(panels)]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(r"time step $\dot{\gamma}\,\mathrm{d}t$", fontsize=LABEL_SIZE)
+    _set_timestep_scale(grid[0], data.timestep.values)
+    figure.supylabel(_RATIO_LABEL, fontsize=LABEL_SIZE)
+    add_curve_legend(figure, data, handles, title)
+    measured = np.isfinite(data.force_ratio.values)
+    finish(figure, data, measured, [status_note(data), missing_note(measured)])
+    return figure
+
+
+def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
+    """Write every figure that a map has the data for, as PNG, and return the paths written.
+
+    Each file appears whole or not at all.
+
+    ======================= ==================================================================
+    `{stem}_curves.png`     always
+    `{stem}_contours.png`   at least two restitutions and two packing fractions
+    `{stem}_timestep.png`   at least two time steps
+    `{stem}_theory.png`     a plane as for the contours, with what the theory predicts
+    `{stem}_clusters.png`   the shares of the clusters
+    `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
+    ======================= ==================================================================
+
+    ======== ============= =====================================================================
+    data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
+    stem     path          folder and beginning of the names; the folder must exist
+    returns  list of Path  the files written, in the order above
+    raises   ValueError    this is no map, or no files can be written there
+    ======== ============= =====================================================================
+    """
+    require_map(data, *RATIO)
+    stem = writable_stem(stem)
+    figures = {
+        "curves": (True, ratio_curves),
+        "contours": (is_plane(data), ratio_contours),
+        "timestep": (_has_timesteps(data), ratio_against_timestep),
+        "theory": (is_plane(data) and has_theory(data), theory_errors),
+        "clusters": (has_clusters(data), cluster_shares),
+        "rheology": (has_friction_law(data), friction_figure),
+    }
+    drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}
+    for path in drawn:
+        if path.is_dir():
+            raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
+    return [write(draw(data), path) for path, draw in drawn.items()]
+
+
+def _has_timesteps(data: xr.Dataset) -> bool:
+    return data.sizes.get("timestep", 1) >= 2
+
+
+# --------------------------------------------------------------------------------------------- curves
+
+
+def _draw_curve(axes: Axes, curve: xr.Dataset, along: str, style: dict, label: str) -> Line2D:
+    """Draw one curve along a coordinate with its error bars and suspect points; return its legend entry."""
+    ratio, stderr = curve.force_ratio.values, curve.force_ratio_stderr.values
+    draw_points(axes, curve[along].values, ratio, suspect(curve), style, yerr=stderr)
+    return curve_key(style, label)
+
+
+def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
+    """Make the force-ratio axis logarithmic, with plain numbers, where the values span enough."""
+    values = ratio[np.isfinite(ratio) & (ratio > 0.0)]
+    span = values.max() / values.min() if values.size else 1.0
+    if span < _LOG_SPAN:
+        return
+    axes.set_yscale("log")
+    subs = (1, 1.5, 2, 3, 4, 6, 8) if span < 12 else (1, 2, 5)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+# ----------------------------------------------------------------------------------------- time steps
+
+
+def _timestep_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.Dataset]]]], str]:
+    """Return the panels, each a name and its curves with their labels, and the title of the labels."""
+    alphas, nus = data.restitution.values, data.packing_fraction.values
+    if len(alphas) * len(nus) <= _MOST_TOGETHER:
+        curves = [
+            (f"{alpha:.4g}, {nu:.4g}", data.sel(packing_fraction=nu, restitution=alpha))
+            for nu in nus
+            for alpha in alphas
+        ]
+        return [("", curves)], "α, ν"
+    panels = [
+        (f"ν = {nu:.4g}", [(f"{alpha:.4g}", data.sel(packing_fraction=nu, restitution=alpha)) for alpha in alphas])
+        for nu in nus
+    ]
+    return panels, ALPHA_TITLE
+
+
+def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
+    """Make the time-step axis logarithmic; where it has no two powers of ten, its ends are labelled."""
+    axes.set_xscale("log")
+    low, high = timesteps.min(), timesteps.max()
+    margin = (high / low) ** 0.06
+    axes.set_xlim(low / margin, high * margin)
+    powers = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9)
+    if powers < 1:
+        axes.xaxis.set_major_locator(FixedLocator([low, high]))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"${scientific(value)}$"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+# ------------------------------------------------------------------------------------------- contours
+
+
+def _shade(axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray) -> None:
+    """Fill the intervals between the levels with faint greys, darker for a larger excess."""
+    greys = [str(value) for value in np.linspace(1.0, 0.8, len(EXCESS_LEVELS) + 1)]
+    axes.contourf(x, y, field, [-1e9, *map(excess_value, EXCESS_LEVELS), 1e9], colors=greys, zorder=1)
+
+
+def _draw_bands(
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    excess: np.ndarray,
+    stderr: np.ndarray,
+    levels: Iterable[float],
+) -> bool:
+    """Shade where the excess agrees with a level within one standard error; return whether any was drawn."""
+    low, middle, high = (interpolated(contour_variable(excess + k * stderr)) for k in (-1.0, 0.0, 1.0))
+    below, above = np.ma.maximum(middle - low, 1e-9), np.ma.maximum(high - middle, 1e-9)
+    drawn = False
+    for level in map(excess_value, levels):
+        away = level - middle
+        in_errors = np.ma.where(away > 0.0, away / above, away / below)
+        if np.ma.min(abs(in_errors), fill_value=np.inf) < 1.0:
+            axes.contourf(x, y, in_errors, [-1.0, 1.0], colors=[_BAND], alpha=0.45, zorder=2)
+            drawn = True
+    return drawn
+
+
+def _contour_note(absent: Sequence[float]) -> str:
+    note = r"Contours of $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
+    return note + (f"; not reached: {', '.join(f'{level:.2f}' for level in absent)}" if absent else "")

@@ -1,0 +1,314 @@
+"""What the force ratio means: where kinetic theory errs and why, and what clusters of grains carry.
+
+The figures show the shortest time step of a map that has several. The excess is that of the force ratio over one,
+⟨F⟩/⟨F_bc⟩ − 1; in the plane of 1 − α and ν its contours lie over those of each figure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.contour import QuadContourSet
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from jaxgran.maps.schema import RATIO, require_map, what_lacks
+from jaxgran.plotting.contours import (
+    EXCESS_LEVELS,
+    add_plane_legend,
+    draw_excess,
+    draw_level,
+    draw_plane,
+    excess_keys,
+    excess_style,
+    interpolated,
+    label_contours,
+    refined_axes,
+)
+from jaxgran.plotting.drawing import (
+    ALPHA_LABEL,
+    ALPHA_TITLE,
+    LABEL_SIZE,
+    NU_LABEL,
+    SMALL_SIZE,
+    add_ring_legend,
+    curve_key,
+    curve_styles,
+    empty_figure,
+    finest,
+    finish,
+    is_plane,
+    mark_bad,
+    missing_note,
+    ordered,
+    require_plane,
+    status_note,
+    suspect,
+)
+
+ERROR_LEVELS = {
+    "÷10": np.log(0.1),
+    "÷5": np.log(0.2),
+    "−50 %": np.log(0.5),
+    "−25 %": np.log(0.75),
+    "−10 %": np.log(0.9),
+    "−5 %": np.log(0.95),
+    "+5 %": np.log(1.05),
+    "+10 %": np.log(1.1),
+    "+25 %": np.log(1.25),
+    "+50 %": np.log(1.5),
+    "×2": np.log(2.0),
+    "×5": np.log(5.0),
+    "×10": np.log(10.0),
+}
+"""Contour values of the logarithm of a quotient, by the label of the quotient."""
+
+SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
+"""Contour values of the share of the clusters."""
+
+_QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
+_STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
+_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
+_SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
+_LEAST_EXCESS = 1e-5  # where its logarithmic axis begins at the latest
+_EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
+_CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
+_THEORY_NOTE = (
+    "Black contours: error, as a quotient less one (dashed where negative) or a factor; (a) is (b) times (c).\n"
+    "Theory: Enskog balance of the second moments of anisotropic Gaussian velocities, per size class.\n"
+    "Binary: measured kinetic stress plus that of the contacts if all collisions were binary"
+)
+
+
+def has_theory(data: xr.Dataset) -> bool:
+    """Return whether a map has what :func:`theory_errors` draws."""
+    return not what_lacks(data, *RATIO, *_NEEDED)
+
+
+def has_clusters(data: xr.Dataset) -> bool:
+    """Return whether a map has what :func:`cluster_shares` draws."""
+    return not what_lacks(data, *RATIO, *_SHARES)
+
+
+# ---------------------------------------------------------------------------------------------- theory
+
+
+def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the error of the theory in `pressure` or `shear_stress`, its two parts, and their standard errors.
+
+    ========== ============================ ==========================================================
+    total      ln(theory/measured)          standard error: that of the measured stress
+    assumption ln(binary/measured)          that of the measured ratio of contact to binary stress
+    closure    ln(theory/binary)            those of the kinetic and the binary stress, added
+    ========== ============================ ==========================================================
+
+    Here binary is the measured kinetic stress plus that of the contacts if collisions were binary. The total is the sum
+    of the other two. All are NaN where a quotient is not positive or not known.
+    """
+    names = quantity, f"theory_{quantity}", f"kinetic_{quantity}", f"binary_{quantity}"
+    measured, theory, kinetic, collisional = (data[name].values for name in names)
+    stderr, _, kinetic_error, collisional_error = (
+        data[f"{name}_stderr"].values if f"{name}_stderr" in data else np.zeros(()) for name in names
+    )
+    components = [(0, 0), (1, 1)] if quantity == "pressure" else [(0, 1)]
+    relative = np.abs(data.stress_ratio_stderr / data.stress_ratio)
+    ratio_error = np.mean([relative.isel(axis_a=a, axis_b=b).values for a, b in components], axis=0)
+    binary = kinetic + collisional
+    with np.errstate(divide="ignore", invalid="ignore"):
+        parts = {
+            "total": (np.log(theory / measured), stderr / measured),
+            "assumption": (np.log(binary / measured), collisional / binary * ratio_error),
+            "closure": (np.log(theory / binary), (kinetic_error + collisional_error) / binary),
+        }
+    return {name: (np.where(np.isfinite(value), value, np.nan), error) for name, (value, error) in parts.items()}
+
+
+def theory_errors(data: xr.Dataset) -> Figure:
+    """Return the error of kinetic theory over the plane of 1 − α and ν, and what it is due to.
+
+    Rows are pressure and shear stress; columns the total, the part of the binary assumption and that of the closure, as
+    in :func:`error_parts`. Contours in black have the error as their label, dashed where the theory is too low; dotted
+    is where the error is smaller than its standard error. Green contours are those of the excess of the force ratio.
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) what :func:`error_parts` needs, `force_ratio` and
+                                             `status`
+    returns  Figure
+    raises   ValueError                      fewer than two restitutions or two packing fractions
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO, *_NEEDED)
+    require_plane(data)
+    data = finest(ordered(data, *_STRESSES, "stress_ratio"))
+    titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
+    figure = empty_figure(width=7.6, height=5.9)
+    grid = figure.subplots(2, 3, sharex=True, sharey=True)
+    panels, noisy, over = [], False, {}
+    measured = np.ones(data.force_ratio.shape, bool)
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title, fontsize=LABEL_SIZE)
+    for axes in grid[1]:
+        axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
+    for row, quantity in zip(grid, _QUANTITIES, strict=True):
+        parts = error_parts(data, quantity)
+        measured &= np.isfinite(parts["total"][0])
+        for axes, (value, error) in zip(row, parts.values(), strict=True):
+            lines, hidden = _draw_errors(axes, data, value, error)
+            over = draw_excess(axes, data)
+            panels.append((axes, lines, over.values()))
+            noisy |= hidden
+        row[0].set_ylabel(f"{_QUANTITIES[quantity]}\n{NU_LABEL}", fontsize=LABEL_SIZE)
+    entries = excess_keys(over)
+    if noisy:
+        entries.insert(
+            0, Patch(facecolor="white", edgecolor="0.5", hatch="....", linewidth=0, label="within ± std. error")
+        )
+    add_plane_legend(figure, data, measured, entries)
+    finish(figure, data, measured, [_THEORY_NOTE, status_note(data), missing_note(measured, " (hatched)")])
+    figure.canvas.draw()
+    for axes, lines, over in panels:
+        label_contours(axes, list(lines.items()), over, room=4.0)
+    return figure
+
+
+def _draw_errors(
+    axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray
+) -> tuple[dict[str, QuadContourSet], bool]:
+    """Draw contours and faint shades of an error; return the lines by their labels, and whether noise hides a part."""
+    x, y = refined_axes(data)
+    field = interpolated(value)
+    bounds = [-1e9, *ERROR_LEVELS.values(), 1e9]
+    tints = 0.55 + 0.45 * colormaps["PuOr_r"](np.linspace(0.12, 0.88, len(bounds) - 1))
+    axes.contourf(x, y, field, bounds, colors=tints, zorder=1)
+    in_errors = field / np.ma.maximum(interpolated(error), 1e-12)
+    hidden = bool(np.ma.min(abs(in_errors), fill_value=np.inf) < 1.0)
+    if hidden:
+        dots = axes.contourf(x, y, in_errors, [-1.0, 1.0], colors="none", hatches=["...."], zorder=2)
+        dots.set_edgecolor("0.5")
+        dots.set_linewidth(0.0)
+    drawn = {}
+    for label, level in ERROR_LEVELS.items():
+        style = {"colors": "black", "linewidths": 0.9, "linestyles": "-" if level > 0.0 else "--", "zorder": 3}
+        line = draw_level(axes, x, y, field, level, **style)
+        if line is not None:
+            drawn[label] = line
+    draw_plane(axes, data, field, np.isfinite(value))
+    return drawn, hidden
+
+
+# -------------------------------------------------------------------------------------------- clusters
+
+
+def cluster_shares(data: xr.Dataset) -> Figure:
+    """Return the share of the contact stress that clusters of three or more grains carry, against the excess.
+
+    Left the shares of pressure and shear stress against the excess of the force ratio, a curve per restitution and a
+    symbol per packing fraction; right, where the map is a plane, contours of the share of the pressure, with those of
+    the excess in green.
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) `cluster_pressure_share`, `cluster_shear_share`,
+                                             `force_ratio`, with `_stderr`, and `status`
+    returns  Figure                          error bars are one standard error, in both directions
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO, *_SHARES)
+    data = finest(ordered(data, "cluster_pressure_share", "cluster_shear_share"))
+    shares = {"pressure": "cluster_pressure_share", "shear stress": "cluster_shear_share"}
+    measured = np.isfinite(data.cluster_pressure_share.values)
+    plane = is_plane(data)
+    figure = empty_figure(*((8.8, 4.6) if plane else (4.8, 4.6)))
+    axes = figure.subplot_mosaic("pm;sm" if plane else "p;s", width_ratios=(1.0, 1.15) if plane else None)
+    axes["s"].sharex(axes["p"])
+    for name, (quantity, share) in zip("ps", shares.items(), strict=True):
+        _draw_shares(axes[name], data, share)
+        axes[name].set_ylabel(f"share of {quantity}", fontsize=LABEL_SIZE)
+    axes["p"].tick_params(labelbottom=False)
+    axes["s"].set_xlabel(_EXCESS_LABEL, fontsize=LABEL_SIZE)
+    left_out = int((measured & ~(_set_excess_scale(axes["p"], data))).sum())
+    lines, over = {}, {}
+    if plane:
+        lines, over = _draw_share_plane(axes["m"], data, measured)
+        add_plane_legend(figure, data, measured, excess_keys(over))
+    else:
+        add_ring_legend(figure, data, "outside upper right")
+    _add_share_legend(figure, data)
+    beyond = f"{left_out} of {measured.size} points have an excess too small for its axis" if left_out else ""
+    finish(figure, data, measured, [_CLUSTER_NOTE, beyond, status_note(data), missing_note(measured)])
+    figure.canvas.draw()
+    if plane:
+        label_contours(axes["m"], [(f"{level:.2f}", line) for level, line in lines.items()], over.values())
+    return figure
+
+
+def _draw_shares(axes: Axes, data: xr.Dataset, name: str) -> None:
+    """Draw a share against the excess: a line for each restitution, a symbol for each packing fraction."""
+    axes.set_xscale("log")
+    styles, symbols = (curve_styles(data.sizes[name]) for name in ("restitution", "packing_fraction"))
+    excess, share, bad = data.force_ratio.values - 1.0, data[name].values, suspect(data)
+    x_error, y_error = data.force_ratio_stderr.values, data[f"{name}_stderr"].values
+    for k, style in enumerate(styles):
+        errors = {"xerr": x_error[:, k], "yerr": y_error[:, k], "elinewidth": 0.8, "capsize": 2}
+        line = {"color": style["color"], "linestyle": style["linestyle"], "linewidth": 0.9}
+        axes.errorbar(excess[:, k], share[:, k], **errors, **line, zorder=2)
+    colours = [style["color"] for style in styles]
+    for k, symbol in enumerate(symbols):
+        faces = ["white" if open_ else colour for open_, colour in zip(bad[k], colours, strict=True)]
+        mark = {"marker": symbol["marker"], "s": 16, "facecolors": faces, "edgecolors": colours}
+        axes.scatter(excess[k], share[k], **mark, zorder=4)
+    mark_bad(axes, excess[bad], share[bad])
+    for level in EXCESS_LEVELS:
+        axes.axvline(level, **(excess_style("color", "linewidth", level) | {"zorder": 0.5, "alpha": 0.3}))
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_yticks((0.0, 0.25, 0.5, 0.75, 1.0))
+    axes.grid(axis="y", color="0.9", linewidth=0.6, zorder=0)
+
+
+def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
+    """Limit the logarithmic axis of the excess to the measured ones, and return which points lie on it."""
+    excess, stderr = data.force_ratio.values - 1.0, np.nan_to_num(data.force_ratio_stderr.values)
+    shown = excess >= _LEAST_EXCESS
+    if shown.any():
+        axes.set_xlim(excess[shown].min() / 1.6, (excess + stderr)[shown].max() * 1.3)
+    return shown
+
+
+def _draw_share_plane(
+    axes: Axes, data: xr.Dataset, measured: np.ndarray
+) -> tuple[dict[float, QuadContourSet], dict[float, QuadContourSet]]:
+    """Draw the share of the pressure over the plane; return its contours and those of the excess."""
+    x, y = refined_axes(data)
+    field = interpolated(data.cluster_pressure_share.values)
+    greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
+    axes.contourf(x, y, field, [-1e9, *SHARE_LEVELS, 1e9], colors=greys, zorder=1)
+    style = {"colors": "black", "linewidths": 1.0, "zorder": 3}
+    lines = {level: draw_level(axes, x, y, field, level, **style) for level in SHARE_LEVELS}
+    over = draw_excess(axes, data)
+    draw_plane(axes, data, field, measured)
+    axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
+    axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
+    axes.set_title("share of pressure", fontsize=LABEL_SIZE)
+    return {level: line for level, line in lines.items() if line is not None}, over
+
+
+def _add_share_legend(figure: Figure, data: xr.Dataset) -> None:
+    """Name the lines and the symbols of the shares beside their panels."""
+    lines = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
+    symbols = zip(data.packing_fraction.values, curve_styles(data.sizes["packing_fraction"]), strict=True)
+    plain = {"linestyle": "none", "color": "0.3"}
+    by_alpha = [curve_key(style | {"marker": ""}, f"{alpha:.4g}") for alpha, style in lines]
+    by_nu = [curve_key(style | plain, f"{nu:.4g}") for nu, style in symbols]
+    heading = Line2D([], [], linestyle="none", label=NU_LABEL)
+    figure.legend(
+        handles=[*by_alpha, heading, *by_nu[::-1]],
+        title=ALPHA_TITLE,
+        loc="outside left upper",
+        fontsize=SMALL_SIZE + 0.5,
+        title_fontsize=SMALL_SIZE + 0.5,
+        alignment="left",
+        frameon=False,
+        handlelength=3.2,
+    )
