@@ -22,7 +22,7 @@ from matplotlib.ticker import NullFormatter, PercentFormatter, StrMethodFormatte
 import jaxgran as jg
 from jaxgran.inference.closure import LAWS
 from jaxgran.inference.cross_validation import leave_one_out
-from jaxgran.maps.dataset import read_dataset
+from jaxgran.maps.results import read_dataset
 from jaxgran.maps.sweep import usable_cores
 
 RESTITUTION, PACKING_FRACTION = [0.2, 0.35, 0.5, 0.65, 0.8], [0.5, 0.6, 0.65, 0.7, 0.75, 0.79]

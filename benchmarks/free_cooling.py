@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import jaxgran as jg
-from jaxgran.theory.kinetic_theory import contact_value
+from jaxgran.theory.steady_shear import contact_value
 
 ALPHAS, NU, TIMESTEP = (0.8, 0.9, 0.95), 0.3, 2e-3
 EQUILIBRATION = np.linspace(0.1, 5.0, 40)  # at T = 1, a dozen collisions a grain; as many times as are recorded

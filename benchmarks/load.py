@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 
 from jaxgran.maps import sweep
 from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.dataset import map_dataset, write_dataset
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.results import write_dataset
 from jaxgran.maps.settings import MapSettings
 
 

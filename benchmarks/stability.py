@@ -28,7 +28,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.steady_state import predicted

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from jaxgran.maps.sweep import usable_cores
-from jaxgran.theory.kinetic_theory import garzo_dufty, gaussian_moments, jenkins_richman
+from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 
 THEORIES = {"moments": gaussian_moments, "Garzó–Dufty": garzo_dufty, "Jenkins–Richman": jenkins_richman}
 NAMES = ("pressure", "shear_stress", "granular_temperature", "collision_rate")

@@ -1,9 +1,9 @@
 """The public names of jaxgran and where they live; they load when they are first used."""
 
 from .analysis.coarse_graining import gaussian, heaviside, lucy
-from .analysis.fields import Fields, fields_at
+from .analysis.fields import Fields, fields_at, grid
 from .dynamics.advance import advance
-from .dynamics.plain import State, count_events
+from .dynamics.plain import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
 from .inference.closure import Closure, predict
@@ -13,12 +13,15 @@ from .inference.restitution import RestitutionFit, fit_restitution
 from .inference.stress_inversion import restitution_from_stresses
 from .io.trajectory import Trajectory, read_trajectory
 from .maps.sweep import ratio_map
+from .model.checks import InputError
 from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
+from .model.state import State
 from .model.status import Status
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
-from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves, save_figures
+from .plotting.map_figures import save_figures
+from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.theory import cluster_shares, theory_errors
 from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
@@ -31,6 +34,7 @@ __all__ = [
     "Cooling",
     "Fields",
     "Grains",
+    "InputError",
     "RestitutionFit",
     "Sample",
     "ShearFlow",
@@ -50,6 +54,7 @@ __all__ = [
     "friction_figure",
     "friction_law",
     "gaussian",
+    "grid",
     "heated",
     "heaviside",
     "lucy",

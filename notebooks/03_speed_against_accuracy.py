@@ -31,7 +31,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.sampling.timestep import automatic_timestep, expected_temperature, stress_error
-from jaxgran.theory.kinetic_theory import gaussian_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments
 
 jax.config.update("jax_enable_x64", True)
 quick = bool(os.environ.get("QUICK"))

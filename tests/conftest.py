@@ -32,9 +32,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from jaxgran.contact.solver import solve  # noqa: E402
-from jaxgran.dynamics.plain import State, advance  # noqa: E402
+from jaxgran.dynamics.plain import advance  # noqa: E402
 from jaxgran.model.flow import ShearFlow  # noqa: E402
 from jaxgran.model.grains import Grains  # noqa: E402
+from jaxgran.model.state import State  # noqa: E402
 from jaxgran.sampling.packing import pack  # noqa: E402
 
 GRAINS = 32

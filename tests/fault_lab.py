@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
-from jaxgran.maps.dataset import read_dataset
+from jaxgran.maps.results import read_dataset
 
 MARKS = [
     pytest.mark.faults,

@@ -3,13 +3,13 @@
 import numpy as np
 
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import Tally
 from jaxgran.maps.dataset import Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.sample import BLOCKS, Sample
 

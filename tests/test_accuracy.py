@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from run_chart import on_front
 
-from jaxgran.dynamics.plain import DEEP_OVERLAP
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.steady_state import predicted
 from jaxgran.sampling.timestep import (

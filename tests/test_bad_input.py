@@ -28,9 +28,9 @@ from jaxgran.analysis import fields
 from jaxgran.dynamics import snapshots
 from jaxgran.maps import settings as map_settings
 from jaxgran.maps import sweep
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
-from jaxgran.sampling import free_cooling, sample, steady_state
+from jaxgran.sampling import free_cooling, sample, steady_state, timestep
 
 GRAINS = 32
 FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
@@ -304,7 +304,7 @@ def test_a_refusal_says_what_is_accepted(case: str) -> None:
 def test_prepare_refuses_a_time_step_too_short_to_count_before_it_packs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steady_state, "_heated", would_run)
     with pytest.raises(InputError, match="timestep must be at least 1e-08 / shear_rate"):
-        steady_state.check_timestep(make_flow("timestep", 1e-12), None)
+        timestep.check_timestep(make_flow("timestep", 1e-12), None)
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.inference.restitution import fit_restitution
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.sampling.packing import pack
 
 GRAINS, FRAMES, STRAIN, NOISE = 64, 100, 0.5, 0.01

@@ -18,7 +18,7 @@ from jaxgran.maps import checkpoint
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import Key, Replica
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 
 SETTINGS = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0)

@@ -30,8 +30,9 @@ from jaxgran.cli.terminal import print_table
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import sweep
-from jaxgran.maps.dataset import NOT_RUN, read_dataset, write_dataset
-from jaxgran.model.flow import InputError
+from jaxgran.maps.dataset import NOT_RUN
+from jaxgran.maps.results import read_dataset, write_dataset
+from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import movie
 
@@ -607,7 +608,7 @@ def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeyp
         raise KeyboardInterrupt
 
     monkeypatch.setattr(map_module, "say_written", interrupts)
-    monkeypatch.setattr("jaxgran.maps.dataset.read_dataset", interrupts)
+    monkeypatch.setattr("jaxgran.maps.results.read_dataset", interrupts)
     outcome = jaxgran(tmp_path, "plot", "map.nc")
     assert (outcome.status, outcome.out) == (130, "")
     assert outcome.err.strip() == "jaxgran: interrupted."

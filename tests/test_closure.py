@@ -13,7 +13,7 @@ from jaxgran.inference.closure import LAWS, Closure, Law, predict
 from jaxgran.inference.closure_fit import closure_points, fit_closure
 from jaxgran.inference.cross_validation import leave_one_out
 from jaxgran.inference.stress_inversion import restitution_from_stresses
-from jaxgran.theory.kinetic_theory import gaussian_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHA, NU = (0.2, 0.35, 0.5, 0.65, 0.8), (0.5, 0.6, 0.65, 0.7, 0.75, 0.79)
 SCATTER = 0.02

@@ -10,8 +10,8 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran.maps.cluster import run_on_cluster
-from jaxgran.maps.dataset import read_dataset
-from jaxgran.model.flow import InputError
+from jaxgran.maps.results import read_dataset
+from jaxgran.model.checks import InputError
 
 MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "slurm_map.py"

@@ -8,12 +8,13 @@ import pytest
 import xarray as xr
 from synthetic import one_sentence, random_replica
 
-from jaxgran.maps.dataset import NOT_RUN, THEORY, Key, Replica, check_output, map_dataset, read_dataset, write_dataset
+from jaxgran.maps.dataset import NOT_RUN, THEORY, Key, Replica, map_dataset
+from jaxgran.maps.results import check_output, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
-from jaxgran.theory.kinetic_theory import gaussian_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
 RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran.dynamics.plain import State
 from jaxgran.model.display import Row, html_of, text_of, value_text
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.sample import BLOCKS, Sample
 

@@ -9,8 +9,9 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
-from jaxgran.dynamics import plain
-from jaxgran.dynamics.plain import advance, contact_capacities, contacts_now
+from jaxgran.dynamics import collision
+from jaxgran.dynamics.collision import contact_capacities, contacts_now
+from jaxgran.dynamics.plain import advance
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.cell import displacement, remap_tilt
 from jaxgran.model.flow import ShearFlow
@@ -169,7 +170,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(run, flowing):
 def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     """A ladder of buffers that ends too early drops contacts, and says so."""
     state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
-    monkeypatch.setattr(plain, "contact_capacities", lambda grains: (1, 2))
+    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (1, 2))
     _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 

@@ -17,7 +17,7 @@ import pytest
 from fault_lab import MARKS, Lab, workers_of
 
 from jaxgran.maps import sweep
-from jaxgran.maps.dataset import read_dataset
+from jaxgran.maps.results import read_dataset
 from jaxgran.maps.settings import MapSettings
 
 pytestmark = MARKS

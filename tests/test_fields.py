@@ -20,7 +20,8 @@ from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside
 from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.observables import averages
 
 GRAINS = pytest.GRAINS

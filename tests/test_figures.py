@@ -10,7 +10,8 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves, save_figures
+from jaxgran.plotting.map_figures import save_figures
+from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
 
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxgran.model.flow import MAX_PACKING_FRACTION, MIN_GRAINS, InputError, ShearFlow, require_sheared
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import MAX_PACKING_FRACTION, MIN_GRAINS, ShearFlow, require_sheared
 
 FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
 NUMBERS = (

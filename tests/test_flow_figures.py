@@ -15,7 +15,7 @@ from synthetic import one_sentence, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis.force_chains import pair_forces
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.plotting import flow, movie
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import Scale, common_scale, draw_scene, flow_figure, scene_of

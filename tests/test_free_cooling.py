@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import snapshot_series
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.free_cooling import Cooling, _cooling, cooling
 from jaxgran.sampling.sample import sample
 from jaxgran.sampling.steady_state import heated, prepare
-from jaxgran.theory.kinetic_theory import contact_value
+from jaxgran.theory.steady_shear import contact_value
 
 GRAINS, NU, ALPHA, SEEDS = 64, 0.3, 0.95, 8
 FLOW = ShearFlow(GRAINS, ALPHA, NU, 1e-3, shear_rate=0.0, polydispersity=0.0)

@@ -16,11 +16,12 @@ from jaxgran.analysis.sensitivity import margins
 from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics.plain import State, advance, count_events
+from jaxgran.dynamics.plain import advance, count_events
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, MAX_DISCS))

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.model.grains import own_grains, polydisperse
 
 EPS = np.finfo(float).eps

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran.dynamics.plain import State
 from jaxgran.io.atomic import Damaged, read_arrays
 from jaxgran.maps import journal as journal_module
 from jaxgran.maps.journal import Journal
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 

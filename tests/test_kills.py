@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from fault_lab import MARKS, PATIENCE, Lab
 
-from jaxgran.maps.dataset import read_dataset
+from jaxgran.maps.results import read_dataset
 
 pytestmark = MARKS
 KILLS = {1: 14, 2: 6}  # by the number of workers

@@ -9,7 +9,8 @@ from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_c
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.observables import averages
-from jaxgran.theory.kinetic_theory import contact_value, gaussian_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.steady_shear import contact_value
 
 GRAINS = pytest.GRAINS
 STRAIN = 40.0

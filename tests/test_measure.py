@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from synthetic import one_sentence, random_tally
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.tally import EXTREMES
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.observables import OBSERVABLES

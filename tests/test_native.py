@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.machine_code import loop
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.dynamics.thread_block import kernel, solver
+from jaxgran.model.checks import InputError
 from jaxgran.model.control_flow import AXIS
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 GRAINS = pytest.GRAINS

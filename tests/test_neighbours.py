@@ -9,11 +9,12 @@ from scipy.spatial import cKDTree
 
 from jaxgran.contact import near_pairs
 from jaxgran.contact.cell_list import _cells_per_side, cell_list_pairs, set_bit
-from jaxgran.dynamics import plain
-from jaxgran.dynamics.plain import State, advance
+from jaxgran.dynamics import collision
+from jaxgran.dynamics.plain import advance
 from jaxgran.model.cell import cell_side, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 
 TILTS = (-0.5, -0.2, 0.0, 0.31, 0.499)
 PACKING_FRACTIONS = (0.1, 0.6, 0.82)
@@ -163,7 +164,7 @@ def test_a_flow_is_the_same_with_cell_lists_as_with_all_pairs(monkeypatch):
     velocities = jax.random.normal(key, (count, 2))
     state = State(grains, lattice, velocities - velocities.mean(axis=0, keepdims=True), side, jnp.asarray(0.3))
     flow = ShearFlow(grains=count, restitution=0.7, packing_fraction=0.6, timestep=1e-3, tolerance=1e-8)
-    monkeypatch.setattr(plain, "contact_capacities", lambda grains: (3 * grains,))  # quicker to compile
+    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (3 * grains,))  # quicker to compile
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         by_cells, tally = jax.jit(lambda start, steps: advance(flow, start, steps))(state, jnp.int32(100))
         monkeypatch.setattr(near_pairs, "ALL_PAIRS_LIMIT", count)

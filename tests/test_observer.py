@@ -7,7 +7,8 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS, sample
 
 GRAINS, STRAIN = pytest.GRAINS, 0.32

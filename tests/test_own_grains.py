@@ -14,14 +14,15 @@ from synthetic import one_sentence
 from test_pairs import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact.near_pairs import widest_skin
-from jaxgran.dynamics.plain import State
 from jaxgran.model.cell import cell_side
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains, own_grains, polydisperse
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.steady_state import _classes, heated, predicted, prepare
-from jaxgran.theory.kinetic_theory import gaussian_moments, mixture_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
 GRAINS = pytest.GRAINS
 EVEN = np.arange(GRAINS) % 2 == 0

@@ -8,7 +8,7 @@ import pytest
 from peers import front, jax_md_dense, jaxgran_itself, lammps, numba_rival
 from peers.problem import Discs, Flow, damping_ratio, overlaps
 
-from jaxgran.dynamics.plain import State
+from jaxgran.model.state import State
 
 SOFT = {"lammps": lammps, "jax_md_dense": jax_md_dense}
 PEERS = {"jaxgran_itself": jaxgran_itself, "numba_rival": numba_rival, **SOFT}

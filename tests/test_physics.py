@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from oracles import gaps_of, kinetic_energy
 
-from jaxgran.dynamics.plain import State
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import averages
 

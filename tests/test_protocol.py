@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.sampling import steady_state
+from jaxgran.sampling import steady_state, timestep
 from jaxgran.sampling.batch import advance_batch, reporting, stack
 from jaxgran.sampling.sample import relative_error
-from jaxgran.sampling.steady_state import Batch, check_timestep, predicted, prepare, prepare_batch, sample_batch
+from jaxgran.sampling.steady_state import Batch, predicted, prepare, prepare_batch, sample_batch
+from jaxgran.sampling.timestep import check_timestep
 
 GRAINS, TIMESTEP = 64, 1e-2
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
@@ -169,8 +171,8 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
 
 def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     flow = with_timesteps(1e-4, 2e-2)
-    coarse = np.asarray(steady_state._coarse_timestep(flow, predicted(flow)))
-    assert coarse[0] == steady_state.COARSE_TIMESTEP
+    coarse = np.asarray(timestep.coarse_timestep(flow, predicted(flow)))
+    assert coarse[0] == timestep.COARSE_TIMESTEP
     assert coarse[1] == 2e-2
 
 

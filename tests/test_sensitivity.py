@@ -9,7 +9,8 @@ import pytest
 
 from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
 from jaxgran.model.cell import displacement
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 
 
 def flow_of(restitution) -> ShearFlow:

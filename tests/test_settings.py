@@ -8,7 +8,7 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran.maps.settings import MapSettings, automatic
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 
 GOOD: dict[str, Any] = {
     "restitution": (0.5, 0.9),

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import stability
 
-from jaxgran.dynamics.plain import DEEP_OVERLAP, State
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.model.status import Status
+from jaxgran.model.state import State
+from jaxgran.model.status import DEEP_OVERLAP, Status
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.sample import sample
 

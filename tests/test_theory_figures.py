@@ -16,7 +16,7 @@ from test_rheology import dense_map
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
 from jaxgran.plotting.friction import friction_figure, parameters_text
-from jaxgran.plotting.ratio import save_figures
+from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
 
 DIMS = ("packing_fraction", "restitution")

@@ -22,7 +22,8 @@ from jaxgran.io.trajectory import (
     write_frame,
 )
 from jaxgran.model.cell import displacement
-from jaxgran.model.flow import InputError, ShearFlow
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.recorder import Recorder
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax.scipy.special import erf
 from jaxtyping import Array, Float
 
-from jaxgran.model.flow import require_number
+from jaxgran.model.checks import require_number
 
 
 class Kernel(NamedTuple):

@@ -26,10 +26,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.analysis.coarse_graining import CoarseGraining
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import Snapshot, collided
 from jaxgran.model.cell import displacement
-from jaxgran.model.flow import InputError, require, shown
+from jaxgran.model.checks import InputError, require, shown
+from jaxgran.model.state import State
 
 _POINTS_AT_ONCE, _BRANCHES_AT_ONCE = 128, 128
 _dot = partial(jnp.dot, precision=lax.Precision.HIGHEST)

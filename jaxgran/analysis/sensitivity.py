@@ -20,10 +20,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.network import first_contact_time
-from jaxgran.dynamics.plain import State, advance, require_state
+from jaxgran.dynamics.plain import advance
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import displacement, relative_velocity
-from jaxgran.model.flow import ShearFlow, require_strain, require_whole
+from jaxgran.model.checks import require_whole
+from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.state import State, require_state
 
 _MOST_POINTS = 10**6
 

@@ -21,7 +21,7 @@ from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_comma
 from jaxgran.cli.mistakes import UsageError, by_option, in_words
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
 from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, stop
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 
 EXAMPLES = {
     "Where binary collisions are all there is, and where they are not": "jaxgran map",

@@ -5,7 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from jaxgran.model.flow import MAX_REPLICAS, InputError, shown
+from jaxgran.model.checks import InputError, shown
+from jaxgran.model.flow import MAX_REPLICAS
 
 FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
 

@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 
 from jaxgran.cli.terminal import BAD_STATUS, configured_jax, print_table, stop, with_error
-from jaxgran.model.flow import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, shown
 
 _FAR_FROM_A_LAW = 9.0  # χ² of stresses that belong to no restitution of a map
 
@@ -78,7 +78,7 @@ def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: fl
     from jaxgran.inference.closure_fit import fit_closure
     from jaxgran.inference.cross_validation import leave_one_out
     from jaxgran.inference.stress_inversion import restitution_from_stresses
-    from jaxgran.maps.dataset import read_dataset
+    from jaxgran.maps.results import read_dataset
 
     data = read_dataset(file)
     closure, errors = fit_closure(data), leave_one_out(data)

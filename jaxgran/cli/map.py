@@ -11,7 +11,8 @@ from rich.table import Table
 from jaxgran.cli.arguments import RelativeError, batch_size, first_strain, number_list, numbers_or_auto
 from jaxgran.cli.measure import by_timestep, finish, measured
 from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
-from jaxgran.model.flow import Activation, InputError, Solver, shown
+from jaxgran.model.checks import InputError, shown
+from jaxgran.model.flow import Activation, Solver
 
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {
@@ -105,7 +106,7 @@ def map_command(
             chosen[name] = number_list(chosen[name], name)
     data, interrupted = measured(chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler)
 
-    from jaxgran.plotting.ratio import save_figures
+    from jaxgran.plotting.map_figures import save_figures
 
     pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
     for one in by_timestep(data):
@@ -118,8 +119,8 @@ def plot_command(
     output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
 ) -> None:
     """Draw the figures of a map that has been run."""
-    from jaxgran.maps.dataset import read_dataset
-    from jaxgran.plotting.ratio import save_figures
+    from jaxgran.maps.results import read_dataset
+    from jaxgran.plotting.map_figures import save_figures
 
     data = read_dataset(file)
     folder = file.parent if output is None else output
@@ -131,7 +132,7 @@ def plot_command(
 def _like(file: Path) -> dict[str, Any]:
     """The choices of the map in a file; what else could change its numbers is said on standard error."""
     configured_jax()
-    from jaxgran.maps.dataset import choices_of, differences, read_dataset
+    from jaxgran.maps.results import choices_of, differences, read_dataset
     from jaxgran.maps.settings import MapSettings
 
     data = read_dataset(file)

@@ -40,7 +40,8 @@ def measured(
     """
     jax = configured_jax()
     from jaxgran.maps.checkpoint import Checkpoint
-    from jaxgran.maps.dataset import check_output, map_dataset, write_dataset
+    from jaxgran.maps.dataset import map_dataset
+    from jaxgran.maps.results import check_output, write_dataset
     from jaxgran.maps.settings import MapSettings, automatic
     from jaxgran.maps.sweep import check_batches, predicted_cost, replicas, usable_cores
 

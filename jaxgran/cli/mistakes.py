@@ -5,7 +5,7 @@ from typing import Any
 
 import typer
 
-from jaxgran.model.flow import shown
+from jaxgran.model.checks import shown
 
 UsageError: Any = typer.BadParameter.__base__  # what typer raises for options that it cannot read
 _LONGEST = 500  # letters of a sentence, of which a mistake may quote more

@@ -13,7 +13,7 @@ from jaxgran.cli.arguments import RelativeError, first_strain, numbers_or_auto
 from jaxgran.cli.measure import finish, measured
 from jaxgran.cli.progress import counted
 from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
-from jaxgran.model.flow import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, shown
 
 MOST_RECORDED = 100_000  # of a trajectory
 

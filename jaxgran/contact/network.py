@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.law import gap_coefficients, overlaps_within, time_to_touch
 from jaxgran.contact.near_pairs import PairList
 from jaxgran.model.grains import Grains
 
@@ -81,33 +82,6 @@ def first_contact_time(
       (1.0, 2.0)
     """
     return time_to_touch(*_gaps(separations, velocities, reach))
-
-
-def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: float | Array) -> tuple:
-    """The rule of ``is_contact`` for pairs of any shape: whether they are contacts, and whether they approach.
-
-    Args:
-      squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
-      look_ahead: θ·dt.
-    """
-    approaching = closing < 0
-    before_closest = -closing < squared_speed * look_ahead
-    t = jnp.where(approaching & before_closest, -closing / jnp.where(approaching, squared_speed, 1), look_ahead)
-    return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
-
-
-def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
-    """The times of ``first_contact_time`` from the numbers that ``overlaps_within`` takes."""
-    discriminant = closing * closing - squared_speed * excess
-    touches = (closing < 0) & (discriminant >= 0)
-    time = excess / (jnp.sqrt(jnp.where(touches, discriminant, 1)) - jnp.where(touches, closing, 0))
-    closest = -closing / jnp.where(closing < 0, squared_speed, 1)
-    return jnp.where(touches, time, jnp.inf), closest
-
-
-def gap_coefficients(x: Array, y: Array, ux: Array, uy: Array, reach: Array) -> tuple[Array, Array, Array]:
-    """|u|², s·u and |s|² − d², the coefficients of |s + u t|² − d²."""
-    return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach**2
 
 
 def _gaps(separations: Array, velocities: Array, reach: Array) -> tuple[Array, Array, Array]:

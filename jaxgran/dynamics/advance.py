@@ -26,11 +26,12 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.dynamics import plain as plain_module
-from jaxgran.dynamics.plain import State, ended, require_advance
+from jaxgran.dynamics.plain import ended, require_advance
 from jaxgran.dynamics.tally import FLAT_SUMS, Sums, Tally
 from jaxgran.model.cell import wrap
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 
 _TARGET = "jaxgran_advance"
 MOST_GRAINS = 1024  # of a thread block: the threads that it can have

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.contact.network import Contacts
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
 Look = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses

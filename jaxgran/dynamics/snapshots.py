@@ -16,9 +16,11 @@ from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.plain import State, contacts_now, require_state
+from jaxgran.dynamics.collision import contacts_now
 from jaxgran.model.cell import remap_tilt, wrap
-from jaxgran.model.flow import ShearFlow, require_strain, require_whole
+from jaxgran.model.checks import require_whole
+from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.state import State, require_state
 
 _MOST_SNAPSHOTS = 10**9  # times grains
 

@@ -27,8 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.model.flow import MAX_PACKING_FRACTION, InputError, require, require_number, shown
-from jaxgran.theory.kinetic_theory import Scalar, gaussian_moments
+from jaxgran.model.checks import InputError, require, require_number, shown
+from jaxgran.model.flow import MAX_PACKING_FRACTION
+from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.steady_shear import Scalar
 
 Numbers = Array | np.ndarray
 

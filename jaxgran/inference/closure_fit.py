@@ -13,21 +13,13 @@ import xarray as xr
 from jaxtyping import Array
 from scipy.optimize import brentq
 
-from jaxgran.inference.closure import (
-    LAWS,
-    NEEDED,
-    Closure,
-    Law,
-    broadcast,
-    excess_terms,
-    require_jamming,
-    stress_terms,
-)
+from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, broadcast, excess_terms, require_jamming, stress_terms
 from jaxgran.maps.schema import require_map
-from jaxgran.model.flow import MAX_PACKING_FRACTION, InputError
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
 from jaxgran.sampling.timestep import JAMMING
-from jaxgran.theory.kinetic_theory import gaussian_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments
 
 FEWEST_POINTS, FEWEST_VALUES = 12, 3  # points of a map, and values of each axis among them
 _LEAST_ERROR = 1e-4  # relative, of a measured value: blocks without a single cluster agree by chance

@@ -17,7 +17,7 @@ import xarray as xr
 from scipy.optimize import curve_fit
 
 from jaxgran.maps.schema import require_map
-from jaxgran.model.flow import InputError, require_number
+from jaxgran.model.checks import InputError, require_number
 from jaxgran.model.status import Status
 
 LARGEST_INERTIAL_NUMBER, SMALLEST_PACKING_FRACTION = 0.3, 0.7  # of a dense flow

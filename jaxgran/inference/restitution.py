@@ -22,8 +22,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.dynamics.plain import State, advance
-from jaxgran.model.flow import MAX_STEPS, InputError, ShearFlow, require_number, shown
+from jaxgran.dynamics.plain import advance
+from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.flow import MAX_STEPS, ShearFlow
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.inference.closure import Closure, broadcast, each, log_laws, of_type, require_closure, require_fraction
-from jaxgran.model.flow import require
-from jaxgran.theory.kinetic_theory import Scalar
+from jaxgran.model.checks import require
+from jaxgran.theory.steady_shear import Scalar
 
 _GRID, _FINER = 33, 16  # restitutions at which a law is evaluated, and between two of them at which it is interpolated
 _REFINEMENTS = 10  # Gauss–Newton steps from the best of the grid

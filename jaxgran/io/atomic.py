@@ -22,7 +22,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 
 _DIGEST = hashlib.sha256().digest_size
 _LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside a file are longer

@@ -38,12 +38,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.io.atomic import replaced, require_place
 from jaxgran.model.cell import centred, remap_tilt, wrap
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd refuse
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
 from jaxgran.maps.pool import Died
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
 _PATIENCE = "10s"  # to find the scheduler

@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.sampling.batch import Drive
 
 SECONDS = 5.0  # between two writings of a journal

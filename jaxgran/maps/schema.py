@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 
 RATIO = ("force_ratio", "force_ratio_stderr")
 _AXES = ("packing_fraction", "restitution")

@@ -8,19 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.model.flow import (
-    MAX_REPLICAS,
-    MAX_STEPS,
-    SHORTEST_TIMESTEP,
-    Activation,
-    InputError,
-    ShearFlow,
-    Solver,
-    require_number,
-    require_whole,
-    shown,
-    two_digits,
-)
+from jaxgran.model.checks import InputError, require_number, require_whole, shown, two_digits
+from jaxgran.model.flow import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, ShearFlow, Solver
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.steady_state import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep

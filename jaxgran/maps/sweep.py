@@ -29,10 +29,12 @@ from jaxgran.maps.dataset import Key, Replica, map_dataset
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.pool import Died, run_tasks, send
 from jaxgran.maps.settings import MapSettings, automatic
-from jaxgran.model.flow import MAX_REPLICAS, Activation, InputError, ShearFlow, Solver, shown
+from jaxgran.model.checks import InputError, shown
+from jaxgran.model.flow import MAX_REPLICAS, Activation, ShearFlow, Solver
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, reporting, stack
-from jaxgran.sampling.steady_state import COARSE_TIMESTEP, prepare_batch, sample_batch
+from jaxgran.sampling.steady_state import prepare_batch, sample_batch
+from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
 _LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
 _SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs

@@ -76,7 +76,7 @@ def _numbers(value: Any) -> np.ndarray | None:
     return array if array.dtype.kind in "iuf" else None
 
 
-def methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
+def display_methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
     """The methods ``__repr__`` and ``_repr_html_`` of a class, from a function that lists the rows of an object."""
     return lambda self: text_of(title, rows(self)), lambda self: html_of(title, rows(self), _UNITS)
 

@@ -2,14 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from reprlib import Repr
 from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.model.display import Row, methods
+from jaxgran.model.checks import InputError, known, require, require_number, require_whole, shown
+from jaxgran.model.display import Row, display_methods
 
 Activation = Literal["midpoint", "touching"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
@@ -19,10 +19,6 @@ MIN_GRAINS, MAX_GRAINS = 16, 10**7  # more would need some 20 GB
 MAX_REPLICAS = 10**6  # of a map
 MAX_STEPS = 2**31 - 1  # of a sample: they are counted in an int32
 SHORTEST_TIMESTEP = 1e-8  # in 1/shear_rate: the longest block of a run has fewer steps than MAX_STEPS
-
-
-class InputError(ValueError):
-    """A mistake in what a user gave; the message is one sentence that says what is accepted."""
 
 
 _STATIC = {"static": True}
@@ -77,7 +73,7 @@ class ShearFlow:
     activation: Activation = field(default="midpoint", metadata=_STATIC)
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
 
-    __repr__, _repr_html_ = methods("ShearFlow", _rows)
+    __repr__, _repr_html_ = display_methods("ShearFlow", _rows)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
@@ -90,7 +86,7 @@ class ShearFlow:
         shapes = sorted({np.shape(getattr(self, name)) for name in _RANGES} - {()})
         if len(shapes) > 1:
             raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {shown(shapes)}.")
-        timestep, shear_rate = _known(self.timestep), _known(self.shear_rate)
+        timestep, shear_rate = known(self.timestep), known(self.shear_rate)
         with np.errstate(over="ignore"):
             too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
         if too_long:
@@ -139,65 +135,6 @@ _RANGES = {
 }
 
 
-def _known(value: Any) -> np.ndarray | None:
-    """The value as an array, of numbers if it is a number or an array of them; None while it is traced."""
-    if isinstance(value, Tracer):
-        return None
-    key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
-    number = isinstance(value, (bool, int, float, np.generic, np.ndarray, jax.Array)) and not key
-    number = number and not isinstance(value, np.ma.MaskedArray)  # whose values need not mean anything
-    return np.asarray(value if number else None)
-
-
-def two_digits(value: float, up: bool) -> str:
-    """A positive number as 1.2e-03, rounded to the side of a limit on which it is still accepted."""
-    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
-
-
-_BRIEF = Repr()
-_BRIEF.maxother = _BRIEF.maxstring = 100
-
-
-def shown(value: Any) -> str:
-    """A value as one short line, for a sentence."""
-    try:
-        return " ".join(_BRIEF.repr(value).split())
-    except ValueError:  # of a whole number with thousands of digits
-        return f"this {type(value).__name__}"
-
-
-def require(name: str, value, accepts, words: str) -> None:
-    """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
-    known = _known(value)
-    if known is None:
-        return
-    if known.dtype.kind not in "iuf" or known.size == 0 or not np.all(accepts(known)):
-        raise InputError(f"{name} must be {words}, not {shown(value)}.")
-
-
-def listed(values: Any) -> Any:
-    """A list of numbers as the array it stands for; anything else, to be judged, as it is."""
-    numbers = isinstance(values, (list, tuple)) and all(
-        isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
-        for x in values
-    )
-    return np.asarray(values, float) if numbers else values
-
-
-def require_number(name: str, value, accepts, words: str) -> None:
-    """The same for what must be a single number."""
-    require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
-
-
-def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
-    """Raise an InputError that says what is accepted, and why not more, unless the value is such a whole number."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(f"{name} must be a whole number of at least {least}, not {shown(value)}.")
-    if value > most:
-        raise InputError(f"{name} must be at most {most}, {why}, not {shown(value)}.")
-
-
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
     """Raise an InputError unless a strain is at least a time step for each part, and no more than can be counted."""
     require_sheared(flow)
@@ -221,11 +158,3 @@ def require_flow(flow: Any) -> None:
         raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
     if any(np.ndim(getattr(flow, name)) for name in _TRACED):
         raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")
-
-
-def require_key(key: Any) -> None:
-    """Raise an InputError unless this is one random key of JAX."""
-    typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
-    if not typed and not raw:
-        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")

@@ -10,16 +10,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgran.model.flow import (
-    MAX_GRAINS,
-    InputError,
-    listed,
-    require,
-    require_key,
-    require_number,
-    require_whole,
-    shown,
-)
+from jaxgran.model.checks import InputError, listed, require, require_key, require_number, require_whole, shown
+from jaxgran.model.flow import MAX_GRAINS
 
 _POSITIVE = "a list of positive numbers"
 _LARGEST = 1e30  # of a diameter or a mass: their sums are finite in float32

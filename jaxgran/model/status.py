@@ -18,3 +18,6 @@ class Status(IntEnum):
     infeasible = 4  # no impulses satisfy the contact law: the packing is jammed
     capacity = 5  # more pairs or contacts than the buffers hold
     nonfinite = 6  # a position, velocity or impulse is not a finite number
+
+
+DEEP_OVERLAP = 1e-2

@@ -22,7 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 
 LONGEST_NAME = 200  # bytes; file systems take 255, and the names of figures are longer
 LABEL_SIZE, TICK_SIZE, SMALL_SIZE = 9.0, 8.0, 7.0  # fonts, in points

@@ -21,7 +21,7 @@ from jaxgran.analysis.force_chains import pair_forces
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import centred, minimum_image
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, force_lines, scientific
 
 Colour = Literal["speed", "pressure"]

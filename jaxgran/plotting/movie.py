@@ -16,7 +16,7 @@ from PIL import Image
 
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.io.atomic import replaced, require_place
-from jaxgran.model.flow import InputError, shown
+from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import BINARY_COLOUR, COLOURS, Colour, Scene, common_scale, draw_picture, scene_of
 

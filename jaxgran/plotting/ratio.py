@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -23,7 +22,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from jaxgran.maps.schema import RATIO, require_map
-from jaxgran.model.flow import InputError
+from jaxgran.model.checks import InputError
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
     add_plane_legend,
@@ -49,7 +48,6 @@ from jaxgran.plotting.drawing import (
     empty_figure,
     finest,
     finish,
-    is_plane,
     missing_note,
     ordered,
     padded,
@@ -57,15 +55,6 @@ from jaxgran.plotting.drawing import (
     scientific,
     status_note,
     suspect,
-    writable_stem,
-    write,
-)
-from jaxgran.plotting.friction import friction_figure, has_friction_law
-from jaxgran.plotting.theory import (
-    cluster_shares,
-    has_clusters,
-    has_theory,
-    theory_errors,
 )
 
 _MOST_TOGETHER = 8  # points whose curves share one panel of the time steps
@@ -162,7 +151,7 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
     ======== ========================================= =============================================
     """
     require_map(data, *RATIO)
-    if not _has_timesteps(data):
+    if data.sizes.get("timestep", 1) < 2:
         raise InputError(
             f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
         )
@@ -191,48 +180,6 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
     measured = np.isfinite(data.force_ratio.values)
     finish(figure, data, measured, [status_note(data), missing_note(measured)])
     return figure
-
-
-def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
-    """Write every figure that a map has the data for, as PNG, and return the paths written.
-
-    Each file appears whole or not at all.
-
-    ======================= ==================================================================
-    `{stem}_curves.png`     always
-    `{stem}_contours.png`   at least two restitutions and two packing fractions
-    `{stem}_timestep.png`   at least two time steps
-    `{stem}_theory.png`     a plane as for the contours, with what the theory predicts
-    `{stem}_clusters.png`   the shares of the clusters
-    `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
-    ======================= ==================================================================
-
-    ======== ============= =====================================================================
-    data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
-    stem     path          folder and beginning of the names; the folder must exist
-    returns  list of Path  the files written, in the order above
-    raises   ValueError    this is no map, or no files can be written there
-    ======== ============= =====================================================================
-    """
-    require_map(data, *RATIO)
-    stem = writable_stem(stem)
-    figures = {
-        "curves": (True, ratio_curves),
-        "contours": (is_plane(data), ratio_contours),
-        "timestep": (_has_timesteps(data), ratio_against_timestep),
-        "theory": (is_plane(data) and has_theory(data), theory_errors),
-        "clusters": (has_clusters(data), cluster_shares),
-        "rheology": (has_friction_law(data), friction_figure),
-    }
-    drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}
-    for path in drawn:
-        if path.is_dir():
-            raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    return [write(draw(data), path) for path, draw in drawn.items()]
-
-
-def _has_timesteps(data: xr.Dataset) -> bool:
-    return data.sizes.get("timestep", 1) >= 2
 
 
 # --------------------------------------------------------------------------------------------- curves

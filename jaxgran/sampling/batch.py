@@ -18,10 +18,10 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Int
 
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call
 Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances a batch, each replica by its own steps

@@ -18,9 +18,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.plain import State, require_state
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.flow import MAX_STEPS, InputError, ShearFlow, listed, require, two_digits
+from jaxgran.model.checks import InputError, listed, require, two_digits
+from jaxgran.model.flow import MAX_STEPS, ShearFlow
+from jaxgran.model.state import State, require_state
 
 _CROSSING = 0.1  # of its diameter that a grain of thermal speed may cross in one step
 _ROUNDING_STEPS = 20  # roundings of a position that such a grain must cross in one, at the start

@@ -23,11 +23,12 @@ from jaxgran.contact.near_pairs import (
     separations_now,
     widest_skin,
 )
-from jaxgran.dynamics.plain import State
 from jaxgran.model.cell import cell_side
+from jaxgran.model.checks import InputError, require_key
 from jaxgran.model.control_flow import any_replica, where_active
-from jaxgran.model.flow import InputError, ShearFlow, require_flow, require_key
+from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains, polydisperse, require_grains
+from jaxgran.model.state import State
 
 INFLATION = 5e-4
 _NARROWEST_SKIN = 0.2  # σ, of the lists of near pairs

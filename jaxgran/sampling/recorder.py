@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import Drive
 

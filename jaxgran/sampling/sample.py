@@ -14,11 +14,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.plain import State, advance_observed, require_state
+from jaxgran.dynamics.plain import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.display import Row, arrays, methods, rounded, statuses
-from jaxgran.model.flow import InputError, ShearFlow, require_strain, require_whole, shown, two_digits
+from jaxgran.model.checks import InputError, require_whole, shown, two_digits
+from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
+from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, correlation_length, jackknife
@@ -82,7 +84,7 @@ class Sample:
     grains: int = field(metadata={"static": True})
     own: Any = None
 
-    __repr__, _repr_html_ = methods("Sample", _rows)
+    __repr__, _repr_html_ = display_methods("Sample", _rows)
 
     @property
     def averages(self) -> dict[str, Array]:

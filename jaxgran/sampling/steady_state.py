@@ -21,34 +21,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxgran.dynamics.plain import State
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.flow import (
-    SHORTEST_TIMESTEP,
-    InputError,
-    ShearFlow,
-    require_flow,
-    require_key,
-    require_number,
-    require_sheared,
-    two_digits,
-)
+from jaxgran.model.checks import require_key, require_number
+from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import Drive, advance_batch, replicated, stack
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
+from jaxgran.sampling.timestep import COARSE_TIMESTEP, bounded_coarse_timestep, check_timestep, timestep_ladder
 from jaxgran.statistics import drift
-from jaxgran.theory.kinetic_theory import SteadyShear, gaussian_moments, mixture_moments
+from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
+from jaxgran.theory.steady_shear import SteadyShear
 
-COARSE_TIMESTEP = 1e-3
-SHORTENING = 10**0.5  # factor between successive time steps
 RELAXATION_STRAIN = 0.5  # at the final time step
 LONGEST_STRAIN = 256.0  # of a sample that is made longer until its errors are small
 _SHORTENING_STRAIN = 0.1  # at each time step between
-_CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
-_COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
 _SHORTEST_CHUNK = 0.75  # strain
 _FEWEST_CHUNKS, _MOST_CHUNKS = 12, 60
 _SIGNIFICANT, _LEVEL, _PRECISE = 2.0, 0.1, 0.1
@@ -116,7 +106,7 @@ def prepare_batch(
     state, packed = _heated(flow, keys, theory.granular_temperature, grains)
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
-    coarse = replace(flow, timestep=_coarse_timestep(flow, theory, coarse_timestep, grains))
+    coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, coarse_timestep, grains))
     batch = Batch(coarse, state, status, np.zeros(len(status)))
     if equilibrate is None:
         batch = _until_steady(batch, theory, drive)
@@ -180,40 +170,6 @@ def _classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " c
     members = [order[first:last] for first, last in pairwise(edges)]
     diameters = jnp.stack([2 * jnp.mean(grains.radii[one]) for one in members])
     return diameters / jnp.mean(diameters), jnp.stack([jnp.mean(grains.masses[one]) for one in members])
-
-
-def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
-    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step.
-
-    Of the default grains it is the mean diameter and the speed of a mean grain; of one's own, those of the grain that
-    is the fastest to cross its own diameter.
-    """
-    if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < 0.49 * SHORTEST_TIMESTEP):
-        raise InputError(
-            f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
-        )
-    longest = _CROSSING / _crossing_rate(theory, grains)
-    too_long = np.asarray(flow.timestep) > longest
-    if np.any(too_long):
-        worst = np.argmax(np.asarray(flow.timestep) / longest)
-        alpha, nu = (float(np.asarray(x)[worst]) for x in (flow.restitution, flow.packing_fraction))
-        raise InputError(
-            f"timestep must be at most {two_digits(longest[worst], up=False)} at restitution {alpha:g} and packing "
-            f"fraction {nu:g}, or grains would cross more than a tenth of a diameter in one step."
-        )
-
-
-def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
-    """Diameters that a grain of thermal speed crosses in a unit of time."""
-    speed = np.sqrt(2 * np.asarray(theory.granular_temperature))
-    return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
-
-
-def _coarse_timestep(
-    flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
-) -> Array:
-    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
-    return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
@@ -349,7 +305,7 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     the foot of theirs wait.
     """
     coarse, final = np.asarray(batch.flow.timestep), np.asarray(flow.timestep)
-    ladders = [_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
+    ladders = [timestep_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
     for rungs in zip_longest(*ladders, fillvalue=np.nan):
         going = np.isfinite(rungs)
         between = jnp.asarray(np.where(going, rungs, final), batch.state.side.dtype)
@@ -358,12 +314,6 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     batch = batch._replace(flow=flow)
     relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
     return _sheared(batch, relaxation, drive) if relaxation.any() else batch
-
-
-def _ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:
-    """Time steps strictly between a coarse and a final one, (1,) each, in equal ratios of at most ``SHORTENING``."""
-    steps = int(np.ceil(np.log(coarse / final) / np.log(SHORTENING) - 1e-9).item())
-    return [(coarse * (final / coarse) ** (k / steps)).item() for k in range(1, steps)]
 
 
 def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:

@@ -12,12 +12,21 @@ their restitution. The numbers here bound what the charts of ``benchmarks/stabil
 ``benchmarks/speed_vs_accuracy.py`` show for this size distribution; they choose a run, and are no results.
 """
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Array
 
-from jaxgran.dynamics.plain import DEEP_OVERLAP
-from jaxgran.model.flow import Activation
+from jaxgran.model.checks import InputError, two_digits
+from jaxgran.model.flow import SHORTEST_TIMESTEP, Activation, ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import DEEP_OVERLAP
+from jaxgran.theory.steady_shear import SteadyShear
 
+COARSE_TIMESTEP = 1e-3
+SHORTENING = 10**0.5  # factor between successive time steps
+_CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
+_COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
 JAMMING = 0.8386  # packing fraction where a random quench of diameters uniform in σ ± 0.26 jams
 
 
@@ -69,3 +78,43 @@ def automatic_tolerance(target_error: float) -> float:
 def _room(packing_fraction: ArrayLike) -> np.ndarray:
     """How far a packing fraction is from jamming."""
     return np.maximum(JAMMING - np.asarray(packing_fraction), 1e-3)
+
+
+def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
+    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step.
+
+    Of the default grains it is the mean diameter and the speed of a mean grain; of one's own, those of the grain that
+    is the fastest to cross its own diameter.
+    """
+    if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < 0.49 * SHORTEST_TIMESTEP):
+        raise InputError(
+            f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
+        )
+    longest = _CROSSING / _crossing_rate(theory, grains)
+    too_long = np.asarray(flow.timestep) > longest
+    if np.any(too_long):
+        worst = np.argmax(np.asarray(flow.timestep) / longest)
+        alpha, nu = (float(np.asarray(x)[worst]) for x in (flow.restitution, flow.packing_fraction))
+        raise InputError(
+            f"timestep must be at most {two_digits(longest[worst], up=False)} at restitution {alpha:g} and packing "
+            f"fraction {nu:g}, or grains would cross more than a tenth of a diameter in one step."
+        )
+
+
+def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
+    """Diameters that a grain of thermal speed crosses in a unit of time."""
+    speed = np.sqrt(2 * np.asarray(theory.granular_temperature))
+    return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
+
+
+def bounded_coarse_timestep(
+    flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
+) -> Array:
+    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
+    return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
+
+
+def timestep_ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:
+    """Time steps strictly between a coarse and a final one, (1,) each, in equal ratios of at most ``SHORTENING``."""
+    steps = int(np.ceil(np.log(coarse / final) / np.log(SHORTENING) - 1e-9).item())
+    return [(coarse * (final / coarse) ** (k / steps)).item() for k in range(1, steps)]

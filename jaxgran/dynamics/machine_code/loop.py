@@ -37,9 +37,8 @@ from numba.extending import intrinsic
 
 from jaxgran.contact.projected_methods import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.contact.solver import JAMMED_RESPONSE
-from jaxgran.dynamics.plain import DEEP_OVERLAP
 from jaxgran.dynamics.tally import FLAT_SUMS, RESIDUAL_EDGES
-from jaxgran.model.status import Status
+from jaxgran.model.status import DEEP_OVERLAP, Status
 
 _CONTACTS, _CLUSTERS, _SOLVES, _LARGEST, _STATUS, _TILT = FLAT_SUMS  # where they begin in what a call returns
 _SUMS = _TILT + 1

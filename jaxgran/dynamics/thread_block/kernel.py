@@ -30,8 +30,8 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Int
 
-from jaxgran.contact.network import gap_coefficients, overlaps_within, time_to_touch
-from jaxgran.dynamics.plain import State, ended, flight_of, kinetic_means
+from jaxgran.contact.law import flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
+from jaxgran.dynamics.plain import ended
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, Sums, Tally, empty_sums
 from jaxgran.dynamics.thread_block.memory import (
     APPROACH,
@@ -61,6 +61,7 @@ from jaxgran.dynamics.thread_block.solver import collided
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 _FEWEST_THREADS, _WARP = 64, 32  # a thread for each bin of the residuals

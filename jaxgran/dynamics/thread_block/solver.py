@@ -17,7 +17,6 @@ from jaxtyping import Array
 from jaxgran.contact.delassus import largest_eigenvalue
 from jaxgran.contact.projected_methods import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.contact.solver import JAMMED_RESPONSE
-from jaxgran.dynamics.plain import DEEP_OVERLAP
 from jaxgran.dynamics.thread_block.memory import (
     APPROACH,
     BEST,
@@ -42,7 +41,7 @@ from jaxgran.dynamics.thread_block.memory import (
     Thread,
     status_if,
 )
-from jaxgran.model.status import Status
+from jaxgran.model.status import DEEP_OVERLAP, Status
 
 
 class Solve(NamedTuple):

@@ -1,154 +1,25 @@
-"""Steady simple shear of inelastic hard discs, predicted by kinetic theory.
+"""Kinetic theory by the moments of an anisotropic Gaussian, for any size distribution.
 
-Three theories of increasing reach: Jenkins and Richman (nearly elastic, one size), Garzó and Dufty (Navier-Stokes
-order at any restitution, one size), and the moments of an anisotropic Gaussian (any size distribution, non-linear in
-the shear rate). All neglect correlations of velocity between neighbours, so all fail near jamming and at small
-restitution in dense flow.
-
-Lengths are in mean diameters, masses in the mass of a grain of mean diameter; a grain of diameter d weighs d², unless
-its mass is given (``mixture_moments``).
-Everything here is differentiable and works on one flow; `jax.vmap` adds a leading `(replicas,)`.
+Each size class has a velocity distribution with a temperature tensor of its own. Collisions between classes balance
+the work of the shear, at any restitution and beyond linear order in the shear rate. Correlations of velocity between
+neighbours are neglected, so the theory fails near jamming and at small restitution in dense flow.
+Units: ``steady_shear``.
 """
 
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Float
 
-Scalar = float | int | Real[Array, ""]
+from jaxgran.theory.navier_stokes import garzo_dufty
+from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats
 
 _ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic, so the error is below 1e-11
 _MAX_ITERATIONS = 40  # Newton takes 4 to 7
 _LARGEST_STEP = 1.0  # of one Newton iteration, in the logarithm of a temperature
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class SteadyShear:
-    """What a theory predicts for steady simple shear.
-
-    ====================  =======  ===========================================================================
-    field                 unit     meaning
-    ====================  =======  ===========================================================================
-    granular_temperature  m(σ/t)²  Σ m c²/(2N), c the peculiar velocity
-    pressure              m/t²     half the trace of the stress, kinetic and collisional
-    shear_stress          m/t²     positive, kinetic and collisional
-    collision_rate        –        collisions per grain per unit strain, a grain counting each of its collisions
-    dissipation           m/t³     energy lost per unit area and time; where the balance is solved it equals the
-                                   shear power, shear_stress × shear_rate
-    ====================  =======  ===========================================================================
-
-    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the shear rate given:
-    at the default of 1, all numbers are in units of m = σ = γ̇ = 1.
-    """
-
-    granular_temperature: Float[Array, "*replicas"]
-    pressure: Float[Array, "*replicas"]
-    shear_stress: Float[Array, "*replicas"]
-    collision_rate: Float[Array, "*replicas"]
-    dissipation: Float[Array, "*replicas"]
-
-
-def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
-    """Pair distribution at contact of discs of one size in equilibrium.
-
-    ================  ====  =======================================================
-    name              unit  meaning
-    ================  ====  =======================================================
-    packing_fraction  –     ν < 1, area of the grains over the area of the cell
-    returns           –     χ = (1 − 7ν/16)/(1 − ν)², a scalar
-    ================  ====  =======================================================
-
-    Source: D. Henderson, Mol. Phys. 30, 971 (1975).
-
-    Examples:
-      >>> [round(float(contact_value(nu)), 3) for nu in (0.0, 0.5, 0.75)]
-      [1.0, 3.125, 10.75]
-    """
-    nu = jnp.asarray(packing_fraction)
-    return (1 - 7 * nu / 16) / (1 - nu) ** 2
-
-
-def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
-    """Steady shear of nearly elastic discs of one size.
-
-    ================  ====  =======================================================
-    name              unit  meaning
-    ================  ====  =======================================================
-    restitution       –     0 ≤ α < 1, meant for α near 1
-    packing_fraction  –     0 < ν < 1
-    shear_rate        1/t   γ̇ > 0
-    returns                 SteadyShear
-    ================  ====  =======================================================
-
-    At α = 1 nothing balances the shear, and the temperature is infinite.
-
-    Source: J. T. Jenkins and M. W. Richman, Phys. Fluids 28, 3485 (1985).
-    """
-    alpha, nu, rate = _as_floats(restitution, packing_fraction, shear_rate)
-    chi = contact_value(nu)
-    density = 4 / jnp.pi * nu
-    # with viscosity = k √T and dissipation = e T^{3/2}, the balance k √T γ̇² = e T^{3/2} gives T
-    viscosity = 4 / jnp.pi * (jnp.sqrt(jnp.pi) / 8) * (1 / chi + 2 * nu + (1 + 8 / jnp.pi) * nu**2 * chi)
-    loss = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
-    temperature = viscosity / loss * rate**2
-    return SteadyShear(
-        granular_temperature=temperature,
-        pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
-        shear_stress=viscosity * jnp.sqrt(temperature) * rate,
-        collision_rate=_maxwellian_collision_rate(density, chi, temperature) / rate,
-        dissipation=loss * temperature**1.5,
-    )
-
-
-def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
-    """Steady shear of inelastic discs of one size, to first order in the velocity gradient.
-
-    ================  ====  =======================================================
-    name              unit  meaning
-    ================  ====  =======================================================
-    restitution       –     0 ≤ α < 1
-    packing_fraction  –     0 < ν < 1
-    shear_rate        1/t   γ̇ > 0
-    returns                 SteadyShear
-    ================  ====  =======================================================
-
-    At α = 1 nothing balances the shear, and the temperature is infinite. In steady shear the restitution itself fixes
-    how large the gradient is, so this expansion in the gradient is several times too hot at small restitution in dilute
-    flow.
-
-    Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko, Phys. Rev. E 72,
-    021306 (2005).
-
-    Examples:
-      Bagnold's scaling: no other time scale than 1/γ̇, so stresses grow with its square.
-
-      >>> slow, fast = garzo_dufty(0.9, 0.4), garzo_dufty(0.9, 0.4, shear_rate=2.0)
-      >>> round(float(fast.pressure / slow.pressure), 6)
-      4.0
-    """
-    alpha, nu, rate = _as_floats(restitution, packing_fraction, shear_rate)
-    chi = contact_value(nu)
-    density = 4 / jnp.pi * nu
-    kurtosis = 16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
-    cooling = chi / 2 * (1 - alpha**2) * (1 + 3 * kurtosis / 16)
-    relaxation = 3 * chi / 8 * (7 / 3 - alpha) * (1 + alpha) * (1 + 7 * kurtosis / 16)
-    kinetic = (1 - (1 + alpha) * (1 - 3 * alpha) * nu * chi / 4) / (relaxation - cooling / 2)
-    bulk = 8 / jnp.pi * nu**2 * chi * (1 + alpha) * (1 - kurtosis / 16)
-    viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2  # in units of the dilute elastic one
-    temperature = jnp.pi / (64 * nu**2) * viscosity / cooling * rate**2
-    dilute_viscosity = jnp.sqrt(temperature / (4 * jnp.pi))
-    return SteadyShear(
-        granular_temperature=temperature,
-        pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
-        shear_stress=viscosity * dilute_viscosity * rate,
-        collision_rate=_maxwellian_collision_rate(density, chi, temperature) * (1 - kurtosis / 16) / rate,
-        dissipation=cooling * (density * temperature) ** 2 / dilute_viscosity,
-    )
 
 
 @partial(jax.jit, static_argnames="size_classes")
@@ -181,7 +52,7 @@ def gaussian_moments(
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys. Rev. E 70, 061101
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
-    alpha, nu, rate, width = _as_floats(restitution, packing_fraction, shear_rate, polydispersity)
+    alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
     return _steady(alpha, rate, _mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature))
 
 
@@ -206,7 +77,7 @@ def mixture_moments(
     returns                    SteadyShear
     ================  =======  ====================================================
     """
-    alpha, nu, rate = _as_floats(restitution, packing_fraction, shear_rate)
+    alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
     fractions = jnp.full(diameters.shape, 1 / diameters.size, nu.dtype)
     guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.mean(masses))
     return _steady(alpha, rate, _mixture_of(nu, diameters, masses, fractions), guess)
@@ -387,14 +258,3 @@ def _dense_linear_solve(linear, target):
     columns = jax.vmap(linear)(jnp.eye(target.size, dtype=target.dtype).reshape(-1, *target.shape))
     matrix = columns.reshape(target.size, target.size).T
     return jnp.linalg.solve(matrix, target.reshape(-1)).reshape(target.shape)
-
-
-def _maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
-    """Collisions per grain and time of discs of one size with Maxwellian velocities."""
-    return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
-
-
-def _as_floats(*values: Scalar) -> list[Float[Array, ""]]:
-    """The values as arrays of their common floating-point type."""
-    dtype = jnp.result_type(float, *values)
-    return [jnp.asarray(value, dtype) for value in values]

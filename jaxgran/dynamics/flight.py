@@ -1,0 +1,117 @@
+"""Free flight of near pairs: how far it may go, and what it does."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxgran.contact.law import flight_of, kinetic_means
+from jaxgran.contact.near_pairs import Frame, Neighbourhood, refresh, separations_now
+from jaxgran.contact.network import first_contact_time
+from jaxgran.dynamics.tally import Sums
+from jaxgran.model.cell import relative_velocity
+from jaxgran.model.control_flow import any_replica, where_active
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+
+LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
+
+
+class PairMotion(NamedTuple):
+    """Near pairs in flight: separations and relative laboratory velocities, (pairs,) each, x and y apart for speed."""
+
+    x: Array
+    y: Array
+    ux: Array
+    uy: Array
+
+    def separations(self) -> Float[Array, "pairs 2"]:
+        return jnp.stack([self.x, self.y], axis=-1)
+
+    def velocities(self) -> Float[Array, "pairs 2"]:
+        return jnp.stack([self.ux, self.uy], axis=-1)
+
+
+class _Carry(NamedTuple):
+    hood: Neighbourhood
+    pairs: PairMotion
+    slack: Array  # what is left of the skin of the near list
+    velocities: Array
+    step: Array  # steps flown
+    solved: Array  # whether the contacts of the present step have been dealt with
+    sums: Sums
+
+
+def pairs_now(hood: Neighbourhood, velocities: Array, shear_rate: float | Array) -> PairMotion:
+    separations = separations_now(hood.near, hood.frame)
+    u = relative_velocity(velocities, hood.near.i, hood.near.j, separations, shear_rate)
+    return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
+
+
+def fresh_lists(
+    now: _Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array
+) -> tuple[Neighbourhood, PairMotion, Array, Array]:
+    """Lists that stay valid for at least one more step, their pairs, the slack, and a bound on its loss per time.
+
+    A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
+    r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
+    """
+    velocities = lax.stop_gradient(now.velocities)  # the lists decide what is looked at, not what it is
+    cx, cy = velocities[:, 0], velocities[:, 1]
+    longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
+    speed = jnp.sqrt(-smallest(-(cx * cx + cy * cy))) * (1 + longest)
+    diameter = 2 * jnp.max(lax.stop_gradient(grains.radii))
+
+    def loss(skin: Array) -> Array:
+        return 2 * speed + flow.shear_rate * (diameter + skin) / 2
+
+    stale = go & ~(now.slack >= loss(now.hood.near.skin) * flow.timestep)
+
+    def fresh():
+        hood = refresh(now.hood, grains, side, stale)
+        new = hood, pairs_now(hood, now.velocities, flow.shear_rate), lax.stop_gradient(hood.near.skin)
+        return where_active(stale, new, (now.hood, now.pairs, now.slack))
+
+    hood, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.hood, now.pairs, now.slack))
+    return hood, pairs, slack, loss(hood.near.skin)
+
+
+def steps_to_contact(pairs: PairMotion, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
+    """Number of steps, at least ``least``, after which some pair first is an approaching contact; may be infinite."""
+    time, closest = first_contact_time(pairs.separations(), pairs.velocities(), reach)
+    steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least.astype(time.dtype))
+    return smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
+
+
+def fly(frame: Frame, velocities: Array, flight: Array, shear_rate: float | Array) -> tuple[Frame, Array]:
+    """Exact free flight (SLLOD) for a time: the laboratory velocities stay as they are."""
+    cy = velocities[:, 1]
+    dx, dy, cx = flight_of(velocities[:, 0], cy, frame.strain, flight, shear_rate)
+    moved = frame.displacements + jnp.stack([dx, dy], axis=-1)
+    return Frame(moved, frame.strain + shear_rate * flight), jnp.stack([cx, cy], axis=-1)
+
+
+def add_flight(
+    sums: Sums, velocities: Array, grains: Grains, jump: Array, flight: Array, shear_rate: float | Array
+) -> Sums:
+    """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
+    cx, cy = velocities[:, 0], velocities[:, 1]
+    px, py = grains.masses * cx, grains.masses * cy
+    xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in ((px, cx), (px, cy), (py, cy)))
+    xx, xy, yy = kinetic_means(xx, xy, yy, shear_rate * flight)
+    flown = jnp.stack([flight, jump.astype(flight.dtype), flight * xx, flight * xy, flight * yy])
+    return sums._replace(flights=sums.flights + flown)
+
+
+def smallest(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Smallest entry of a vector.
+
+    XLA's CPU backend runs a minimum over one long axis as a serial chain of comparisons; folded into rows of 32 it
+    is a vector operation. The halves are folded apart so that the entries are computed once, in a loop of their own.
+    """
+    lanes = 32
+    rows = 2 * -(-values.size // (2 * lanes))
+    folded = jnp.pad(values, (0, rows * lanes - values.size), constant_values=jnp.inf).reshape(rows, lanes)
+    columns = jnp.minimum(jnp.min(folded[: rows // 2], axis=0), jnp.min(folded[rows // 2 :], axis=0))
+    return jnp.min(jnp.minimum(columns[: lanes // 2], columns[lanes // 2 :]))

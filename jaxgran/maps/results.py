@@ -1,0 +1,86 @@
+"""The file of a map: refused before the work where it could not be written, written whole, read, and compared."""
+
+import os
+from dataclasses import fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import xarray as xr
+
+from jaxgran.io.atomic import replaced, require_place
+from jaxgran.maps.dataset import run_attributes
+from jaxgran.maps.schema import RATIO, what_lacks
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.checks import InputError, shown
+
+PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
+
+
+def check_output(path: Path) -> None:
+    """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
+    require_place(path, "output", ".nc")
+    for file in (path.with_name(f"{path.stem}_{name}.png") for name in PICTURES):
+        if os.path.isdir(file):
+            raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    if unfinished.exists() and not unfinished.is_dir():
+        raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")
+
+
+def write_dataset(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
+    path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
+    content = BytesIO()
+    data.to_netcdf(content, engine="h5netcdf")
+    with replaced(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
+
+
+def read_dataset(path: Path) -> xr.Dataset:
+    """Read a dataset that ``write_dataset`` wrote; ValueError in one sentence where it is not one."""
+    if not os.path.isfile(path):
+        raise InputError(f"there is no file {shown(str(path))}.")
+    try:
+        with h5py.File(path, "r") as file:  # h5netcdf complains a second time about what it could not open
+            file.attrs.get("_nc3_strict")
+        data = xr.load_dataset(path, engine="h5netcdf")
+    except Exception as error:  # a torn file may fail in any way
+        why = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
+    lack = what_lacks(data, *RATIO, "status")
+    if lack:
+        raise InputError(f"{shown(str(path))} is not a ratio map: {lack}.")
+    return data
+
+
+def choices_of(data: xr.Dataset) -> dict[str, Any]:
+    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them."""
+    chosen: dict[str, Any] = {}
+    try:
+        for field in fields(MapSettings):
+            if field.name in data.dims:
+                chosen[field.name] = tuple(data[field.name].values.tolist())
+            elif field.name in data.attrs:
+                chosen[field.name] = np.asarray(data.attrs[field.name]).tolist()
+            elif field.name not in ("strain", "error"):  # one is there in place of the other
+                raise KeyError(field.name)
+        chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
+        return chosen | {
+            name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")
+        }
+    except KeyError as missing:
+        raise InputError(f"this dataset does not tell the {missing.args[0]} of its map.") from None
+
+
+def differences(data: xr.Dataset, settings: MapSettings) -> list[str]:
+    """What of the versions, the device and the precision of a dataset is other than here, in words."""
+    here = run_attributes(settings)
+    names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
+    return [
+        f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"
+        for name in names
+        if name in data.attrs and data.attrs[name] != here[name]
+    ]

@@ -1,0 +1,85 @@
+"""State: a sheared packing at one instant, what judges it, and its energy and momentum."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxgran.model.checks import InputError
+from jaxgran.model.display import Row, arrays, display_methods, rounded
+from jaxgran.model.flow import ShearFlow, require_flow
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import Status
+
+
+def _rows(state: "State") -> list[Row]:
+    known = arrays(state.grains.radii, state.grains.masses, state.velocities)
+    if not known or known[-1].ndim < 2:
+        return [Row("positions", state.positions), Row("side", state.side, "σ"), Row("tilt", state.tilt)]
+    radii, masses, velocities = known
+    *replicas, grains, _ = velocities.shape
+    temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
+    return [
+        *[Row("replicas", count) for count in replicas],
+        Row("grains", grains),
+        Row("packing_fraction", rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2)),
+        Row("granular_temperature", rounded(temperature), "mσ²/t²"),
+        Row("side", rounded(state.side), "σ"),
+        Row("tilt", rounded(state.tilt)),
+        Row("precision", str(velocities.dtype)),
+    ]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """A sheared packing at one instant.
+
+    ==========  ===========  ====  =====================================================
+    field       shape        unit  meaning
+    ==========  ===========  ====  =====================================================
+    grains      Grains       –     radii and masses
+    positions   (grains, 2)  σ     centres, wrapped into the cell
+    velocities  (grains, 2)  σγ̇    peculiar velocities c; the laboratory's are c + γ̇ y x̂
+    side        ()           σ     side L of the cell
+    tilt        ()           –     offset of the image row above, in L, in [−½, ½)
+    ==========  ===========  ====  =====================================================
+    """
+
+    grains: Grains
+    positions: Float[Array, "grains 2"]
+    velocities: Float[Array, "grains 2"]
+    side: Float[Array, ""]
+    tilt: Float[Array, ""]
+
+    __repr__, _repr_html_ = display_methods("State", _rows)
+
+
+def require_state(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError unless this is one flow, and one state of its grains."""
+    require_flow(flow)
+    if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
+        raise InputError(
+            f"state must be one State of {flow.grains} grains, best from prepare, not "
+            f"{f'of positions {jnp.shape(state.positions)}' if isinstance(state, State) else type(state).__name__}."
+        )
+
+
+def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
+    return jnp.sum(grains.masses * jnp.sum(velocities**2, axis=-1)) / 2
+
+
+def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
+    """|Σ m c| over Σ m |c|, zero at rest."""
+    momenta = grains.masses[:, None] * velocities
+    momenta = lax.stop_gradient(momenta)  # a measure of rounding; at rest a norm has no derivative
+    all_of_it = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
+    return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(all_of_it > 0, all_of_it, 1)
+
+
+def status_if_finite(*values: Array) -> Int[Array, ""]:
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+    return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)

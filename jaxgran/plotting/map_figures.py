@@ -1,0 +1,52 @@
+"""All figures of a map, written as files beside its dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import xarray as xr
+
+from jaxgran.maps.schema import RATIO, require_map
+from jaxgran.model.checks import InputError
+from jaxgran.plotting.drawing import is_plane, writable_stem, write
+from jaxgran.plotting.friction import friction_figure, has_friction_law
+from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
+from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
+
+
+def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
+    """Write every figure that a map has the data for, as PNG, and return the paths written.
+
+    Each file appears whole or not at all.
+
+    ======================= ==================================================================
+    `{stem}_curves.png`     always
+    `{stem}_contours.png`   at least two restitutions and two packing fractions
+    `{stem}_timestep.png`   at least two time steps
+    `{stem}_theory.png`     a plane as for the contours, with what the theory predicts
+    `{stem}_clusters.png`   the shares of the clusters
+    `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
+    ======================= ==================================================================
+
+    ======== ============= =====================================================================
+    data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
+    stem     path          folder and beginning of the names; the folder must exist
+    returns  list of Path  the files written, in the order above
+    raises   ValueError    this is no map, or no files can be written there
+    ======== ============= =====================================================================
+    """
+    require_map(data, *RATIO)
+    stem = writable_stem(stem)
+    figures = {
+        "curves": (True, ratio_curves),
+        "contours": (is_plane(data), ratio_contours),
+        "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
+        "theory": (is_plane(data) and has_theory(data), theory_errors),
+        "clusters": (has_clusters(data), cluster_shares),
+        "rheology": (has_friction_law(data), friction_figure),
+    }
+    drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}
+    for path in drawn:
+        if path.is_dir():
+            raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
+    return [write(draw(data), path) for path, draw in drawn.items()]

@@ -1,0 +1,87 @@
+"""Kinetic theories of one grain size at Navier-Stokes order.
+
+Jenkins and Richman is for nearly elastic grains, Garzó and Dufty for any restitution. Both neglect correlations of
+velocity between neighbours, so both fail near jamming and at small restitution in dense flow. Units: ``steady_shear``.
+"""
+
+import jax.numpy as jnp
+
+from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_value, maxwellian_collision_rate
+
+
+def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
+    """Steady shear of nearly elastic discs of one size.
+
+    ================  ====  =======================================================
+    name              unit  meaning
+    ================  ====  =======================================================
+    restitution       –     0 ≤ α < 1, meant for α near 1
+    packing_fraction  –     0 < ν < 1
+    shear_rate        1/t   γ̇ > 0
+    returns                 SteadyShear
+    ================  ====  =======================================================
+
+    At α = 1 nothing balances the shear, and the temperature is infinite.
+
+    Source: J. T. Jenkins and M. W. Richman, Phys. Fluids 28, 3485 (1985).
+    """
+    alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
+    chi = contact_value(nu)
+    density = 4 / jnp.pi * nu
+    # with viscosity = k √T and dissipation = e T^{3/2}, the balance k √T γ̇² = e T^{3/2} gives T
+    viscosity = 4 / jnp.pi * (jnp.sqrt(jnp.pi) / 8) * (1 / chi + 2 * nu + (1 + 8 / jnp.pi) * nu**2 * chi)
+    loss = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
+    temperature = viscosity / loss * rate**2
+    return SteadyShear(
+        granular_temperature=temperature,
+        pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
+        shear_stress=viscosity * jnp.sqrt(temperature) * rate,
+        collision_rate=maxwellian_collision_rate(density, chi, temperature) / rate,
+        dissipation=loss * temperature**1.5,
+    )
+
+
+def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
+    """Steady shear of inelastic discs of one size, to first order in the velocity gradient.
+
+    ================  ====  =======================================================
+    name              unit  meaning
+    ================  ====  =======================================================
+    restitution       –     0 ≤ α < 1
+    packing_fraction  –     0 < ν < 1
+    shear_rate        1/t   γ̇ > 0
+    returns                 SteadyShear
+    ================  ====  =======================================================
+
+    At α = 1 nothing balances the shear, and the temperature is infinite. In steady shear the restitution itself fixes
+    how large the gradient is, so this expansion in the gradient is several times too hot at small restitution in dilute
+    flow.
+
+    Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko, Phys. Rev. E 72,
+    021306 (2005).
+
+    Examples:
+      Bagnold's scaling: no other time scale than 1/γ̇, so stresses grow with its square.
+
+      >>> slow, fast = garzo_dufty(0.9, 0.4), garzo_dufty(0.9, 0.4, shear_rate=2.0)
+      >>> round(float(fast.pressure / slow.pressure), 6)
+      4.0
+    """
+    alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
+    chi = contact_value(nu)
+    density = 4 / jnp.pi * nu
+    kurtosis = 16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
+    cooling = chi / 2 * (1 - alpha**2) * (1 + 3 * kurtosis / 16)
+    relaxation = 3 * chi / 8 * (7 / 3 - alpha) * (1 + alpha) * (1 + 7 * kurtosis / 16)
+    kinetic = (1 - (1 + alpha) * (1 - 3 * alpha) * nu * chi / 4) / (relaxation - cooling / 2)
+    bulk = 8 / jnp.pi * nu**2 * chi * (1 + alpha) * (1 - kurtosis / 16)
+    viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2  # in units of the dilute elastic one
+    temperature = jnp.pi / (64 * nu**2) * viscosity / cooling * rate**2
+    dilute_viscosity = jnp.sqrt(temperature / (4 * jnp.pi))
+    return SteadyShear(
+        granular_temperature=temperature,
+        pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
+        shear_stress=viscosity * dilute_viscosity * rate,
+        collision_rate=maxwellian_collision_rate(density, chi, temperature) * (1 - kurtosis / 16) / rate,
+        dissipation=cooling * (density * temperature) ** 2 / dilute_viscosity,
+    )

@@ -1,0 +1,71 @@
+"""SteadyShear: what every theory here predicts, and the quantities that the theories share.
+
+Lengths are in mean diameters, masses in the mass of a grain of mean diameter; a grain of diameter d weighs d², unless
+its mass is given. Everything is differentiable and works on one flow; `jax.vmap` adds a leading `(replicas,)`.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
+
+Scalar = float | int | Real[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SteadyShear:
+    """What a theory predicts for steady simple shear.
+
+    ====================  =======  ===========================================================================
+    field                 unit     meaning
+    ====================  =======  ===========================================================================
+    granular_temperature  m(σ/t)²  Σ m c²/(2N), c the peculiar velocity
+    pressure              m/t²     half the trace of the stress, kinetic and collisional
+    shear_stress          m/t²     positive, kinetic and collisional
+    collision_rate        –        collisions per grain per unit strain, a grain counting each of its collisions
+    dissipation           m/t³     energy lost per unit area and time; where the balance is solved it equals the
+                                   shear power, shear_stress × shear_rate
+    ====================  =======  ===========================================================================
+
+    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the shear rate given:
+    at the default of 1, all numbers are in units of m = σ = γ̇ = 1.
+    """
+
+    granular_temperature: Float[Array, "*replicas"]
+    pressure: Float[Array, "*replicas"]
+    shear_stress: Float[Array, "*replicas"]
+    collision_rate: Float[Array, "*replicas"]
+    dissipation: Float[Array, "*replicas"]
+
+
+def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
+    """Pair distribution at contact of discs of one size in equilibrium.
+
+    ================  ====  =======================================================
+    name              unit  meaning
+    ================  ====  =======================================================
+    packing_fraction  –     ν < 1, area of the grains over the area of the cell
+    returns           –     χ = (1 − 7ν/16)/(1 − ν)², a scalar
+    ================  ====  =======================================================
+
+    Source: D. Henderson, Mol. Phys. 30, 971 (1975).
+
+    Examples:
+      >>> [round(float(contact_value(nu)), 3) for nu in (0.0, 0.5, 0.75)]
+      [1.0, 3.125, 10.75]
+    """
+    nu = jnp.asarray(packing_fraction)
+    return (1 - 7 * nu / 16) / (1 - nu) ** 2
+
+
+def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
+    """Collisions per grain and time of discs of one size with Maxwellian velocities."""
+    return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
+
+
+def as_floats(*values: Scalar) -> list[Float[Array, ""]]:
+    """The values as arrays of their common floating-point type."""
+    dtype = jnp.result_type(float, *values)
+    return [jnp.asarray(value, dtype) for value in values]
