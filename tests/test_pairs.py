@@ -13,10 +13,10 @@ from oracles import gaps_of
 from jaxgran.contact import near_pairs
 from jaxgran.contact.near_pairs import (
     Frame,
-    Neighbourhood,
+    PairLists,
     consumed_skin,
     first_true,
-    neighbourhood,
+    pair_lists,
     present,
     refresh,
     separations_now,
@@ -28,7 +28,7 @@ EPS = np.finfo(float).eps
 
 
 compiled_first = jax.jit(first_true, static_argnums=1)
-build = jax.jit(neighbourhood)
+build = jax.jit(pair_lists)
 
 
 @pytest.mark.parametrize(("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)])
@@ -42,17 +42,17 @@ def test_first_true_entries(length, size, seed, density):
 
 
 @jax.jit
-def move(hood: Neighbourhood, grains: Grains, side, displacements, strain):
-    """The neighbourhood after a motion, with new lists where the old ones would no longer be valid."""
+def move(hood: PairLists, grains: Grains, side, displacements, strain):
+    """The pair_lists after a motion, with new lists where the old ones would no longer be valid."""
     moved = Frame(hood.frame.displacements + displacements, hood.frame.strain + strain)
     valid = consumed_skin(moved, hood.near_frame, 2 * jnp.max(grains.radii)) <= hood.near.skin
-    now = Neighbourhood(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
+    now = PairLists(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
     now = jax.lax.cond(valid, lambda: now, lambda: refresh(now, grains, side, jnp.asarray(True)))
     return now, ~valid, *present(now, side)
 
 
 @jax.jit
-def both_separations(hood: Neighbourhood, side):
+def both_separations(hood: PairLists, side):
     positions, tilt = present(hood, side)
     listed = hood.near
     direct = displacement(positions[listed.i], positions[listed.j], side, tilt)
@@ -129,7 +129,7 @@ def test_pairs_left_out_are_flagged(packed, monkeypatch, buffer):
     """With a buffer that is too small a list is complete, or says that it is not: by its flag or a skin used up."""
     state, flags = packed(0.7), []
     monkeypatch.setattr(near_pairs, buffer, 2)
-    tiny = jax.jit(lambda *arguments: neighbourhood(*arguments))
+    tiny = jax.jit(lambda *arguments: pair_lists(*arguments))
     for seed in range(6):
         places = state.positions if seed == 0 else clustered(len(state.positions), float(state.side), seed)
         hood = tiny(places, state.grains, state.side, state.tilt)
@@ -145,7 +145,7 @@ def test_flag_of_the_outer_list_reaches_the_near_one(packed, monkeypatch):
     monkeypatch.setattr(near_pairs, "NEAR_PAIRS_PER_GRAIN", 10)
     state = packed(0.7)
     places = clustered(len(state.positions), float(state.side), 0)
-    hood = jax.jit(lambda *arguments: neighbourhood(*arguments))(places, state.grains, state.side, state.tilt)
+    hood = jax.jit(lambda *arguments: pair_lists(*arguments))(places, state.grains, state.side, state.tilt)
     assert hood.outer.overflow and hood.near.overflow
 
 

@@ -16,6 +16,7 @@ An isolated pair has D = W in all three.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
 
 
@@ -66,11 +67,6 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     largest = largest_eigenvalue(xx, xy, yy)
     bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
-
-
-def largest_eigenvalue(xx: Array, xy: Array, yy: Array) -> Array:
-    """The larger eigenvalue of symmetric 2×2 matrices."""
-    return (xx + yy + jnp.sqrt((xx - yy) ** 2 + 4 * xy**2)) / 2
 
 
 def _gathered(

@@ -1,10 +1,77 @@
-"""TODO"""
+"""The law of a contact: arithmetic that every engine shares.
 
-import jax.numpy as jnp
+These functions take numbers or arrays and have no branches on values. The plain engine and the thread block call them
+with arrays of JAX; the machine code compiles the same source for numbers (``dynamics.machine_code.compiled``). What
+branches, such as the search for the next contact or a solver, is written for each engine, and tests compare them.
+
+The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With s the separation,
+u the relative velocity in the laboratory and d the sum of the radii, the gap along the flight is
+f(t) = |s + u t|² − d² = |u|² t² + 2 s·u t + |s|² − d².
+"""
+
+from typing import Any
+
+from jax.numpy import ceil, maximum, sqrt, where
 from jaxtyping import Array
 
+Number = Any  # a number, or an array of them
 
-def flight_of(cx: Array, cy: Array, strain: Array, flight: Array, shear_rate: float | Array) -> tuple[Array, ...]:
+LONGEST_STRIDE = 1e4  # step length of the method of Barzilai and Borwein, in units of that of Nesterov's
+WINDOW = 100  # iterations after which the progress of that method is judged
+PROGRESS = 0.5  # factor by which the best residual must have fallen within a window
+JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
+ABSOLUTE_RESIDUAL = 10  # roundings of the velocity γ̇σ that a residual may always keep
+
+
+def gap_coefficients(x: Number, y: Number, ux: Number, uy: Number, reach: Number) -> tuple[Number, Number, Number]:
+    """|u|², s·u and |s|² − d², the coefficients of the gap along a flight."""
+    return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach * reach
+
+
+def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: Number) -> tuple:
+    """The activation rule: whether pairs are contacts, and whether they approach.
+
+    The gap falls until the closest approach, so it is read at θ·dt or at the closest approach, whichever comes first.
+    A receding pair is judged at θ·dt.
+
+    Args:
+      squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
+      look_ahead: θ·dt.
+    """
+    approaching = closing < 0
+    before_closest = -closing < squared_speed * look_ahead
+    t = where(approaching & before_closest, -closing / where(approaching, squared_speed, 1), look_ahead)
+    return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
+
+
+def gap_discriminant(squared_speed: Number, closing: Number, excess: Number) -> Number:
+    """Below zero where the pair never touches."""
+    return closing * closing - squared_speed * excess
+
+
+def touching_time(closing: Number, excess: Number, root: Number) -> Number:
+    """Time at which an approaching pair touches, from the square root of the discriminant; no cancellation."""
+    return excess / (root - closing)
+
+
+def first_step(time: Number, timestep: Number, fraction: Number) -> Number:
+    """The activation rule in steps: the first step whose look-ahead, a fraction θ of it, reaches a time."""
+    return ceil(time / timestep - fraction)
+
+
+def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
+    """Time at which free flight makes a pair touch, and time of its closest approach.
+
+    The time is negative for an approaching pair that overlaps already and infinite for a pair that never touches.
+    """
+    discriminant = gap_discriminant(squared_speed, closing, excess)
+    touches = (closing < 0) & (discriminant >= 0)
+    time = touching_time(where(touches, closing, 0), excess, sqrt(where(touches, discriminant, 1)))
+    closest = -closing / where(closing < 0, squared_speed, 1)
+    return where(touches, time, float("inf")), closest
+
+
+def flight_of(cx: Number, cy: Number, strain: Number, flight: Number, shear_rate: Number) -> tuple:
     """Displacements of a free flight in the frame that shears with the flow, and the peculiar velocity c_x after it.
 
     Args:
@@ -16,33 +83,76 @@ def flight_of(cx: Array, cy: Array, strain: Array, flight: Array, shear_rate: fl
     return dx, cy * flight, cx - shear_rate * flight * cy
 
 
-def kinetic_means(xx: Array, xy: Array, yy: Array, turned: Array) -> tuple[Array, Array, Array]:
+def kinetic_means(xx: Number, xy: Number, yy: Number, turned: Number) -> tuple[Number, Number, Number]:
     """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``turned``, in which c_x falls by γ̇ c_y t."""
-    return xx - turned * xy + turned**2 / 3 * yy, xy - turned / 2 * yy, yy
+    return xx - turned * xy + turned * turned / 3 * yy, xy - turned / 2 * yy, yy
 
 
-def overlaps_within(squared_speed: Array, closing: Array, excess: Array, look_ahead: float | Array) -> tuple:
-    """The rule of ``is_contact`` for pairs of any shape: whether they are contacts, and whether they approach.
+def residual_target(scale: Number, tolerance: Number, shear_rate: Number, epsilon: Number) -> Number:
+    """The residual at which a solve ends: relative to ‖min(u⁻, 0)‖, with an absolute part for rounding.
 
     Args:
-      squared_speed, closing, excess: |u|², s·u and |s|² − d², see ``gap_coefficients``.
-      look_ahead: θ·dt.
+      scale: ‖min(u⁻, 0)‖ over the contacts.
+      epsilon: rounding of a number of order one.
     """
-    approaching = closing < 0
-    before_closest = -closing < squared_speed * look_ahead
-    t = jnp.where(approaching & before_closest, -closing / jnp.where(approaching, squared_speed, 1), look_ahead)
-    return excess + t * (2 * closing + t * squared_speed) <= 0, approaching
+    return tolerance * scale + ABSOLUTE_RESIDUAL * epsilon * shear_rate
 
 
-def time_to_touch(squared_speed: Array, closing: Array, excess: Array) -> tuple:
-    """The times of ``first_contact_time`` from the numbers that ``overlaps_within`` takes."""
-    discriminant = closing * closing - squared_speed * excess
-    touches = (closing < 0) & (discriminant >= 0)
-    time = excess / (jnp.sqrt(jnp.where(touches, discriminant, 1)) - jnp.where(touches, closing, 0))
-    closest = -closing / jnp.where(closing < 0, squared_speed, 1)
-    return jnp.where(touches, time, jnp.inf), closest
+def relative_residual(residual: Number, scale: Number, target: Number) -> Number:
+    """A residual over ‖min(u⁻, 0)‖, or over the target where that is larger; zero without shear and approach."""
+    floor = maximum(scale, target)
+    return residual / where(floor > 0, floor, 1)
 
 
-def gap_coefficients(x: Array, y: Array, ux: Array, uy: Array, reach: Array) -> tuple[Array, Array, Array]:
-    """|u|², s·u and |s|² − d², the coefficients of |s + u t|² − d²."""
-    return ux * ux + uy * uy, x * ux + y * uy, x * x + y * y - reach**2
+def largest_eigenvalue(xx: Number, xy: Number, yy: Number) -> Number:
+    """The larger eigenvalue of symmetric 2×2 matrices."""
+    return (xx + yy + sqrt((xx - yy) * (xx - yy) + 4 * xy * xy)) / 2
+
+
+def contact_terms(
+    nx: Number,
+    ny: Number,
+    distance: Number,
+    overlap: Number,
+    approach: Number,
+    half_change: Number,
+    bounce: Number,
+    impulse: Number,
+    binary_impulse: Number,
+    clustered: Number,
+    used: Number,
+    loaded: Number,
+    approaching: Number,
+) -> tuple:
+    """What one contact adds to the running sums, in the order of the rows of ``dynamics.tally`` for contacts.
+
+    Args:
+      nx, ny, distance: unit normal and distance of the centres, in σ.
+      overlap: overlap in σ, not negative.
+      approach: relative normal velocity u⁻ before the step.
+      half_change: half its change by the impulses, (u⁺ − u⁻)/2.
+      bounce: 1 + α.
+      impulse, binary_impulse: p = (1 + α) p₀, and the same if the collision were binary.
+      clustered: the impulse p where the contact is in a cluster, otherwise 0.
+      used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
+    """
+    xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
+    return (
+        impulse,
+        binary_impulse,
+        impulse * xx,
+        impulse * xy,
+        impulse * yy,
+        binary_impulse * xx,
+        binary_impulse * xy,
+        binary_impulse * yy,
+        clustered * xx,
+        clustered * xy,
+        clustered * yy,
+        -impulse * (approach + half_change),
+        impulse * (bounce / 2 * approach + half_change),
+        used,
+        loaded,
+        approaching,
+        overlap,
+    )

@@ -70,7 +70,7 @@ class Frame:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Neighbourhood:
+class PairLists:
     """Both lists and the frame that their separations are frozen in.
 
     ===========  ===========  ====  =====================================================
@@ -108,45 +108,45 @@ def consumed_skin(frame: Frame, since: Frame, distance: Array) -> Float[Array, "
     return 2 * moved * (1 + jnp.abs(since.strain)) + distance * jnp.abs(frame.strain - since.strain)
 
 
-def present(hood: Neighbourhood, side: Array) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
+def present(lists: PairLists, side: Array) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
     """Positions of the grains now, wrapped into the cell, and its tilt."""
-    y = hood.positions[:, 1] + hood.frame.displacements[:, 1]
-    x = hood.positions[:, 0] + hood.frame.displacements[:, 0] + hood.frame.strain * y
-    tilt = hood.tilt + hood.frame.strain
+    y = lists.positions[:, 1] + lists.frame.displacements[:, 1]
+    x = lists.positions[:, 0] + lists.frame.displacements[:, 0] + lists.frame.strain * y
+    tilt = lists.tilt + lists.frame.strain
     remapped = remap_tilt(tilt)
     return wrap(jnp.stack([x, y], axis=-1), side, remapped), remapped
 
 
-def neighbourhood(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> Neighbourhood:
+def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairLists:
     """Both lists, built from the positions; the frame starts here."""
-    still = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
+    at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
     outer = _outer_pairs(positions, grains, side, tilt)
-    near = _near_pairs(outer, still, outer.skin, grains, side)
-    return Neighbourhood(outer, near, still, still, positions, tilt)
+    near = _near_pairs(outer, at_rest, outer.skin, grains, side)
+    return PairLists(outer, near, at_rest, at_rest, positions, tilt)
 
 
-def refresh(hood: Neighbourhood, grains: Grains, side: Array, stale: Bool[Array, ""]) -> Neighbourhood:
-    """The neighbourhood with a new near list where it is ``stale``, and all of it anew where the outer list is used up.
+def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""]) -> PairLists:
+    """The lists with a new near list where it is ``stale``, and both anew where the outer list is used up.
 
     Args:
-      hood: the present lists.
+      lists: the present lists.
       grains, side: the grains and the side of their cell.
       stale: whether this replica needs it; others of the batch keep what they have.
     """
-    still = Frame(jnp.zeros_like(hood.positions), jnp.zeros_like(hood.tilt))
+    at_rest = Frame(jnp.zeros_like(lists.positions), jnp.zeros_like(lists.tilt))
     nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
-    left = hood.outer.skin - consumed_skin(hood.frame, still, 2 * jnp.max(grains.radii) + nominal)
+    left = lists.outer.skin - consumed_skin(lists.frame, at_rest, 2 * jnp.max(grains.radii) + nominal)
     left = jax.lax.stop_gradient(left)
     search = stale & ~(left >= nominal)
 
     def searched(_):
-        positions, tilt = present(hood, side)
-        return where_active(search, neighbourhood(positions, grains, side, tilt), filtered(_))
+        positions, tilt = present(lists, side)
+        return where_active(search, pair_lists(positions, grains, side, tilt), filtered(_))
 
     def filtered(_):
-        near = _near_pairs(hood.outer, hood.frame, left, grains, side)
-        new = Neighbourhood(hood.outer, near, hood.frame, hood.frame, hood.positions, hood.tilt)
-        return where_active(stale, new, hood)
+        near = _near_pairs(lists.outer, lists.frame, left, grains, side)
+        new = PairLists(lists.outer, near, lists.frame, lists.frame, lists.positions, lists.tilt)
+        return where_active(stale, new, lists)
 
     return jax.lax.cond(any_replica(search), searched, filtered, None)
 

@@ -34,11 +34,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import count_bound, diagonal, spectral_bound
+from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.contact.network import Contacts
 from jaxgran.model.flow import Solver
-
-LONGEST_STRIDE = 1e4
-WINDOW, PROGRESS = 100, 0.5
 
 
 class Iterate(NamedTuple):

@@ -29,13 +29,13 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import delassus_product, diagonal
+from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import METHODS, Iterate, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import Solver
 from jaxgran.model.status import Status
 
-JAMMED_RESPONSE = 1e-2  # pᵀWp over −pᵀu⁻: 1 at a solution, and 0 where impulses grow without moving anything
 _DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN
 _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 
@@ -94,7 +94,7 @@ def solve(
     rule = METHODS[method]
     bound = rule.bound(contacts, grains)
     scale = jnp.sqrt(dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
-    target = tolerance * scale + 10 * jnp.finfo(b.dtype).eps * shear_rate
+    target = residual_target(scale, tolerance, shear_rate, jnp.finfo(b.dtype).eps)
     relaxation = jnp.asarray(relaxation, b.dtype)
 
     def unfinished(now: _Progress):
@@ -131,11 +131,10 @@ def solve(
     capped = active & ~(end.residual <= target)
     jammed = lax.cond(any_replica(capped), is_jammed, lambda: jnp.bool_(False))
     status = jnp.where(capped, jnp.where(jammed, Status.infeasible, Status.iteration_limit), Status.ok)
-    floor = jnp.maximum(scale, target)  # zero where what approaches does so by rounding, without shear
     return Solution(
         impulses=impulses,
         response=response,
-        residual=jnp.where(active, end.at.best_residual / jnp.where(floor > 0, floor, 1), 0),
+        residual=jnp.where(active, relative_residual(end.at.best_residual, scale, target), 0),
         iterations=end.at.iterations,
         status=jnp.where(active & ~jnp.isfinite(end.at.best_residual), Status.nonfinite, status).astype(jnp.int32),
     )

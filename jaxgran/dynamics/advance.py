@@ -13,7 +13,6 @@ All three solve the same steps to the same tolerance. XLA calls the machine code
 and the thread block as a kernel of Pallas, so ``jit``, ``lax.map`` and ``vmap`` apply to them as to everything else.
 """
 
-import ctypes
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,13 +26,12 @@ from jaxtyping import Array, Int
 
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.plain import ended, require_advance
-from jaxgran.dynamics.tally import FLAT_SUMS, Sums, Tally
+from jaxgran.dynamics.tally import NUMBERS, Tally, sums_from_row
 from jaxgran.model.cell import wrap
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
-_TARGET = "jaxgran_advance"
 MOST_GRAINS = 1024  # of a thread block: the threads that it can have
 _SOLVER = ShearFlow.__dataclass_fields__["solver"].default
 Engine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
@@ -127,18 +125,20 @@ def _advance_jvp(by: Engine, primals: tuple, tangents: tuple) -> tuple[tuple[Sta
 
 
 def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica by ``event_loop``."""
-    _register()
+    """Advance one replica by the machine code."""
+    from jaxgran.dynamics.machine_code import ffi, loop
+
+    ffi.register()
     dtype, grains = state.positions.dtype, state.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
     numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps)
-    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape in (*[state.positions.shape] * 2, (FLAT_SUMS[-1] + 1,))]
-    call = jax.ffi.ffi_call(_TARGET, shapes, vmap_method="sequential")
+    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape in (*[state.positions.shape] * 2, (loop.RESULTS,))]
+    call = jax.ffi.ffi_call(ffi.TARGET, shapes, vmap_method="sequential")
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    positions, velocities, sums = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
-    flights, contacts, clusters, solves, largest, status, tilt = jnp.split(sums, FLAT_SUMS)
-    gathered = Sums(flights, contacts.reshape(7, 5), clusters, solves, largest, status[0].astype(jnp.int32))
-    return ended(state, wrap(positions, state.side, tilt[0]), tilt[0], velocities, gathered)
+    positions, velocities, results = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
+    status, tilt = results[loop.STATUS], results[loop.TILT]
+    sums = sums_from_row(results[:NUMBERS], status.astype(jnp.int32))
+    return ended(state, wrap(positions, state.side, tilt), tilt, velocities, sums)
 
 
 def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
@@ -146,13 +146,3 @@ def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Ta
     from jaxgran.dynamics.thread_block.kernel import advance
 
     return lax.platform_dependent(flow, state, steps, cuda=advance, default=plain_module.advance)
-
-
-@cache
-def _register() -> None:
-    """Compile the machine code, or take what is on disc, and tell XLA where it is."""
-    from jaxgran.dynamics.machine_code.loop import handler
-
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    jax.ffi.register_ffi_target(_TARGET, new(handler.address, None, None), platform="cpu")

@@ -8,12 +8,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgran.contact.delassus import grain_impulses, in_clusters
-from jaxgran.contact.near_pairs import Frame, Neighbourhood, PairList, bit_words, neighbourhood, set_bits
+from jaxgran.contact.law import contact_terms
+from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, contact_network, first_contact_time, is_contact
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.flight import PairMotion, pairs_now
-from jaxgran.dynamics.observer import Look, with_contacts
-from jaxgran.dynamics.tally import RESIDUAL_EDGES, Sums
+from jaxgran.dynamics.observer import ObserveNow, with_contacts
+from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
 from jaxgran.model.control_flow import in_batch, largest_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -39,12 +40,12 @@ def contact_capacities(grains: int) -> tuple[int, ...]:
 
 def contacts_now(flow: ShearFlow, state: State) -> Contacts:
     """The contact network that the next time step of a flow would solve, in a buffer that holds any packing."""
-    hood = neighbourhood(state.positions, state.grains, state.side, state.tilt)
-    pairs = pairs_now(hood, state.velocities, flow.shear_rate)
+    lists = pair_lists(state.positions, state.grains, state.side, state.tilt)
+    pairs = pairs_now(lists, state.velocities, flow.shear_rate)
     separations, velocities = pairs.separations(), pairs.velocities()
-    contact, _ = is_contact(separations, velocities, hood.near.reach, flow.activation_fraction * flow.timestep)
+    contact, _ = is_contact(separations, velocities, lists.near.reach, flow.activation_fraction * flow.timestep)
     index = set_bits(bit_words(contact), contact_capacities(state.grains.radii.size)[-1], contact.size)
-    return contact_network(index, hood.near, separations, velocities, state.grains)
+    return contact_network(index, lists.near, separations, velocities, state.grains)
 
 
 def collide(
@@ -53,11 +54,11 @@ def collide(
     grains: Grains,
     velocities: Array,
     pairs: PairMotion,
-    sums: Sums,
+    sums: RunningSums,
     meets: Array,
     options: AdvanceOptions,
-    look: Look | None,
-) -> tuple[Array, PairMotion, Sums, Array | None]:
+    observe_now: ObserveNow | None,
+) -> tuple[Array, PairMotion, RunningSums, Array | None]:
     """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches.
 
     The last result are displacements that are zero, and have the derivatives that come of contacts that move in time.
@@ -70,11 +71,11 @@ def collide(
     # A lone contact has a closed form, which differs in the last bits: never chosen by what else is in a batch.
     capacities = contact_capacities(grains.radii.size)[1 if in_batch() else 0 :]
     capacities = capacities if options.rungs is None else capacities[-options.rungs :]
-    separations, delays, still = pairs.separations(), None, None
+    separations, delays, zero_shift = pairs.separations(), None, None
     if options.moving_contacts:
         delays = _delays(pairs, near.reach, approaching, flow.timestep)
         apart = jnp.where(_alone(near, contact, grains), delays, 0)
-        separations, still = separations + apart[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
+        separations, zero_shift = separations + apart[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
     rung = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
     rung = largest_replica(jnp.where(meets, rung, 0))
 
@@ -83,21 +84,25 @@ def collide(
             index = set_bits(words, capacity, contact.size)
             network = contact_network(index, near, separations, pairs.velocities(), grains)
             impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
-            new = new if look is None else new._replace(own=with_contacts(sums.own, look, network, impulses))
+            new = (
+                new
+                if observe_now is None
+                else new._replace(user_sums=with_contacts(sums.user_sums, observe_now, network, impulses))
+            )
             change = _velocity_changes(network, impulses, grains)
             (xi, yi), (xj, yj) = change(near.i), change(near.j)
             kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)
             moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
             shift = None
             if delays is not None:
-                own = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
-                delayed = own * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
+                alone = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
+                delayed = alone * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
                 shift = -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
-            return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, still))
+            return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, zero_shift))
 
         return collided
 
-    return lax.switch(rung, [lambda: (velocities, pairs, sums, still), *map(with_capacity, capacities)])
+    return lax.switch(rung, [lambda: (velocities, pairs, sums, zero_shift), *map(with_capacity, capacities)])
 
 
 def _delays(pairs: PairMotion, reach: Array, approaching: Array, timestep: float | Array) -> Float[Array, " pairs"]:
@@ -125,11 +130,11 @@ def _binary_impulses(network: Contacts, bounce: Array | float) -> Float[Array, "
 
 
 def shifted(
-    shift: Array, shear_rate: float | Array, hood: Neighbourhood, velocities: Array, pairs: PairMotion
+    shift: Array, shear_rate: float | Array, lists: PairLists, velocities: Array, pairs: PairMotion
 ) -> tuple[Frame, Array, PairMotion]:
     """Frame, velocities and pairs with the grains displaced, at the same velocities in the laboratory."""
     x, y = shift[:, 0], shift[:, 1]
-    frame, near = hood.frame, hood.near
+    frame, near = lists.frame, lists.near
     moved = frame.displacements + jnp.stack([x - frame.strain * y, y], axis=-1)
     apart = shift[near.i] - shift[near.j]
     pairs = pairs._replace(x=pairs.x + apart[:, 0], y=pairs.y + apart[:, 1])
@@ -155,8 +160,8 @@ def _velocity_changes(network: Contacts, impulses: Array, grains: Grains):
 
 
 def _impulses(
-    flow: ShearFlow, network: Contacts, overflow: Array, sums: Sums, grains: Grains, meets: Array
-) -> tuple[Array, Sums]:
+    flow: ShearFlow, network: Contacts, overflow: Array, sums: RunningSums, grains: Grains, meets: Array
+) -> tuple[Array, RunningSums]:
     """Impulses of a network, and the sums with its contribution."""
     count = grains.radii.size
     solution = solve(
@@ -164,20 +169,26 @@ def _impulses(
     )
     bounce = 1 + flow.restitution
     impulses = bounce * solution.impulses
-    approach, (nx, ny), length = network.approach, network.normals.T, network.distances
-    binary = _binary_impulses(network, bounce)
-    loss = -(approach + bounce / 2 * solution.response)
-    overlaps = jnp.where(network.used, jnp.maximum(grains.radii[network.i] + grains.radii[network.j] - length, 0), 0)
-    deepest = jnp.max(overlaps)
-    slip = bounce / 2 * (approach + solution.response)
-    features = jnp.stack(
-        [jnp.ones_like(nx), nx * nx * length, nx * ny * length, ny * ny * length, loss, overlaps, slip]
-    )
+    approach, (nx, ny), distance = network.approach, network.normals.T, network.distances
+    reach = grains.radii[network.i] + grains.radii[network.j]
+    overlap = jnp.where(network.used, jnp.maximum(reach - distance, 0), 0)
+    deepest = jnp.max(overlap)
     loaded = impulses > 0
     clustered = in_clusters(network, impulses, count) if impulses.size > 1 else jnp.zeros_like(loaded)
-    flags = jnp.stack([network.used, loaded, network.used & (approach < 0)]).astype(nx.dtype)
-    weights = jnp.concatenate([jnp.stack([impulses, binary]), flags])
-    in_cluster = jnp.where(clustered, impulses, 0)
+    flags = (flag.astype(nx.dtype) for flag in (network.used, loaded, network.used & (approach < 0)))
+    terms = contact_terms(
+        nx,
+        ny,
+        distance,
+        overlap,
+        approach,
+        bounce / 2 * solution.response,
+        bounce,
+        impulses,
+        _binary_impulses(network, bounce),
+        jnp.where(clustered, impulses, 0),
+        *flags,
+    )
     status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
     status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok
@@ -185,11 +196,9 @@ def _impulses(
     edges = jnp.asarray(RESIDUAL_EDGES[1:-1], nx.dtype)
     above = jnp.concatenate([jnp.ones(1, bool), solution.residual > edges])
     by_residual = above & ~jnp.append(above[1:], False)
-    return impulses, Sums(
-        flights=sums.flights,
-        contacts=sums.contacts + jnp.matmul(features, weights.T, precision=lax.Precision.HIGHEST),
-        clusters=sums.clusters + jnp.sum(features[1:4] * in_cluster[None, :], axis=1),
-        solves=sums.solves + jnp.concatenate([counts, by_residual.astype(nx.dtype)]),
+    return impulses, sums._replace(
+        contact=sums.contact + jnp.sum(jnp.stack(terms), axis=1),
+        solve=sums.solve + jnp.concatenate([counts, by_residual.astype(nx.dtype)]),
         largest=jnp.maximum(sums.largest, jnp.stack([deepest, solution.residual])),
         status=jnp.maximum(sums.status, status),
     )

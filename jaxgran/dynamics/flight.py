@@ -7,9 +7,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxgran.contact.law import flight_of, kinetic_means
-from jaxgran.contact.near_pairs import Frame, Neighbourhood, refresh, separations_now
+from jaxgran.contact.near_pairs import Frame, PairLists, refresh, separations_now
 from jaxgran.contact.network import first_contact_time
-from jaxgran.dynamics.tally import Sums
+from jaxgran.dynamics.tally import RunningSums
 from jaxgran.model.cell import relative_velocity
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
@@ -33,25 +33,25 @@ class PairMotion(NamedTuple):
         return jnp.stack([self.ux, self.uy], axis=-1)
 
 
-class _Carry(NamedTuple):
-    hood: Neighbourhood
+class Carry(NamedTuple):
+    lists: PairLists
     pairs: PairMotion
     slack: Array  # what is left of the skin of the near list
     velocities: Array
     step: Array  # steps flown
     solved: Array  # whether the contacts of the present step have been dealt with
-    sums: Sums
+    sums: RunningSums
 
 
-def pairs_now(hood: Neighbourhood, velocities: Array, shear_rate: float | Array) -> PairMotion:
-    separations = separations_now(hood.near, hood.frame)
-    u = relative_velocity(velocities, hood.near.i, hood.near.j, separations, shear_rate)
+def pairs_now(lists: PairLists, velocities: Array, shear_rate: float | Array) -> PairMotion:
+    separations = separations_now(lists.near, lists.frame)
+    u = relative_velocity(velocities, lists.near.i, lists.near.j, separations, shear_rate)
     return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
 
 
 def fresh_lists(
-    now: _Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array
-) -> tuple[Neighbourhood, PairMotion, Array, Array]:
+    now: Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array
+) -> tuple[PairLists, PairMotion, Array, Array]:
     """Lists that stay valid for at least one more step, their pairs, the slack, and a bound on its loss per time.
 
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
@@ -66,15 +66,19 @@ def fresh_lists(
     def loss(skin: Array) -> Array:
         return 2 * speed + flow.shear_rate * (diameter + skin) / 2
 
-    stale = go & ~(now.slack >= loss(now.hood.near.skin) * flow.timestep)
+    stale = go & ~(now.slack >= loss(now.lists.near.skin) * flow.timestep)
 
     def fresh():
-        hood = refresh(now.hood, grains, side, stale)
-        new = hood, pairs_now(hood, now.velocities, flow.shear_rate), lax.stop_gradient(hood.near.skin)
-        return where_active(stale, new, (now.hood, now.pairs, now.slack))
+        lists = refresh(now.lists, grains, side, stale)
+        new = (
+            lists,
+            pairs_now(lists, now.velocities, flow.shear_rate),
+            lax.stop_gradient(lists.near.skin),
+        )
+        return where_active(stale, new, (now.lists, now.pairs, now.slack))
 
-    hood, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.hood, now.pairs, now.slack))
-    return hood, pairs, slack, loss(hood.near.skin)
+    lists, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.lists, now.pairs, now.slack))
+    return lists, pairs, slack, loss(lists.near.skin)
 
 
 def steps_to_contact(pairs: PairMotion, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
@@ -93,15 +97,15 @@ def fly(frame: Frame, velocities: Array, flight: Array, shear_rate: float | Arra
 
 
 def add_flight(
-    sums: Sums, velocities: Array, grains: Grains, jump: Array, flight: Array, shear_rate: float | Array
-) -> Sums:
+    sums: RunningSums, velocities: Array, grains: Grains, jump: Array, flight: Array, shear_rate: float | Array
+) -> RunningSums:
     """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
     cx, cy = velocities[:, 0], velocities[:, 1]
     px, py = grains.masses * cx, grains.masses * cy
     xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in ((px, cx), (px, cy), (py, cy)))
     xx, xy, yy = kinetic_means(xx, xy, yy, shear_rate * flight)
     flown = jnp.stack([flight, jump.astype(flight.dtype), flight * xx, flight * xy, flight * yy])
-    return sums._replace(flights=sums.flights + flown)
+    return sums._replace(flight=sums.flight + flown)
 
 
 def smallest(values: Float[Array, " n"]) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ from jaxgran.contact.network import Contacts
 from jaxgran.model.checks import InputError, shown
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
-Look = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
+ObserveNow = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
 
 
 class Observed(NamedTuple):
@@ -29,7 +29,7 @@ class Observed(NamedTuple):
     acted: Float[Array, ""]
 
 
-def nothing_observed(look: Look, slots: int, dtype: jnp.dtype) -> Observed:
+def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> Observed:
     """The sums of no time at all.
 
     Raises:
@@ -38,7 +38,7 @@ def nothing_observed(look: Look, slots: int, dtype: jnp.dtype) -> Observed:
 
     def found(slots: int) -> Any:
         def numbers() -> Any:
-            values = look(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
+            values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
             for x in jax.tree.leaves(values):
                 if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
                     raise InputError(f"observe must return real numbers, not {shown(x)}.")
@@ -52,17 +52,18 @@ def nothing_observed(look: Look, slots: int, dtype: jnp.dtype) -> Observed:
     return Observed(jax.tree.map(lambda x: jnp.zeros(x.shape, dtype), few), jnp.zeros((), dtype))
 
 
-def with_flight(own: Observed, look: Look, steps: Array) -> Observed:
+def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> Observed:
     """The sums with a flight of so many steps; where the contacts of its first step acted, that step is in already."""
-    dtype = own.acted.dtype
-    weight = steps.astype(dtype) - own.acted
-    found = look(_no_contacts(1, dtype), jnp.zeros(1, dtype))
-    return Observed(_added(own.sums, found, weight), jnp.zeros_like(own.acted))
+    dtype = user_sums.acted.dtype
+    weight = steps.astype(dtype) - user_sums.acted
+    found = observe_now(_no_contacts(1, dtype), jnp.zeros(1, dtype))
+    return Observed(_added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.acted))
 
 
-def with_contacts(own: Observed, look: Look, network: Contacts, impulses: Array) -> Observed:
+def with_contacts(user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array) -> Observed:
     """The sums with the present step, whose contacts act."""
-    return Observed(_added(own.sums, look(network, impulses), jnp.ones_like(own.acted)), jnp.ones_like(own.acted))
+    one = jnp.ones_like(user_sums.acted)
+    return Observed(_added(user_sums.sums, observe_now(network, impulses), one), one)
 
 
 def _added(sums: Any, found: Any, weight: Array) -> Any:

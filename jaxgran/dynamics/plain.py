@@ -22,12 +22,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.contact.near_pairs import Neighbourhood, neighbourhood, present
+from jaxgran.contact.near_pairs import PairLists, pair_lists, present
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_capacities, shifted
-from jaxgran.dynamics.flight import LONGEST_FLIGHT, _Carry, add_flight, fly, fresh_lists, pairs_now, steps_to_contact
-from jaxgran.dynamics.observer import Look, nothing_observed, with_flight
-from jaxgran.dynamics.tally import Sums, Tally, empty_sums
+from jaxgran.dynamics.flight import LONGEST_FLIGHT, Carry, add_flight, fly, fresh_lists, pairs_now, steps_to_contact
+from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
+from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import MAX_STEPS, ShearFlow
@@ -74,17 +74,17 @@ def advance_observed(
     """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
     start, body, unfinished = _event_loop(flow, state, steps, True, AdvanceOptions(observe=observe))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
-    return *_ended(state, end, unfinished), end.sums.own.sums
+    return *_ended(state, end, unfinished), end.sums.user_sums.sums
 
 
-def _ended(state: State, end: _Carry, unfinished: Callable) -> tuple[State, Tally]:
+def _ended(state: State, end: Carry, unfinished: Callable) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
     short = jnp.where(unfinished(end), Status.capacity, Status.ok).astype(jnp.int32)
     sums = end.sums._replace(status=jnp.maximum(end.sums.status, short))
-    return ended(state, *present(end.hood, state.side), end.velocities, sums)
+    return ended(state, *present(end.lists, state.side), end.velocities, sums)
 
 
-def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: Sums) -> tuple[State, Tally]:
+def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: RunningSums) -> tuple[State, Tally]:
     """The state and the tally of an advance that led from a state to these positions, tilt and velocities."""
     grains = state.grains
     tally = sums.tally(
@@ -107,19 +107,21 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     require_advance(flow, state, steps)
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
 
-    def look_at(hood: Neighbourhood, velocities: Array) -> Look | None:
-        """The user's view of the flow as it is; None where nobody looks."""
-        return None if options.observe is None else partial(_seen, options.observe, hood, grains, velocities, side)
+    def observer_at(lists: PairLists, velocities: Array) -> ObserveNow | None:
+        """What the user observes of the flow as it is; None where nothing is observed."""
+        return (
+            None if options.observe is None else partial(_observed_at, options.observe, lists, grains, velocities, side)
+        )
 
-    def unfinished(now: _Carry):
+    def unfinished(now: Carry):
         return (now.step < steps) & (now.sums.status < Status.nonfinite)
 
-    def body(now: _Carry) -> _Carry:
+    def body(now: Carry) -> Carry:
         go = unfinished(now)
-        hood, pairs, slack, loss = fresh_lists(now, flow, grains, side, go)
+        lists, pairs, slack, loss = fresh_lists(now, flow, grains, side, go)
 
         least = now.solved.astype(jnp.int32)
-        jump = steps_to_contact(pairs, hood.near.reach, flow, least)
+        jump = steps_to_contact(pairs, lists.near.reach, flow, least)
         jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, jnp.divide(LONGEST_FLIGHT, shear_rate)) / dt))
         jump = jump if free_flight else jnp.zeros_like(jump)
         remaining = steps - now.step
@@ -127,48 +129,60 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         flight = jump.astype(slack.dtype) * dt
 
         sums = add_flight(now.sums, now.velocities, grains, jump, flight, shear_rate)
-        look = look_at(hood, now.velocities)
-        sums = sums if look is None else sums._replace(own=with_flight(sums.own, look, jump))
-        frame, velocities = fly(hood.frame, now.velocities, flight, shear_rate)
-        hood, slack = replace(hood, frame=frame), slack - loss * flight
+        observe_now = observer_at(lists, now.velocities)
+        sums = sums if observe_now is None else sums._replace(user_sums=with_flight(sums.user_sums, observe_now, jump))
+        frame, velocities = fly(lists.frame, now.velocities, flight, shear_rate)
+        lists, slack = replace(lists, frame=frame), slack - loss * flight
         pairs = pairs._replace(x=pairs.x + flight * pairs.ux, y=pairs.y + flight * pairs.uy)
         step = now.step + jump
         meets = go & (step < steps)
-        look = look_at(hood, velocities)
-        velocities, pairs, sums, shift = collide(flow, hood.near, grains, velocities, pairs, sums, meets, options, look)
+        observe_now = observer_at(lists, velocities)
+        velocities, pairs, sums, shift = collide(
+            flow, lists.near, grains, velocities, pairs, sums, meets, options, observe_now
+        )
         if shift is not None:
-            frame, velocities, pairs = shifted(shift, shear_rate, hood, velocities, pairs)
-            hood = replace(hood, frame=frame)
+            frame, velocities, pairs = shifted(shift, shear_rate, lists, velocities, pairs)
+            lists = replace(lists, frame=frame)
         status = jnp.where(
-            hood.near.overflow | (slack < -16 * jnp.finfo(slack.dtype).eps * hood.near.skin), Status.capacity, Status.ok
+            lists.near.overflow | (slack < -16 * jnp.finfo(slack.dtype).eps * lists.near.skin),
+            Status.capacity,
+            Status.ok,
         )
         status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
         sums = sums._replace(status=jnp.maximum(sums.status, status))
-        return where_active(go, _Carry(hood, pairs, slack, velocities, step, meets, sums), now)
+        return where_active(go, Carry(lists, pairs, slack, velocities, step, meets, sums), now)
 
-    hood = neighbourhood(state.positions, grains, side, state.tilt)
-    pairs = pairs_now(hood, state.velocities, shear_rate)
+    lists = pair_lists(state.positions, grains, side, state.tilt)
+    pairs = pairs_now(lists, state.velocities, shear_rate)
     sums = empty_sums(state.positions.dtype)
     sums = sums._replace(status=status_if_finite(state.positions, state.velocities))
-    look = look_at(hood, state.velocities)
-    if look is not None:
-        sums = sums._replace(own=nothing_observed(look, contact_capacities(flow.grains)[-1], state.positions.dtype))
-    start = _Carry(hood, pairs, hood.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
+    observe_now = observer_at(lists, state.velocities)
+    if observe_now is not None:
+        sums = sums._replace(
+            user_sums=nothing_observed(observe_now, contact_capacities(flow.grains)[-1], state.positions.dtype)
+        )
+    start = Carry(lists, pairs, lists.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
     return start, body, unfinished
 
 
-def _seen(
-    observe: Observe, hood: Neighbourhood, grains: Grains, velocities: Array, side: Array, contacts: Contacts, p: Array
+def _observed_at(
+    observe: Observe,
+    lists: PairLists,
+    grains: Grains,
+    velocities: Array,
+    side: Array,
+    contacts: Contacts,
+    p: Array,
 ) -> Any:
     """What is observed of one time step with the given contacts and impulses p."""
-    positions, tilt = present(hood, side)
+    positions, tilt = present(lists, side)
     return observe(State(grains, positions, velocities, side, tilt), contacts, p)
 
 
-def _scanned(start: _Carry, body: Callable, unfinished: Callable, events: int) -> _Carry:
+def _scanned(start: Carry, body: Callable, unfinished: Callable, events: int) -> Carry:
     """The end of a loop of fixed length, of which reverse mode keeps what is carried and computes all else again."""
 
-    def one(now: _Carry, _: None) -> tuple[_Carry, None]:
+    def one(now: Carry, _: None) -> tuple[Carry, None]:
         return lax.cond(any_replica(unfinished(now)), body, lambda now: now, now), None
 
     return lax.scan(jax.checkpoint(one), start, length=events)[0]

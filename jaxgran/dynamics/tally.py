@@ -1,10 +1,11 @@
-"""Tally: running sums of one sample, and the averages that follow from them.
+"""Tally: the sums over the steps of one sample, and the one table from which their places in memory follow.
 
-While a sample runs its sums are kept in a few small arrays (``Sums``), since a loop that carries two dozen scalars
-spends its time on them; ``tally`` gives them their names in the end.
+The fields of ``Tally`` are the table: every row has a shape, a unit, a meaning, and what adds to it. While the time
+loop runs, an engine keeps the sums as plain numbers. Their order follows from the table (``LAYOUT``), so no position is
+written down anywhere. A new sum over contacts is one row here and one term of ``contact.law.contact_terms``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import jax
@@ -12,69 +13,60 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-EXTREMES = ("largest_overlap", "worst_residual", "momentum_drift", "status")  # joined by the larger one, not added
 RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
 
-FLAT_SUMS = 5, 40, 43, 110, 112, 113  # where the fields of ``Sums`` after the first begin in its numbers, and its end
+# What adds to a sum. The running sums of an engine stand in this order, and within it in the order of the table.
+FLIGHT = "flight"  # the flight between two events
+CONTACT = "contact"  # each contact of a solved network, by the law of a contact
+SOLVE = "solve"  # each solved network
+LARGEST = "largest"  # each solved network; the largest value counts
+AT_END = "end"  # the end of an advance
+KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST)
+_TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
+
+
+def _sum(kind: str, unit: str, meaning: str, shape: tuple[int, ...] = (), joined: str = "sum") -> Any:
+    """A row of the table. Parts are joined by their sum, or by the largest of them."""
+    joined = "largest" if kind == LARGEST else joined
+    return field(metadata={"kind": kind, "unit": unit, "meaning": meaning, "shape": shape, "joined": joined})
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Tally:
-    """Sums over the steps of a sample of one replica; ``+`` joins two samples.
+    """Sums over the steps of a sample of one replica; ``+`` joins two samples."""
 
-    =================  =======  ======  ==========================================================================
-    field              shape    unit    sum of
-    =================  =======  ======  ==========================================================================
-    duration           ()       1/γ̇     time
-    steps              ()       –       time steps, counted as a float (they exceed an int32)
-    impulse            ()       mσγ̇     contact impulses p
-    binary_impulse     ()       mσγ̇     (1+α) μ₁₂ max(0, −u⁻), the impulses if every collision were binary
-    contact_moment     (2, 2)   mσ²γ̇    σ ⊗ p n over the contacts, σ the centre-to-centre vector
-    binary_moment      (2, 2)   mσ²γ̇    the same with the binary impulses
-    cluster_moment     (2, 2)   mσ²γ̇    the contact moment of clusters of three or more grains that push at once
-    kinetic_moment     (2, 2)   mσ²γ̇    ∫ Σ m c ⊗ c dt, exact along the flights
-    dissipation        ()       mσ²γ̇²   energy lost in contacts, −½ Σ p (u⁻ + u⁺)
-    complementarity    ()       mσ²γ̇²   ½ Σ p (u⁺ + α u⁻), zero where a solve is exact
-    energy_change      ()       mσ²γ̇²   growth of the kinetic energy ½ Σ m c²
-    contacts           ()       –       contacts of the steps in which a network was solved
-    loaded_contacts    ()       –       contacts that carry an impulse
-    collisions         ()       –       contacts that approach
-    solves             ()       –       networks solved
-    iterations         ()       –       solver iterations
-    unconverged        ()       –       solves that ended above the tolerance
-    residual_counts    (64,)    –       solves by relative residual, in the bins between ``RESIDUAL_EDGES``
-    overlap            ()       σ       overlaps of the contacts of solved networks
-    largest_overlap    ()       σ       (the largest) overlap of a contact
-    worst_residual     ()       –       (the largest) relative residual of a solve
-    momentum_drift     ()       –       (the largest) |Σ m c| over Σ m |c|, at the end
-    status             ()       –       (the worst) status
-    =================  =======  ======  ==========================================================================
-    """
-
-    duration: Float[Array, "*b"]
-    steps: Float[Array, "*b"]
-    impulse: Float[Array, "*b"]
-    binary_impulse: Float[Array, "*b"]
-    contact_moment: Float[Array, "*b 2 2"]
-    binary_moment: Float[Array, "*b 2 2"]
-    cluster_moment: Float[Array, "*b 2 2"]
-    kinetic_moment: Float[Array, "*b 2 2"]
-    dissipation: Float[Array, "*b"]
-    complementarity: Float[Array, "*b"]
-    energy_change: Float[Array, "*b"]
-    contacts: Float[Array, "*b"]
-    loaded_contacts: Float[Array, "*b"]
-    collisions: Float[Array, "*b"]
-    solves: Float[Array, "*b"]
-    iterations: Float[Array, "*b"]
-    unconverged: Float[Array, "*b"]
-    residual_counts: Float[Array, "*b 64"]
-    overlap: Float[Array, "*b"]
-    largest_overlap: Float[Array, "*b"]
-    worst_residual: Float[Array, "*b"]
-    momentum_drift: Float[Array, "*b"]
-    status: Int[Array, "*b"]
+    duration: Float[Array, "*b"] = _sum(FLIGHT, "1/γ̇", "time")
+    steps: Float[Array, "*b"] = _sum(FLIGHT, "–", "time steps, counted as a float (they exceed an int32)")
+    impulse: Float[Array, "*b"] = _sum(CONTACT, "mσγ̇", "contact impulses p")
+    binary_impulse: Float[Array, "*b"] = _sum(
+        CONTACT, "mσγ̇", "(1+α) μ₁₂ max(0, −u⁻), the impulses if every collision were binary"
+    )
+    contact_moment: Float[Array, "*b 2 2"] = _sum(
+        CONTACT, "mσ²γ̇", "σ ⊗ p n over the contacts, σ the centre-to-centre vector", _TENSOR
+    )
+    binary_moment: Float[Array, "*b 2 2"] = _sum(CONTACT, "mσ²γ̇", "the same with the binary impulses", _TENSOR)
+    cluster_moment: Float[Array, "*b 2 2"] = _sum(
+        CONTACT, "mσ²γ̇", "the contact moment of clusters of three or more grains that push at once", _TENSOR
+    )
+    kinetic_moment: Float[Array, "*b 2 2"] = _sum(FLIGHT, "mσ²γ̇", "∫ Σ m c ⊗ c dt, exact along the flights", _TENSOR)
+    dissipation: Float[Array, "*b"] = _sum(CONTACT, "mσ²γ̇²", "energy lost in contacts, −½ Σ p (u⁻ + u⁺)")
+    complementarity: Float[Array, "*b"] = _sum(CONTACT, "mσ²γ̇²", "½ Σ p (u⁺ + α u⁻), zero where a solve is exact")
+    energy_change: Float[Array, "*b"] = _sum(AT_END, "mσ²γ̇²", "growth of the kinetic energy ½ Σ m c²")
+    contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts of the steps in which a network was solved")
+    loaded_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that carry an impulse")
+    collisions: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that approach")
+    solves: Float[Array, "*b"] = _sum(SOLVE, "–", "networks solved")
+    iterations: Float[Array, "*b"] = _sum(SOLVE, "–", "solver iterations")
+    unconverged: Float[Array, "*b"] = _sum(SOLVE, "–", "solves that ended above the tolerance")
+    residual_counts: Float[Array, "*b 64"] = _sum(
+        SOLVE, "–", "solves by relative residual, in the bins between ``RESIDUAL_EDGES``", (RESIDUAL_EDGES.size - 1,)
+    )
+    overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
+    largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
+    worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
+    momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
+    status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
@@ -82,6 +74,82 @@ class Tally:
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
         """The tally of all that stands along leading axes: sums, and the larger of each of ``EXTREMES``."""
         return Tally(**{name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in vars(self).items()})
+
+
+TABLE = {row.name: row.metadata for row in fields(Tally)}
+EXTREMES = tuple(name for name, row in TABLE.items() if row["joined"] == "largest")  # joined by the larger one
+
+
+def _layout() -> dict[str, slice]:
+    """Where each of the running sums stands, for an engine that keeps them in one row of numbers."""
+    places, begin = {}, 0
+    for kind in KINDS:
+        for name, row in TABLE.items():
+            if row["kind"] == kind:
+                size = 3 if row["shape"] == _TENSOR else int(np.prod(row["shape"], dtype=int))
+                places[name] = slice(begin, begin + size)
+                begin += size
+    return places
+
+
+LAYOUT = _layout()
+NUMBERS = max(place.stop for place in LAYOUT.values())  # of the running sums
+
+
+def place_of(name: str) -> int:
+    """Where a running sum begins."""
+    return LAYOUT[name].start
+
+
+def span_of(kind: str) -> slice:
+    """Where the running sums of one kind stand."""
+    places = [place for name, place in LAYOUT.items() if TABLE[name]["kind"] == kind]
+    return slice(places[0].start, places[-1].stop)
+
+
+class RunningSums(NamedTuple):
+    """What the time loop of an engine carries, until ``tally`` gives the sums their names.
+
+    =========  ===========  ========================================================================================
+    field      shape        meaning
+    =========  ===========  ========================================================================================
+    flight     (numbers,)   the sums of each kind, in the order of ``LAYOUT``
+    contact    (numbers,)
+    solve      (numbers,)
+    largest    (numbers,)
+    status     ()           the worst status
+    user_sums  pytree       what a function of the user's has found, see ``observer``; () where there is none
+    =========  ===========  ========================================================================================
+    """
+
+    flight: Float[Array, " flight"]
+    contact: Float[Array, " contact"]
+    solve: Float[Array, " solve"]
+    largest: Float[Array, " largest"]
+    status: Int[Array, ""]
+    user_sums: Any = ()
+
+    def tally(self, energy_change: Array, momentum_drift: Array) -> Tally:
+        """The tally; what is known only at the end of an advance is given."""
+        ends = {"energy_change": energy_change, "momentum_drift": momentum_drift, "status": self.status}
+        return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})
+
+    def _named(self, name: str) -> Array:
+        kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
+        begin = span_of(kind).start
+        numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
+        return numbers[jnp.asarray([0, 1, 1, 2])].reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
+
+
+def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
+    """The running sums of an engine that keeps them in one row."""
+    flight, contact, solve, largest = (numbers[span_of(kind)] for kind in KINDS)
+    return RunningSums(flight, contact, solve, largest, status)
+
+
+def empty_sums(dtype: jnp.dtype) -> RunningSums:
+    """The running sums of no time at all."""
+    return sums_from_row(jnp.zeros(NUMBERS, dtype), jnp.int32(0))
 
 
 def empty_tally(dtype: jnp.dtype) -> Tally:
@@ -105,71 +173,16 @@ def tally_from_flat(numbers: np.ndarray, dtype: jnp.dtype) -> Tally:
     return jax.tree.unflatten(structure, [x.reshape(*shape, *leaf.shape).astype(leaf.dtype) for x, leaf in parts])
 
 
-class Sums(NamedTuple):
-    """A tally in the making.
-
-    ===============  =======  =====================================================================================
-    field            shape    sum of
-    ===============  =======  =====================================================================================
-    flights          (5,)     time, steps, and the integrals of Σ m c_x c_x, Σ m c_x c_y, Σ m c_y c_y
-    contacts         (7, 5)   over contacts: (1, l n_x n_x, l n_x n_y, l n_y n_y, loss per impulse, overlap,
-                              (u⁺ + α u⁻)/2), l the distance, times (p, binary p, used, loaded, approaching)
-    clusters         (3,)     (l n_x n_x, l n_x n_y, l n_y n_y) p over contacts in clusters
-    solves           (67,)    networks solved, iterations, unconverged solves, and the counts by residual
-    largest          (2,)     (the largest) overlap of a contact and relative residual of a solve
-    status           ()       (the worst) status
-    own              pytree   what an observer of the user's has found, see ``observer``; () where there is none
-    ===============  =======  =====================================================================================
-    """
-
-    flights: Float[Array, "5"]
-    contacts: Float[Array, "7 5"]
-    clusters: Float[Array, "3"]
-    solves: Float[Array, "67"]
-    largest: Float[Array, "2"]
-    status: Int[Array, ""]
-    own: Any = ()
-
-    def tally(self, energy_change: Array, momentum_drift: Array) -> Tally:
-        """The tally with its named fields, two of which are known from the ends of the advance."""
-
-        def tensor(components: Array) -> Array:
-            return components[jnp.asarray([0, 1, 1, 2])].reshape(2, 2)
-
-        return Tally(
-            duration=self.flights[0],
-            steps=self.flights[1],
-            impulse=self.contacts[0, 0],
-            binary_impulse=self.contacts[0, 1],
-            contact_moment=tensor(self.contacts[1:4, 0]),
-            binary_moment=tensor(self.contacts[1:4, 1]),
-            cluster_moment=tensor(self.clusters),
-            kinetic_moment=tensor(self.flights[2:]),
-            dissipation=self.contacts[4, 0],
-            complementarity=self.contacts[6, 0],
-            energy_change=energy_change,
-            contacts=self.contacts[0, 2],
-            loaded_contacts=self.contacts[0, 3],
-            collisions=self.contacts[0, 4],
-            solves=self.solves[0],
-            iterations=self.solves[1],
-            unconverged=self.solves[2],
-            residual_counts=self.solves[3:],
-            overlap=self.contacts[5, 2],
-            largest_overlap=self.largest[0],
-            worst_residual=self.largest[1],
-            momentum_drift=momentum_drift,
-            status=self.status,
-        )
+def _documentation() -> str:
+    """The table as the docstring of ``Tally`` shows it."""
+    rows = [("field", "shape", "unit", "sum of")]
+    for name, row in TABLE.items():
+        largest = "(the largest) " if row["joined"] == "largest" else ""
+        rows.append((name, str(row["shape"]).replace(",)", ",)"), row["unit"], largest + row["meaning"]))
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    border = "  ".join("=" * width for width in widths)
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join(["", "", border, lines[0], border, *lines[1:], border])
 
 
-def empty_sums(dtype: jnp.dtype) -> Sums:
-    """The sums of no time at all."""
-    return Sums(
-        flights=jnp.zeros(5, dtype),
-        contacts=jnp.zeros((7, 5), dtype),
-        clusters=jnp.zeros(3, dtype),
-        solves=jnp.zeros(3 + RESIDUAL_EDGES.size - 1, dtype),
-        largest=jnp.zeros(2, dtype),
-        status=jnp.int32(0),
-    )
+Tally.__doc__ = (Tally.__doc__ or "") + _documentation()

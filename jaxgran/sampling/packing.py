@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.near_pairs import (
     Frame,
-    Neighbourhood,
+    PairLists,
     consumed_skin,
-    neighbourhood,
+    pair_lists,
     present,
     refresh,
     separations_now,
@@ -38,7 +38,7 @@ _SHORTEST_STEP, _LONGEST_STEP = 0.1, 0.5  # FIRE's time step; overlap stiffness 
 
 
 class _Fire(NamedTuple):
-    hood: Neighbourhood
+    hood: PairLists
     velocities: Array
     step: Array
     mixing: Array
@@ -80,7 +80,7 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
 
     def start(attempt: Int[Array, ""]) -> _Fire:
         places = jax.random.uniform(jax.random.fold_in(place_key, attempt), still.shape, side.dtype) * side
-        hood = neighbourhood(places, inflated, side, jnp.zeros_like(side))
+        hood = pair_lists(places, inflated, side, jnp.zeros_like(side))
         step, mixing = jnp.asarray(_SHORTEST_STEP, side.dtype), jnp.asarray(0.1, side.dtype)
         return _Fire(hood, still, step, mixing, jnp.int32(0), jnp.full_like(side, jnp.inf), jnp.int32(0), attempt + 1)
 
@@ -120,7 +120,7 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
         )
 
 
-def _overlap_forces(hood: Neighbourhood, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
+def _overlap_forces(hood: PairLists, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
     """Forces of the overlap energy, and the largest overlap (infinite while the list is incomplete)."""
     pairs = hood.near
     separations = separations_now(pairs, hood.frame)
@@ -151,5 +151,5 @@ def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire
     velocities = mixed + step * forces
     stride = jnp.where(overlap < allowed, 0, step)
     moved = Frame(hood.frame.displacements + stride * velocities, hood.frame.strain)
-    hood = Neighbourhood(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
+    hood = PairLists(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
     return _Fire(hood, velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts)

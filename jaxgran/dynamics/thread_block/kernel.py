@@ -32,7 +32,7 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.law import flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
 from jaxgran.dynamics.plain import ended
-from jaxgran.dynamics.tally import RESIDUAL_EDGES, Sums, Tally, empty_sums
+from jaxgran.dynamics.tally import LAYOUT, RESIDUAL_EDGES, RunningSums, Tally, sums_from_row
 from jaxgran.dynamics.thread_block.memory import (
     APPROACH,
     CX,
@@ -160,20 +160,11 @@ def trial(grains: int, dtype: jnp.dtype) -> None:
         raise RuntimeError(f"it fails in {', '.join(wrong)}")
 
 
-def _sums(totals: Array, residuals: Array, status: Array) -> Sums:
-    """The sums of an advance from what the kernel returns: those of contacts, then flights and solves."""
-    of, rest = totals[:KINETIC], totals[KINETIC:]
-    empty = empty_sums(totals.dtype)
-    contacts = empty.contacts.at[0].set(of[:5]).at[1:4, 0].set(of[5:8]).at[1:4, 1].set(of[8:11])
-    contacts = contacts.at[4, 0].set(of[14]).at[6, 0].set(of[15]).at[5, 2].set(of[16])
-    return empty._replace(
-        flights=rest[:5],
-        contacts=contacts,
-        clusters=of[11:14],
-        solves=jnp.concatenate([rest[5:8], residuals[: RESIDUAL_EDGES.size - 1]]),
-        largest=rest[8:10],
-        status=status,
-    )
+def _sums(totals: Array, counts: Array, status: Array) -> RunningSums:
+    """The running sums of an advance from what the kernel returns; the counts by residual come from the grains."""
+    bins = LAYOUT["residual_counts"]
+    counts = counts[: bins.stop - bins.start]
+    return sums_from_row(jnp.concatenate([totals[: bins.start], counts, totals[bins.start : -1]]), status)
 
 
 def _kernel(*memory: Any, grains: int, interpret: bool) -> None:
@@ -213,7 +204,7 @@ def _kernel(*memory: Any, grains: int, interpret: bool) -> None:
     contacts, kinetic = [total / 2 for total in sums[:KINETIC]], sums[KINETIC:]  # each contact was seen twice
     time, *solves = end.counts
     tilt = remap_tilt(end.lists.tilt + end.lists.strain)
-    for n, value in enumerate([*contacts, time, end.step.astype(x.dtype), *kinetic, *solves, tilt]):
+    for n, value in enumerate([time, end.step.astype(x.dtype), *kinetic, *contacts, *solves, tilt]):
         block.totals[n] = value
     block.status[0] = end.status
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.experimental.pallas import triton
 from jaxtyping import Array
 
+from jaxgran.dynamics.tally import CONTACT, LAYOUT, NUMBERS, span_of
 from jaxgran.model.status import Status
 
 NEAR = 20  # near grains that a grain has room for
@@ -23,8 +24,13 @@ X, Y, CX, CY, RADIUS, INVERSE_MASS, GIVEN = range(7)  # rows of what is given; t
 PULL_X, PULL_Y, WIDTH, SHARED = range(4, 8)  # velocity changes by impulses; the share of a grain in the spectral bound
 TOUCHING, LOADED, COUNTS = range(3)  # contacts of a grain, and those that carry an impulse
 NX, NY, APPROACH, DISTANCE, IMPULSE, RESPONSE, STEP, CHANGE, BEST, BOUND, NETWORK = range(11)  # of a contact
-KINETIC, RESIDUALS, SUMS = 17, 20, 21  # rows of the sums: contacts come before flights, and solves last
-TOTALS = 28  # the sums but the last, time, steps, five numbers of the solves, and the tilt
+
+# Rows of the sums that each grain adds to: those of contacts, the kinetic moment, and the solves by residual.
+KINETIC = span_of(CONTACT).stop - span_of(CONTACT).start
+RESIDUALS = KINETIC + 3
+SUMS = RESIDUALS + 1
+_BINS = LAYOUT["residual_counts"]
+TOTALS = NUMBERS - (_BINS.stop - _BINS.start) + 1  # the running sums without the counts by residual, and the tilt
 
 
 class Flow(NamedTuple):
@@ -54,9 +60,9 @@ class Block(NamedTuple):
     given: Any  # (6, threads): positions, peculiar velocities, radii, inverse masses
     bins: Any  # (2, threads): bounds of the bins of the residuals
     moved: Any  # (4, threads): positions at the last search; at the end those then, and the peculiar velocities
-    totals: Any  # (28,)
+    totals: Any  # (TOTALS,)
     status: Any  # (1,)
-    sums: Any  # (21, threads): what each grain adds to the sums, and the solves by residual
+    sums: Any  # (SUMS, threads): what each grain adds to the sums, and the solves by residual
     shared: Any  # (7, threads): what grains tell each other
     counts: Any  # (2, threads): the same of whole numbers
     near: Any  # (NEAR, threads): near grains

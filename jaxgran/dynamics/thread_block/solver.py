@@ -14,9 +14,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxgran.contact.delassus import largest_eigenvalue
-from jaxgran.contact.projected_methods import LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.contact.solver import JAMMED_RESPONSE
+from jaxgran.contact.law import (
+    JAMMED_RESPONSE,
+    LONGEST_STRIDE,
+    PROGRESS,
+    WINDOW,
+    contact_terms,
+    largest_eigenvalue,
+    relative_residual,
+    residual_target,
+)
 from jaxgran.dynamics.thread_block.memory import (
     APPROACH,
     BEST,
@@ -101,7 +108,7 @@ def collided(
     """
     flow, block = thread.flow, thread.block
     bounce = 1 + flow.restitution
-    target = flow.tolerance * jnp.sqrt(scale) + 10 * flow.epsilon * flow.shear_rate
+    target = residual_target(jnp.sqrt(scale), flow.tolerance, flow.shear_rate, flow.epsilon)
     thread.tell([TOUCHING], [contacts])
     most, zero = jnp.max(contacts), jnp.zeros_like(motion.x)
 
@@ -134,26 +141,35 @@ def collided(
     x, y, loaded = thread.tell((PULL_X, PULL_Y, LOADED), (x, y, loaded))
 
     def tally(m: Array, ok: Array) -> Array:
-        """Add a contact to the sums: rows 0 to 16, in the order in which ``thread_block`` takes them apart."""
+        """Add a contact to the sums."""
         contact = _contact(thread, m, contacts)
         nx, ny, approach = contact.nx, contact.ny, contact.approach
         distance, impulse = _read(thread, m, contact.real, DISTANCE, IMPULSE)
-        response = bounce / 2 * _response(thread, contact, x, y)
+        half_change = bounce / 2 * _response(thread, contact, x, y)
         push, approaches = bounce * impulse, contact.real & (approach < 0)
         single = jnp.where(approaches, -bounce * approach / jnp.where(contact.real, contact.mobility, 1), 0)
         clustered = (loaded > 1) | (thread.ask(block.counts, LOADED, contact.other, contact.real) > 1)
         reach = thread.radius + thread.ask(block.given, RADIUS, contact.other, contact.real)
-        moments = nx * nx * distance, nx * ny * distance, ny * ny * distance
-        flags = (x.astype(nx.dtype) for x in (contact.real, push > 0, approaches))
-        weights = push, single, jnp.where(clustered, push, 0)
-        sums = [push, single, *flags, *(weight * moment for weight in weights for moment in moments)]
-        sums += [-push * (approach + response), push * (bounce / 2 * approach + response)]
-        thread.add(0, [*sums, jnp.where(contact.real, jnp.maximum(reach - distance, 0), 0)])
+        overlap = jnp.where(contact.real, jnp.maximum(reach - distance, 0), 0)
+        flags = (flag.astype(nx.dtype) for flag in (contact.real, push > 0, approaches))
+        terms = contact_terms(
+            nx,
+            ny,
+            distance,
+            overlap,
+            approach,
+            half_change,
+            bounce,
+            push,
+            single,
+            jnp.where(clustered, push, 0),
+            *flags,
+        )
+        thread.add(0, terms)
         return ok
 
     lax.fori_loop(0, most, tally, flow.ok)
-    floor = jnp.maximum(jnp.sqrt(scale), target)  # zero where what approaches does so by rounding, without shear
-    residual = jnp.sqrt(solve.squared) / jnp.where(floor > 0, floor, 1)
+    residual = relative_residual(jnp.sqrt(solve.squared), jnp.sqrt(scale), target)
     mine = (residual > block.bins[0, :]) & (residual <= block.bins[1, :])
     thread.add(RESIDUALS, [mine.astype(zero.dtype)])
     counts = counts._replace(

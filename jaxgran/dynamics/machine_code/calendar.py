@@ -1,0 +1,121 @@
+"""The calendar of pairs: in which steps each near pair will be a contact, as long as neither grain is struck.
+
+Between two impulses both grains of a pair fly freely, so these steps follow from a quadratic equation. The next step to
+visit is the smallest entry, and its contacts are a comparison of whole numbers away.
+"""
+
+import math
+
+import numpy as np
+
+from jaxgran.contact import law
+from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.layout import (
+    ACROSS,
+    BEGINS,
+    ENDS,
+    FIRST,
+    LANES,
+    MANY,
+    NEVER,
+    RADIUS,
+    ROW,
+    SECOND,
+    STRIKES,
+    VX,
+    VY,
+    X,
+    Y,
+)
+
+_LAW = compiled_law(law)
+gap_coefficients, gap_discriminant = _LAW["gap_coefficients"], _LAW["gap_discriminant"]
+touching_time, first_step = _LAW["touching_time"], _LAW["first_step"]
+
+
+@compiled
+def pair_motion(p, t, flow, grains, pairs):
+    """Both grains of a pair, its separation at the time t since the search, and its relative velocity."""
+    motion, images = grains.motion, pairs.images
+    i, j = pairs.ends[FIRST, p], pairs.ends[SECOND, p]
+    up = images[ROW, p] * flow.side
+    ux, uy = motion[i, VX] - motion[j, VX] - flow.rate * up, motion[i, VY] - motion[j, VY]
+    dx = motion[i, X] - motion[j, X] - images[ACROSS, p] + ux * t
+    dy = motion[i, Y] - motion[j, Y] - up + uy * t
+    return i, j, dx, dy, ux, uy
+
+
+@compiled
+def predict_contact_steps(p, t, earliest, horizon, flow, grains, pairs):
+    """Write when, from the step ``earliest`` on, a pair is a contact if neither grain is struck.
+
+    ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer valid.
+    """
+    calendar, dt, theta = pairs.calendar, flow.dt, flow.theta
+    i, j, dx, dy, ux, uy = pair_motion(p, t, flow, grains, pairs)
+    reach = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
+    speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
+    calendar[STRIKES, p], calendar[BEGINS, p], calendar[ENDS, p] = NEVER, NEVER, -1
+    if excess > 0.0 and excess + 2 * closing * horizon > 0.0:
+        return  # apart, and the gap does not close while the list is valid
+    if speed == 0.0:
+        if excess <= 0.0:
+            calendar[BEGINS, p], calendar[ENDS, p] = earliest, NEVER - 1
+        return
+    discriminant = gap_discriminant(speed, closing, excess)
+    if not discriminant >= 0.0:
+        return
+    root = math.sqrt(discriminant)
+    turn = _as_step(first_step(t - closing / speed, dt, 0.0))  # the first step in which the pair recedes
+    enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) / speed
+    begin = max(earliest, _as_step(first_step(t + enter, dt, theta)))
+    last = max(turn - 1, _as_step(np.floor((t + (root - closing) / speed) / dt - theta)))
+    if begin <= last and begin < MANY:
+        calendar[BEGINS, p], calendar[ENDS, p] = begin, last
+        if begin < turn:
+            calendar[STRIKES, p] = begin
+
+
+@compiled
+def _as_step(number):
+    """The number as a step of the calendar: -1 for what is past or no number, and never beyond its end."""
+    if number > MANY:
+        return int(MANY)
+    return int(number) if number > -1.0 else -1
+
+
+@compiled
+def clear_calendar(found, pairs):
+    """Fill the slots behind the pairs found up to whole ``LANES``; returns the number of these blocks."""
+    blocks = (found + LANES - 1) // LANES
+    for p in range(found, blocks * LANES):
+        pairs.calendar[STRIKES, p], pairs.calendar[BEGINS, p], pairs.calendar[ENDS, p] = NEVER, NEVER, -1
+    return blocks
+
+
+@compiled
+def next_contact_step(blocks, pairs):
+    """The next step in which some contact approaches."""
+    calendar = pairs.calendar
+    strike = NEVER
+    for p in range(blocks * LANES):
+        strike = min(strike, calendar[STRIKES, p])
+    return strike
+
+
+@compiled
+def contacts_of_step(k, blocks, pairs, met):
+    """Write the pairs that are contacts in a step; more than there is room for are counted, not kept."""
+    calendar = pairs.calendar
+    contacts, now = 0, np.int32(k)
+    for block in range(blocks):
+        inside = 0
+        for p in range(block * LANES, (block + 1) * LANES):
+            inside += (calendar[BEGINS, p] <= now) & (now <= calendar[ENDS, p])
+        if inside > 0:
+            for p in range(block * LANES, (block + 1) * LANES):
+                if calendar[BEGINS, p] <= now and now <= calendar[ENDS, p]:
+                    if contacts < met.size:
+                        met[contacts] = p
+                    contacts += 1
+    return contacts

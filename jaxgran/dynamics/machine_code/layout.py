@@ -1,0 +1,99 @@
+"""Where numbers lie in the memory of the machine code, and what its functions are given together.
+
+Arrays are handed on whole and read by row and column. Indices are unsigned, which spares a test for negative ones.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxgran.model.status import Status
+
+X, Y, VX, VY = range(4)  # columns of the motion of the grains
+RADIUS, INVERSE_MASS = range(2)  # columns of the grains
+FIRST, SECOND = range(2)  # rows of the ends of a pair, and of a contact
+ACROSS, ROW = range(2)  # rows of the images: r_i − r_j − (across, row·L) is the separation
+STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the search
+NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
+PULL_X, PULL_Y, DRIVE, IX, IY, JX, JY, MOBILITY, P = range(9)  # columns of what a contact brings to the solver
+RESPONSE, STEP, CHANGE, BEST, BOUND = range(5)  # columns of the same for a stiff cluster
+
+NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
+MANY = 2.0**30  # steps, the end of the calendar
+LANES = 64  # entries of the calendar that are compared together
+EPSILON = float(np.finfo(np.float64).eps)
+OK, ITERATION_LIMIT, DEEP = int(Status.ok), int(Status.iteration_limit), int(Status.deep_overlap)
+INFEASIBLE, CAPACITY, NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
+
+
+class Flow(NamedTuple):
+    """Numbers of a flow that do not change: side of the cell, shear rate, dt, θ, 1 + α, tolerance, most iterations."""
+
+    side: Any
+    rate: Any
+    dt: Any
+    theta: Any
+    bounce: Any
+    tolerance: Any
+    most_iterations: Any
+
+
+class Grains(NamedTuple):
+    """The grains. Positions in the laboratory are r + v t with t counted from the last search for near pairs.
+
+    motion: (grains, 4), r and v in the laboratory; constants: (grains, 2), radius and inverse mass.
+    """
+
+    motion: Any
+    constants: Any
+
+
+class Pairs(NamedTuple):
+    """Near pairs, filled up to whole ``LANES``.
+
+    ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; of_grain: (2 room,) pairs of the grains,
+    those of grain g at ``offsets[g] : offsets[g + 1]``; heads, links: chains of the grains in each cell of the search.
+    """
+
+    ends: Any
+    images: Any
+    calendar: Any
+    of_grain: Any
+    offsets: Any
+    heads: Any
+    links: Any
+
+
+class Network(NamedTuple):
+    """The contacts of one step and the grains that they touch.
+
+    met: (contacts,) pairs; ends: (2, contacts) grains; rows: (5, contacts); touched: (grains,) the grains with
+    contacts. For each grain: degree, its contacts; loaded, those with an impulse; kicks, (grains, 2) total impulse.
+    """
+
+    met: Any
+    ends: Any
+    rows: Any
+    touched: Any
+    degree: Any
+    loaded: Any
+    kicks: Any
+
+
+class Clusters(NamedTuple):
+    """Contacts that touch each other, sorted by cluster, and the memory of their solver.
+
+    source: (contacts,) places in the network; those of cluster m at ``starts[m] : starts[m + 1]``; parent, number:
+    (grains,) for the search of clusters; scratch: (2, contacts); rows: (contacts, 9); stiff: (contacts, 5);
+    turns: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
+    """
+
+    source: Any
+    starts: Any
+    parent: Any
+    number: Any
+    scratch: Any
+    rows: Any
+    stiff: Any
+    turns: Any
+    matrices: Any

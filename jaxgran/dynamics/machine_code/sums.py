@@ -1,0 +1,90 @@
+"""The running sums of the machine code, in one row of numbers ordered by the table of ``dynamics.tally``."""
+
+from jaxgran.contact import law
+from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.layout import (
+    APPROACH,
+    DISTANCE,
+    FIRST,
+    IMPULSE,
+    INVERSE_MASS,
+    NX,
+    NY,
+    OK,
+    RADIUS,
+    SECOND,
+)
+from jaxgran.dynamics.tally import CONTACT, RESIDUAL_EDGES, place_of, span_of
+
+_LAW = compiled_law(law)
+contact_terms, kinetic_means = _LAW["contact_terms"], _LAW["kinetic_means"]
+
+_EDGES = RESIDUAL_EDGES[1:-1]
+_FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
+_DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
+_SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
+_UNCONVERGED, _COUNTS = place_of("unconverged"), place_of("residual_counts")
+_LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
+
+
+@compiled
+def add_flight(sums, steps, flight, turned, kinetic):
+    """Add a flight of so many steps, with Σ m c ⊗ c at its beginning, and return that at its end.
+
+    ``turned`` is the strain of the flight, in which c_x falls by γ̇ c_y t.
+    """
+    xx, xy, yy = kinetic
+    mean_xx, mean_xy, mean_yy = kinetic_means(xx, xy, yy, turned)
+    sums[_DURATION] += flight
+    sums[_STEPS] += steps
+    sums[_KINETIC] += flight * mean_xx
+    sums[_KINETIC + 1] += flight * mean_xy
+    sums[_KINETIC + 2] += flight * mean_yy
+    return xx + turned * (turned * yy - 2 * xy), xy - turned * yy, yy
+
+
+@compiled
+def add_contacts(sums, step_sums, contacts, bounce, grains, network):
+    """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is memory for it."""
+    ends, rows, kicks, loaded, constants = network.ends, network.rows, network.kicks, network.loaded, grains.constants
+    for n in range(_TERMS):
+        step_sums[n] = 0.0
+    for c in range(contacts):
+        i, j = ends[FIRST, c], ends[SECOND, c]
+        nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
+        mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
+        impulse = bounce * rows[IMPULSE, c]
+        change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (kicks[i, 1] * mi - kicks[j, 1] * mj)
+        terms = contact_terms(
+            nx,
+            ny,
+            distance,
+            max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
+            approach,
+            change / 2,
+            bounce,
+            impulse,
+            -bounce * min(approach, 0.0) / (mi + mj),
+            impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
+            1.0,
+            1.0 if impulse > 0.0 else 0.0,
+            1.0 if approach < 0.0 else 0.0,
+        )
+        for n in range(_TERMS):
+            step_sums[n] += terms[n]
+    for n in range(_TERMS):
+        sums[_FIRST_TERM + n] += step_sums[n]
+
+
+@compiled
+def add_solve(sums, iterations, residual, outcome, deepest):
+    """Add one solve."""
+    place = 0
+    while place < _EDGES.size and residual > _EDGES[place]:
+        place += 1
+    sums[_SOLVES] += 1
+    sums[_ITERATIONS] += iterations
+    sums[_UNCONVERGED] += outcome != OK
+    sums[_COUNTS + place] += 1
+    sums[_LARGEST_OVERLAP] = max(sums[_LARGEST_OVERLAP], deepest)
+    sums[_WORST_RESIDUAL] = max(sums[_WORST_RESIDUAL], residual)
