@@ -1,14 +1,11 @@
-"""Other ways to solve the contact problem, for comparison only: Gauss–Seidel sweeps, and the exact solution.
+"""Another way to solve the contact problem, for comparison only: Gauss–Seidel sweeps.
 
 The problem is 0 ≤ p ⟂ W p + u⁻ ≥ 0 on a network of contacts, see ``jaxgran.contact.network`` and
 ``jaxgran.contact.solver``.
 """
 
-from typing import NamedTuple
-
 import numba
 import numpy as np
-from scipy.optimize import nnls
 
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution
@@ -83,68 +80,3 @@ def _sweep(i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count
             if not true > target or last:
                 break
     return sweep + 1, np.sqrt(true)
-
-
-class Exact(NamedTuple):
-    """Exact solution of a network.
-
-    ==========  ===========  ====  =============================================================
-    field       shape        unit  meaning
-    ==========  ===========  ====  =============================================================
-    impulses    (contacts,)  mσγ̇   impulses p₀ at restitution zero; zero where there are none
-    changes     (grains, 2)  σγ̇    velocity changes M⁻¹ Hᵀ p₀, which are unique
-    residual    number       –     ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
-    feasible    flag         –     False where no velocities satisfy all contacts
-    ==========  ===========  ====  =============================================================
-    """
-
-    impulses: np.ndarray
-    changes: np.ndarray
-    residual: float
-    feasible: bool
-
-
-def exact(contacts: Contacts, masses: np.ndarray) -> Exact:
-    """The exact solution from a dense active-set method.
-
-    The velocity changes are the shortest vector x, in the norm of the kinetic energy, that satisfies G x ≥ −u⁻ with
-    G = H M^-½. Lawson and Hanson (Solving Least Squares Problems, 1974, chapter 23) turn this into non-negative least
-    squares, min ‖E q − e‖ with the columns (G_c, −u⁻_c) in E and e = (0, …, 0, 1); where the residual is zero, there is
-    no such x, else p = q / (1 + u⁻·q). The set of pushing contacts is exact; Newton steps on it remove the rounding.
-    """
-    used = np.asarray(contacts.used)
-    roots = np.repeat(np.sqrt(masses), 2)
-    incidence = _incidence(contacts, len(masses))[used] / roots
-    moved = np.any(incidence != 0, axis=0)
-    g, approach = incidence[:, moved], np.asarray(contacts.approach)[used]
-    scale = np.linalg.norm(np.minimum(approach, 0))
-    operator = g @ g.T
-    own = np.diag(operator)
-    h = approach / scale
-    unit = np.concatenate([np.zeros(g.shape[1]), [1.0]])
-    q, left = nnls(np.concatenate([g.T, -h[None]]), unit, maxiter=100 * len(h))
-    feasible = left > 1e-9
-    p = scale * q / left**2 if feasible else np.zeros_like(q)
-
-    def error(p):
-        return np.linalg.norm(np.minimum(own * p, operator @ p + approach))
-
-    for _ in range(5 if feasible else 0):
-        push = p > 0
-        better = p.copy()
-        better[push] -= np.linalg.lstsq(operator[np.ix_(push, push)], (operator @ p + approach)[push])[0]
-        if not error(np.maximum(better, 0)) < error(p):
-            break
-        p = np.maximum(better, 0)
-    impulses, changes = np.zeros(len(used)), np.zeros(2 * len(masses))
-    impulses[used], changes[moved] = p, g.T @ p / roots[moved]
-    return Exact(impulses, changes.reshape(-1, 2), error(p) / scale, feasible)
-
-
-def _incidence(contacts: Contacts, grains: int) -> np.ndarray:
-    """H (contacts, 2 grains): relative normal velocities are H v."""
-    rows, normals = np.arange(contacts.used.size), np.asarray(contacts.normals)
-    matrix = np.zeros((len(rows), grains, 2))
-    matrix[rows, np.asarray(contacts.i)] += normals
-    matrix[rows, np.asarray(contacts.j)] -= normals
-    return matrix.reshape(len(rows), 2 * grains)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gauss_seidel import Exact, exact, gauss_seidel
+from exact_contacts import Exact, exact
+from gauss_seidel import gauss_seidel
 from hardware import hardware, json_with_rows
 from jax import lax
 from matplotlib.axes import Axes

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import nnls
+from exact_contacts import certified_impulses, incidence
 
 from jaxgran.contact.network import Contacts
 
@@ -30,17 +30,6 @@ def gaps_of(positions, radii, side, tilt) -> np.ndarray:
     return np.where(np.triu(np.ones(gaps.shape, bool), 1), gaps, np.inf)
 
 
-def incidence(network: Contacts, grains: int) -> np.ndarray:
-    """H (contacts, 2 grains): relative normal velocities are H v."""
-    i, j, normals, used = (np.asarray(getattr(network, name)) for name in ("i", "j", "normals", "used"))
-    matrix = np.zeros((len(i), grains, 2))
-    rows = np.arange(len(i))
-    np.add.at(matrix, (rows, i), normals)
-    np.add.at(matrix, (rows, j), -normals)
-    matrix[~used] = 0
-    return matrix.reshape(len(i), 2 * grains)
-
-
 def delassus(network: Contacts, masses: np.ndarray) -> np.ndarray:
     """W = H M⁻¹ Hᵀ as a dense matrix."""
     matrix = incidence(network, len(masses))
@@ -51,11 +40,12 @@ def exact_velocities(network: Contacts, masses: np.ndarray, velocities: np.ndarr
     """Velocities (grains, 2) after the contact law at restitution zero.
 
     They are the projection, in the norm of the kinetic energy, of the velocities before on those that let no contact
-    approach: v + M⁻¹Hᵀp with p = argmin ‖M^½ v + M^-½ Hᵀ p‖ over p ≥ 0, which an active-set method solves exactly.
+    approach: v + M⁻¹Hᵀp with p = argmin ‖M^½ v + M^-½ Hᵀ p‖ over p ≥ 0, by a method whose answers are certified.
     """
-    root = np.repeat(np.sqrt(masses), 2)
-    impulses, _ = nnls(incidence(network, len(masses)).T / root[:, None], -root * velocities.ravel(), maxiter=10_000)
-    return velocities + (incidence(network, len(masses)).T @ impulses / root**2).reshape(-1, 2)
+    matrix, roots = incidence(network, len(masses))[np.asarray(network.used)], np.repeat(np.sqrt(masses), 2)
+    impulses = certified_impulses(matrix / roots, matrix @ velocities.ravel())
+    assert impulses is not None  # grains at rest satisfy all contacts
+    return velocities + (matrix.T @ impulses / roots**2).reshape(-1, 2)
 
 
 def kinetic_energy(masses, velocities) -> float:

@@ -1,0 +1,204 @@
+"""The reference of other tests: exact solutions agree with closed forms, and what is wrong is refused."""
+
+import numpy as np
+import pytest
+from exact_contacts import (
+    METHODS,
+    active_set,
+    certified_impulses,
+    exact,
+    incidence,
+    interior_point,
+    is_obstacle,
+    is_solution,
+)
+from networks import chain, hexagonal, jammed_lattice, jammed_row, mass_ratio, size_ratio
+from oracles import delassus, exact_velocities, padded_network, random_network
+
+EPS = np.finfo(float).eps
+
+
+def problem(contacts, masses) -> tuple[np.ndarray, np.ndarray]:
+    """G and u⁻ of the contacts in use."""
+    used = np.asarray(contacts.used)
+    return incidence(contacts, len(masses))[used] / np.repeat(np.sqrt(masses), 2), np.asarray(contacts.approach)[used]
+
+
+def problem_of(network) -> tuple[np.ndarray, np.ndarray]:
+    return problem(network.contacts, network.masses)
+
+
+SOLVABLE = {
+    "chain": chain(16),
+    "size ratio": size_ratio(1, 0),
+    "mass ratio": mass_ratio(4, 0),
+    "hexagon, struck": hexagonal(2, True),
+    "hexagon, pressed": hexagonal(2, False),
+}
+JAMMED = {"row": jammed_row(10), "lattice": jammed_lattice(4)}
+solvable = pytest.mark.parametrize("network", SOLVABLE.values(), ids=SOLVABLE)
+jammed = pytest.mark.parametrize("network", JAMMED.values(), ids=JAMMED)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_three_discs_in_a_row(method):
+    """One that hits two: at restitution zero all go on together; at one they leave as −1/3, 2/3, 2/3."""
+    g, approach = problem_of(chain(3))
+    changes = certified_impulses(g, approach, [method]) @ g
+    np.testing.assert_allclose(np.array([1, 0, 0]) + changes[:6:2], 1 / 3, rtol=4 * EPS)
+    np.testing.assert_allclose(np.array([1, 0, 0]) + 2 * changes[:6:2], [-1 / 3, 2 / 3, 2 / 3], rtol=4 * EPS)
+
+
+def test_struck_chain_moves_as_one():
+    network = chain(64)
+    np.testing.assert_allclose(exact(network.contacts, network.masses).changes[1:64, 0], 1 / 64, rtol=64 * EPS)
+
+
+def test_isolated_pairs():
+    rng = np.random.default_rng(1)
+    masses, approach = 100 ** rng.uniform(0, 1, 60), rng.normal(size=30)
+    first = np.arange(0, 60, 2)
+    pairs = padded_network(first, first + 1, np.tile([0.6, 0.8], (30, 1)), approach, masses)
+    expected = np.maximum(0, -approach) / (1 / masses[::2] + 1 / masses[1::2])
+    np.testing.assert_allclose(exact(pairs, masses).impulses[:30], expected, rtol=8 * EPS)
+
+
+@pytest.mark.parametrize("rings", [1, 2, 3])
+def test_pressed_hexagon_stops(rings):
+    """W is singular; the changes undo the compression, which moves every grain by its place from the centre."""
+    network = hexagonal(rings, struck=False)
+    g, _ = problem_of(network)
+    assert np.linalg.matrix_rank(g) < len(g)
+    a, b = (axis.ravel() for axis in np.meshgrid(np.arange(-rings, rings + 1), np.arange(-rings, rings + 1)))
+    places = np.stack([a + b / 2, b * np.sqrt(3) / 2], axis=-1)[np.abs(a + b) <= rings]
+    found = exact(network.contacts, network.masses)
+    assert found.feasible and found.residual < 1e-14
+    np.testing.assert_allclose(found.changes[: len(places)], places, rtol=0, atol=100 * EPS * rings)
+
+
+def test_both_methods_find_the_same_velocities():
+    for seed in range(12):
+        contacts, masses, _ = random_network(seed, 5 * (seed + 1), [1.0, 100.0, 1e6][seed % 3])
+        g, approach = problem(contacts, masses)
+        one, other = (certified_impulses(g, approach, [method]) @ g for method in METHODS)
+        assert np.linalg.norm(one - other) <= 1e-11 * np.linalg.norm(one)
+
+
+def test_velocities_after_do_not_approach():
+    for seed in range(4):
+        contacts, masses, velocities = random_network(seed, 30)
+        after = exact_velocities(contacts, masses, velocities)
+        assert np.min(incidence(contacts, len(masses)) @ after.ravel()) > -1e-12
+        with_network = velocities + exact(contacts, masses).changes
+        np.testing.assert_allclose(after, with_network, rtol=0, atol=1e-12)
+
+
+def test_nothing_to_stop_needs_no_impulse():
+    g, approach = problem_of(chain(5))
+    assert np.all(certified_impulses(g, np.abs(approach), []) == 0)
+
+
+@solvable
+def test_wrong_impulses_are_refused(network):
+    g, approach = problem_of(network)
+    right = certified_impulses(g, approach)
+    assert is_solution(g, approach, right)
+    strongest = np.zeros_like(right)
+    strongest[np.argmax(np.sum(g**2, axis=1) * right)] = 1
+    for wrong in (
+        np.zeros_like(right),
+        right * (1 + 1e-9),
+        right * (1 - 1e-9),
+        right * (1 - strongest),
+        right + 1e-9 * right * strongest,
+        np.where(strongest, -right, right),
+        np.where(strongest, np.nan, right),
+        np.where(strongest, np.inf, right),
+    ):
+        assert not is_solution(g, approach, wrong)
+
+
+@jammed
+def test_no_impulses_stop_what_is_jammed(network):
+    g, approach = problem_of(network)
+    assert certified_impulses(g, approach) is None
+    assert not exact(network.contacts, network.masses).feasible
+    balanced = np.ones(len(g))  # both are pressed alike along every row of contacts
+    assert is_obstacle(g, approach, balanced)
+    for wrong in (balanced + 1e-9 * np.eye(len(g))[0], -balanced, np.eye(len(g))[0], np.full(len(g), np.nan)):
+        assert not is_obstacle(g, approach, wrong)
+    assert not is_obstacle(g, -approach, balanced)
+    for size in 10.0 ** np.arange(0, 30, 3):  # what cancels in rounding is no solution either
+        assert not is_solution(g, approach, size * balanced)
+
+
+@solvable
+def test_nothing_stands_against_what_can_be_solved(network):
+    g, approach = problem_of(network)
+    assert not is_obstacle(g, approach, certified_impulses(g, approach))
+
+
+def fails(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    raise RuntimeError("Maximum number of iterations reached.")
+
+
+def nowhere(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    return np.full(len(g), np.nan)
+
+
+@pytest.mark.parametrize("wrong", [fails, nowhere])
+def test_next_method_is_tried_and_without_one_an_error_is_raised(wrong):
+    for network in SOLVABLE.values():
+        g, approach = problem_of(network)
+        right = certified_impulses(g, approach) @ g
+        found = certified_impulses(g, approach, [wrong, interior_point]) @ g
+        assert np.linalg.norm(found - right) <= 1e-11 * np.linalg.norm(right)
+        with pytest.raises(ArithmeticError, match="no exact solution of"):
+            certified_impulses(g, approach, [wrong])
+
+
+def early(g: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    """Non-negative least squares that end early: before they have seen every other contact."""
+    multipliers = np.zeros(len(g))
+    multipliers[::2] = active_set(g[::2], approach[::2])
+    return multipliers
+
+
+@pytest.mark.parametrize("method", [active_set, early])
+@pytest.mark.parametrize("struck", [True, False])
+@pytest.mark.parametrize("rings", [2, 3])
+def test_least_squares_that_end_early_are_caught(rings, struck, method):
+    """On these clusters SciPy's end early for some kernels of the linear algebra: they are mended, or refused."""
+    g, approach = problem_of(hexagonal(rings, struck))
+    right = certified_impulses(g, approach) @ g
+    try:
+        found = certified_impulses(g, approach, [method]) @ g
+    except ArithmeticError:
+        return
+    assert np.linalg.norm(found - right) <= 1e-11 * np.linalg.norm(right)
+
+
+@solvable
+def test_impulses_of_least_squares_that_ended_early_are_refused(network):
+    g, approach = problem_of(network)
+    multipliers = early(g, approach)
+    assert not is_solution(g, approach, multipliers / (1 + multipliers @ approach))
+
+
+def test_interior_point_alone_solves_all():
+    for network in SOLVABLE.values():
+        g, approach = problem_of(network)
+        impulses = certified_impulses(g, approach, [interior_point])
+        matrix = delassus(network.contacts, network.masses)[: len(g), : len(g)]
+        assert np.min(matrix @ impulses + approach) > -1e-11 * np.linalg.norm(np.minimum(approach, 0))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(value):
+    g, approach = problem_of(chain(4))
+    with pytest.raises(ValueError, match="finite"):
+        certified_impulses(g, np.where(np.arange(3) == 1, value, approach))
+    with pytest.raises(ValueError, match="finite"):
+        certified_impulses(np.where(np.arange(3)[:, None] == 1, value, g), approach)
+    with pytest.raises(ValueError, match="not zero"):
+        certified_impulses(np.where(np.arange(3)[:, None] == 1, 0, g), approach)
