@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.optimize import nnls
 
-from jaxgran.contacts import Contacts
+from jaxgran.contact.network import Contacts
 
 EPS = float(np.finfo(float).eps)
 ROUNDINGS = 16  # of the largest term of w, that a residual may reach; the collection of networks needs less than one

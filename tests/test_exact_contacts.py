@@ -15,6 +15,8 @@ from exact_contacts import (
 from networks import chain, hexagonal, jammed_lattice, jammed_row, mass_ratio, size_ratio
 from oracles import delassus, exact_velocities, padded_network, random_network
 
+pytestmark = pytest.mark.kernels
+
 EPS = np.finfo(float).eps
 
 
