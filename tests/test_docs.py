@@ -64,7 +64,9 @@ def test_drawing_of_the_folders_shows_every_folder_and_every_import(monkeypatch:
     folders = {path.parent.name for path in ROOT.glob("jaxgran/*/__init__.py")}
     rows, imports, figure = architecture.rows(), architecture.imports(), architecture.drawing()
     shown = [text.get_text() for text in figure.axes[0].texts]
-    assert folders <= {name for row in rows for name in row}
+    named = {name for row in rows for name in row}
+    page = (DOCS / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    assert folders <= named == set(re.findall(r"^\| `(\w+)` \|", page.split("## How data flows")[0], re.MULTILINE))
     assert folders <= set(shown)
     assert imports["sampling", "dynamics"] > 0 and ("dynamics", "sampling") not in imports
     assert sorted(word for word in shown if word.isdecimal()) == sorted(str(number) for number in imports.values())
