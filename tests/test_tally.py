@@ -1,10 +1,11 @@
-"""Tally: what joins two samples."""
+"""Tally: what joins two samples, and the one table from which the places of the sums follow."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgran.dynamics.tally import EXTREMES, Tally, empty_tally
+from jaxgran.contact.law import contact_terms
+from jaxgran.dynamics.tally import CONTACT, EXTREMES, LAYOUT, NUMBERS, TABLE, Tally, empty_tally, span_of
 from jaxgran.model.status import Status
 
 
@@ -37,3 +38,42 @@ def test_batches_of_tallies_join_replica_by_replica():
     joined = ones + twos
     second = jax.tree.map(lambda leaf: leaf[1], joined)
     jax.tree.map(np.testing.assert_array_equal, second, random_tally(1) + random_tally(3))
+
+
+def test_running_sums_follow_each_other_without_a_gap():
+    places = sorted(LAYOUT.values(), key=lambda place: place.start)
+    assert [place.start for place in places] == [0, *(place.stop for place in places[:-1])]
+    assert places[-1].stop == NUMBERS
+
+
+def test_every_row_of_the_table_is_in_the_docstring():
+    rows = [line.split() for line in (Tally.__doc__ or "").splitlines()]
+    assert [row[0] for row in rows if row and row[0] in TABLE] == list(TABLE)
+
+
+def test_terms_of_a_contact_stand_where_the_table_says():
+    rng = np.random.default_rng(0)
+    angle, distance, overlap, approach, half_change, bounce, p, binary, clustered = rng.uniform(0.1, 1, 9)
+    nx, ny = np.cos(angle), np.sin(angle)
+    terms = contact_terms(nx, ny, distance, overlap, approach, half_change, bounce, p, binary, clustered, 1, 2, 3)
+    moment = distance * np.array([nx * nx, nx * ny, ny * ny])
+    after = approach + 2 * half_change
+    expected = {
+        "impulse": p,
+        "binary_impulse": binary,
+        "contact_moment": p * moment,
+        "binary_moment": binary * moment,
+        "cluster_moment": clustered * moment,
+        "dissipation": -p * (approach + after) / 2,
+        "complementarity": p * (after + (bounce - 1) * approach) / 2,
+        "contacts": 1,
+        "loaded_contacts": 2,
+        "collisions": 3,
+        "overlap": overlap,
+    }
+    begin = span_of(CONTACT).start
+    assert len(terms) == span_of(CONTACT).stop - begin
+    assert {name for name, row in TABLE.items() if row["kind"] == CONTACT} == set(expected)
+    for name, value in expected.items():
+        found = np.squeeze(terms[LAYOUT[name].start - begin : LAYOUT[name].stop - begin])
+        np.testing.assert_allclose(found, value, rtol=1e-14, err_msg=name)
