@@ -47,7 +47,7 @@ def test_a_changed_constant_and_a_changed_function_take_effect(tmp_path: Path) -
     changed(package / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
     after, _ = outcome(package, cache)
     assert after == before.replace("deep_overlap", "ok")
-    changed(package / "jaxgran" / "contact" / "law.py", "        overlap,\n    )", "        2 * overlap,\n    )")
+    changed(package / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
     status, overlap = outcome(package, cache)[0].split()
     assert status == "ok" and float(overlap) == 2 * float(before.split()[1])
 

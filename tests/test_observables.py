@@ -10,7 +10,7 @@ from jaxgran.sampling.observables import OBSERVABLES, TENSORS, averages
 GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 
 DATASET_NAMES = """
-    force_ratio contact_force binary_force
+    force_ratio contact_force binary_force force_second_moment
     pressure contact_pressure binary_pressure kinetic_pressure
     shear_stress contact_shear_stress binary_shear_stress kinetic_shear_stress
     granular_temperature bagnold_pressure bagnold_shear_stress cluster_pressure_share cluster_shear_share
@@ -69,6 +69,7 @@ def tally(microscopic) -> Tally:
         unconverged=np.float64(1.0),
         residual_counts=np.histogram([3e-5, 4e-5, 9e-5, 0.02], RESIDUAL_EDGES)[0].astype(float),
         overlap=np.float64(6e-3),
+        squared_impulse=(impulses**2).sum(),
         largest_overlap=np.float64(3e-3),
         worst_residual=np.float64(0.02),
         momentum_drift=np.float64(1e-15),
@@ -97,6 +98,8 @@ def test_forces_are_means_over_the_contacts_that_carry_an_impulse(microscopic, m
     assert measured["contact_force"] == pytest.approx(forces.sum() / loaded)
     assert measured["binary_force"] == pytest.approx(binary.sum() / loaded)
     assert measured["force_ratio"] == pytest.approx(forces.mean() / binary.mean())
+    pushing = forces[forces > 0]
+    assert measured["force_second_moment"] == pytest.approx(np.mean(pushing**2) / np.mean(pushing) ** 2)
 
 
 def test_stresses_are_time_averages_over_the_cell(microscopic, measured) -> None:

@@ -70,6 +70,7 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "loaded_contacts": 2,
         "collisions": 3,
         "overlap": overlap,
+        "squared_impulse": p * p,
     }
     begin = span_of(CONTACT).start
     assert len(terms) == span_of(CONTACT).stop - begin

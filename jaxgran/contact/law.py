@@ -155,4 +155,5 @@ def contact_terms(
         loaded,
         approaching,
         overlap,
+        impulse * impulse,
     )

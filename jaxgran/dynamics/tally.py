@@ -63,6 +63,7 @@ class Tally:
         SOLVE, "–", "solves by relative residual, in the bins between ``RESIDUAL_EDGES``", (RESIDUAL_EDGES.size - 1,)
     )
     overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
+    squared_impulse: Float[Array, "*b"] = _sum(CONTACT, "m²σ²γ̇²", "squares p² of the contact impulses")
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
     momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
