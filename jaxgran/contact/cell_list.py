@@ -2,11 +2,11 @@
 
 The grains are sorted into a grid of cells by ``jax_md.partition.cell_list``, in the fractional coordinates that move
 with the sheared cell, s = ((x − tilt·y)/L, y/L). A disc of radius r covers ±√(1 + tilt²) r/L of s_x and ±r/L of s_y,
-so with square cells of the larger size, at the largest tilt ½, all its neighbours lie in 3×3 cells. Each grain looks
-through half of them, and the pairs found are gathered through words of 32 bits, one bit a candidate.
+so with square cells of the larger size, at the largest tilt ½, all its neighbours lie in 3×3 cells. Each grain is
+compared with those in half of them. The pairs found are gathered through words of 32 bits, one bit for each candidate.
 
-jax-md's whole ``neighbor_list`` finds the same pairs but compacts them by scattering every candidate: it takes three
-times as long as this search for a thousand grains and over ten times as long for ten thousand.
+jax-md's ``neighbor_list`` finds the same pairs but writes every candidate to its place. It takes three times as long
+as this search for a thousand grains, and over ten times as long for ten thousand.
 """
 
 import math

@@ -1,7 +1,7 @@
 """The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an iteration by.
 
 W is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal velocities that
-follow. Three diagonals D stand for it in the projected methods of ``methods``:
+follow. Three diagonals D stand for it in the ``projected_methods``:
 
 - ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks make it diverge.
 - ``count_bound``: z_i/m_i + z_j/m_j with z_b the number of contacts of grain b (mass splitting). Since

@@ -11,9 +11,9 @@ grains within a distance r now have |Δy| ≤ r, so no such pair is missed as lo
 
     s − 2 max|δ| (1 + |γ_ref|) − r |γ − γ_ref|
 
-with δ counted from the build of the list and γ_ref the strain of the frame at that time. So the outer list is judged
-before a near list is filtered from it, with r the largest diameter and the skin of the near list; the near list itself
-is judged in ``dynamics`` by a bound on the speed at which a gap closes, which is cheaper and as safe.
+with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer list is judged by
+this before a near list is filtered from it, with r the largest diameter and the skin of the near list. The near list is
+judged in ``dynamics.flight`` by a bound on the speed at which a gap closes, which costs less and is as safe.
 """
 
 from dataclasses import dataclass
@@ -154,8 +154,8 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
 def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
     """Indices of the first ``size`` True entries, padded with the length of the mask.
 
-    Rank and select on words of 32 bits: the word that holds the k-th True entry follows from the running number of
-    set bits, its place in the word by halving. An order of magnitude cheaper than ``jnp.nonzero`` inside a step.
+    Rank and select on words of 32 bits. The word that holds the k-th True entry follows from the running number of
+    set bits, and its place in the word by halving. Inside a step this costs a tenth of ``jnp.nonzero``.
 
     Examples:
       >>> first_true(jnp.array([False, True, True, False, True]), 4).tolist()
@@ -200,7 +200,7 @@ def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Ar
 
 
 def widest_skin(grains: Grains, side: Array) -> Float[Array, ""]:
-    """The largest skin that lists of these grains can have: nearest images are unique, and the grid of cells serves."""
+    """The largest skin of lists of these grains: nearest images are unique, and the grid of cells is fine enough."""
     count, reach = grains.radii.size, side / 2
     if count > ALL_PAIRS_LIMIT:
         reach = jnp.minimum(reach, largest_cutoff(count, side, _capacity(OUTER_PAIRS_PER_GRAIN, count)))

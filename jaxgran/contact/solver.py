@@ -83,7 +83,7 @@ def solve(
       tolerance: relative residual to reach.
       max_iterations: cap; beyond it the best iterate is returned with a status.
       relaxation: ω of the Jacobi methods; the others do not use it.
-      method: name of a projected method, see ``methods``.
+      method: name of a projected method, see ``projected_methods``.
       active: whether this replica has something to solve; others of its batch return zero impulses.
 
     Impulses and response have derivatives with respect to the network, see the module; all else has none.

@@ -25,9 +25,13 @@ Observe = Callable[[State, Contacts, Array], Any]  # of a time step: the state, 
 
 
 class AdvanceOptions(NamedTuple):
-    """Options of the plain advance that are static when it is compiled."""
+    """Options of the plain engine that are static when it is compiled.
 
-    rungs: int | None = None  # contact buffers, the largest; None for all of them
+    buffers: how many of the contact buffers are compiled, the largest ones; None for all of them. moving_contacts:
+    whether derivatives include that a contact moves in time. observe: a function of the user's, or None.
+    """
+
+    buffers: int | None = None
     moving_contacts: bool = False
     observe: Observe | None = None
 
@@ -61,54 +65,57 @@ def collide(
 ) -> tuple[Array, PairMotion, RunningSums, Array | None]:
     """Velocities, pairs and sums after the contacts of one step; unchanged where no contact approaches.
 
-    The last result are displacements that are zero, and have the derivatives that come of contacts that move in time.
+    Args:
+      meets: whether this replica has a step to solve; others of its batch stay as they are.
+
+    The last result is a displacement of the grains. Its value is zero; its derivative is that of contacts that move
+    in time (see ``plain``). None where this derivative is not asked for.
     """
     look_ahead = flow.activation_fraction * flow.timestep
     contact, approaching = is_contact(pairs.separations(), pairs.velocities(), near.reach, look_ahead)
     words = bit_words(contact)
     count = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
     meets = meets & jnp.any(bit_words(approaching) > 0)
-    # A lone contact has a closed form, which differs in the last bits: never chosen by what else is in a batch.
-    capacities = contact_capacities(grains.radii.size)[1 if in_batch() else 0 :]
-    capacities = capacities if options.rungs is None else capacities[-options.rungs :]
+    # A single contact has a closed form, whose last bits differ. In a batch it is left out, so that the result of a
+    # replica does not depend on the others.
+    first = 1 if in_batch() else 0
+    capacities = contact_capacities(grains.radii.size)[first:]
+    capacities = capacities if options.buffers is None else capacities[-options.buffers :]
     separations, delays, zero_shift = pairs.separations(), None, None
     if options.moving_contacts:
         delays = _delays(pairs, near.reach, approaching, flow.timestep)
         apart = jnp.where(_alone(near, contact, grains), delays, 0)
         separations, zero_shift = separations + apart[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
-    rung = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
-    rung = largest_replica(jnp.where(meets, rung, 0))
+    buffer = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
+    buffer = largest_replica(jnp.where(meets, buffer, 0))  # 0: nothing to solve
 
     def with_capacity(capacity: int):
         def collided():
             index = set_bits(words, capacity, contact.size)
             network = contact_network(index, near, separations, pairs.velocities(), grains)
             impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
-            new = (
-                new
-                if observe_now is None
-                else new._replace(user_sums=with_contacts(sums.user_sums, observe_now, network, impulses))
-            )
+            if observe_now is not None:
+                new = new._replace(user_sums=with_contacts(sums.user_sums, observe_now, network, impulses))
             change = _velocity_changes(network, impulses, grains)
             (xi, yi), (xj, yj) = change(near.i), change(near.j)
             kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)
             moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
             shift = None
             if delays is not None:
-                alone = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
-                delayed = alone * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
+                own_approach = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
+                delayed = own_approach * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
                 shift = -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
             return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, zero_shift))
 
         return collided
 
-    return lax.switch(rung, [lambda: (velocities, pairs, sums, zero_shift), *map(with_capacity, capacities)])
+    return lax.switch(buffer, [lambda: (velocities, pairs, sums, zero_shift), *map(with_capacity, capacities)])
 
 
 def _delays(pairs: PairMotion, reach: Array, approaching: Array, timestep: float | Array) -> Float[Array, " pairs"]:
     """Zero, with the derivative of the time at which each contact of this step began.
 
-    Contacts that began long before are those of clusters: theirs is not a moment, and moves nothing.
+    Contacts that began long before belong to clusters. They have no moment of contact that could move.
     """
     time, _ = first_contact_time(pairs.separations(), pairs.velocities(), reach)
     begins = approaching & (jnp.abs(time) <= timestep)

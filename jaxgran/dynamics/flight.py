@@ -34,6 +34,8 @@ class PairMotion(NamedTuple):
 
 
 class Carry(NamedTuple):
+    """What the time loop of the plain engine carries."""
+
     lists: PairLists
     pairs: PairMotion
     slack: Array  # what is left of the skin of the near list
@@ -44,6 +46,7 @@ class Carry(NamedTuple):
 
 
 def pairs_now(lists: PairLists, velocities: Array, shear_rate: float | Array) -> PairMotion:
+    """The near pairs with their separations and relative velocities now."""
     separations = separations_now(lists.near, lists.frame)
     u = relative_velocity(velocities, lists.near.i, lists.near.j, separations, shear_rate)
     return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
@@ -57,10 +60,10 @@ def fresh_lists(
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
     r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
     """
-    velocities = lax.stop_gradient(now.velocities)  # the lists decide what is looked at, not what it is
+    velocities = lax.stop_gradient(now.velocities)  # the choice of pairs has no derivative
     cx, cy = velocities[:, 0], velocities[:, 1]
     longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
-    speed = jnp.sqrt(-smallest(-(cx * cx + cy * cy))) * (1 + longest)
+    speed = jnp.sqrt(largest(cx * cx + cy * cy)) * (1 + longest)
     diameter = 2 * jnp.max(lax.stop_gradient(grains.radii))
 
     def loss(skin: Array) -> Array:
@@ -106,6 +109,11 @@ def add_flight(
     xx, xy, yy = kinetic_means(xx, xy, yy, shear_rate * flight)
     flown = jnp.stack([flight, jump.astype(flight.dtype), flight * xx, flight * xy, flight * yy])
     return sums._replace(flight=sums.flight + flown)
+
+
+def largest(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Largest entry of a vector, see ``smallest``."""
+    return -smallest(-values)
 
 
 def smallest(values: Float[Array, " n"]) -> Float[Array, ""]:

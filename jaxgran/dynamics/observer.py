@@ -1,10 +1,11 @@
-"""Sums over every time step of what a function of one's own finds in it, in the pass that advances the flow.
+"""User sums: what a function of the user's finds in every time step, summed while the flow advances.
 
-The engine jumps over the steps in which no contact approaches: the grains fly, and nothing else happens. Such a flight
-is looked at once, at its beginning and without contacts, and counts as the number of its steps. A step whose contacts
-act is looked at with their network and its impulses, before they act, and counts as one. So the weights add up to the
-number of steps; what contacts do is summed exactly, and what the flying grains do to first order: their velocities
-change by the strain of a flight, which ends with the next collision anywhere in the cell.
+The engine jumps over the steps in which no contact approaches. Such a flight is observed once, at its beginning and
+without contacts, and counts as the number of its steps. A step whose contacts act is observed with their network and
+impulses, before they act, and counts as one. So the weights add up to the number of steps.
+
+What contacts do is summed exactly. What the flying grains do is summed to first order: peculiar velocities change by
+the strain of a flight, which ends with the next collision anywhere in the cell.
 """
 
 from collections.abc import Callable

@@ -35,7 +35,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, kinetic_energy, relative_momentum, require_state, status_if_finite
 from jaxgran.model.status import Status
 
-_FEW_RUNGS = 3  # of the contact buffers, where derivatives are compiled along
+_FEW_BUFFERS = 3  # contact buffers where derivatives are compiled too, which takes long
 
 
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
@@ -53,12 +53,12 @@ def advance(
     events: int | None = None,
     moving_contacts: bool = False,
 ) -> tuple[State, Tally]:
-    """Advance one replica: the plain advance, which is differentiated and serves every backend.
+    """Advance one replica by the plain engine.
 
-    Arguments, derivatives and results are those of the public ``advance`` of ``native``.
+    Arguments, derivatives and results are those of the public ``advance``, see ``dynamics.advance``.
     """
-    rungs = None if events is None and not moving_contacts else _FEW_RUNGS
-    options = AdvanceOptions(rungs, moving_contacts)
+    buffers = None if events is None and not moving_contacts else _FEW_BUFFERS
+    options = AdvanceOptions(buffers, moving_contacts)
     start, body, unfinished = _event_loop(flow, state, steps, free_flight, options)
     if events is None:
         end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)

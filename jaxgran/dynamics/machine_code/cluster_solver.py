@@ -141,7 +141,7 @@ def _sweep(start, size, target, most_sweeps, grains, network, clusters):
 
 @compiled
 def _descend(size, target, most_iterations, clusters):
-    """The guarded method of Barzilai and Borwein (``methods``), from the impulses where the sweeps ended.
+    """The guarded method of Barzilai and Borwein, from the impulses where the sweeps ended.
 
     Returns the products with W and the squared residual of the best iterate, whose impulses are in ``stiff``.
     """

@@ -1,21 +1,21 @@
-"""The advance of one replica as one thread block of an accelerator: a grain is a thread, and a launch is many steps.
+"""The engine for NVIDIA GPUs: the advance of one replica as one kernel, with a thread for each grain.
 
-XLA starts a few dozen kernels for every step that is visited, and a batch waits for its slowest replica at each. This
-is the plain advance of ``dynamics`` with all its steps in one kernel, written in Pallas: a replica goes at its own
-pace, and what it works on stays in registers and in the caches beside them.
+The plain engine starts a few dozen kernels in every step that it visits, and a batch waits for its slowest replica at
+each. Here all steps are in one kernel, written in Pallas. A replica goes at its own pace, and its numbers stay in
+registers and in the nearest caches.
 
-- *A grain is a thread.* Every array has an entry for each thread, so what a thread has written it reads without
-  waiting. It learns of other grains through what all write at the same time, with a barrier before and after.
-- *Every pair is seen twice*, once from each of its grains, with separations, normals and impulses that are equal and
-  opposite to the bit: sums over the contacts of a grain are sums of its thread, in a fixed order, and nothing is ever
-  added up by several threads at once. Results are the same from run to run.
-- *Pairs are computed again, not stored*: a thread goes through the list of its near grains, one after the other, and
-  the loops end at the longest list that there is at present.
-- *Few contacts, little work*: two grains that touch nobody else have a closed form; what is left goes through the
-  default of ``methods``, of which only contacts are part.
+- *A grain is a thread.* Every array has an entry for each thread. What a thread has written it reads without waiting.
+  It reads of other grains what all threads write at the same time, with a barrier before and after.
+- *Every pair is computed twice*, once from each of its grains, with separations, normals and impulses that are equal
+  and opposite to the bit. Sums over the contacts of a grain are sums of its thread, in a fixed order. No two threads
+  add to the same number, so results are the same from run to run.
+- *Pairs are computed again, not stored.* A thread goes through the list of its near grains, one after the other. The
+  loops end at the longest of these lists.
+- *Few contacts, little work.* Two grains that touch no other have a closed form. The other contacts go through the
+  default method of ``contact.projected_methods``.
 
-The kernel runs as it is in the interpreter of Pallas, on any machine, which is how it is tested; on NVIDIA GPUs Triton
-compiles it, for as many warps as there are times 32 threads, so that no thread has a double.
+The interpreter of Pallas runs the kernel on any machine, which is how it is tested. On NVIDIA GPUs Triton compiles it.
+The number of warps is that of the grains over 32, so that each thread holds one grain.
 """
 
 import math
@@ -284,7 +284,7 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
     def listed(skin: Array) -> Array:
         """Write the lists of a skin; returns their lengths, of which not more than ``NEAR`` are there."""
 
-        def look(other: Array, near: Array) -> Array:
+        def visit(other: Array, near: Array) -> Array:
             dx, dy = x - block.shared[X, other], y - block.shared[Y, other]
             row = jnp.floor(dy / side + 0.5)
             dx, dy = dx - row * tilt * side, dy - row * side
@@ -298,7 +298,7 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
             thread.write(block.apart, Y, place, value=dy, mask=room)
             return near + close.astype(jnp.int32)
 
-        return lax.fori_loop(0, count, look, jnp.zeros_like(number))
+        return lax.fori_loop(0, count, visit, jnp.zeros_like(number))
 
     def narrowed(at: tuple[Array, ...]) -> tuple[Array, ...]:
         tried, skin, *_ = at
@@ -312,9 +312,9 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
     _, skin, near, longest = lax.while_loop(
         lambda at: (at[0] < _NARROWER) & (at[3] > NEAR), narrowed, (jnp.int32(1), skin, near, jnp.max(near))
     )
-    still = Motion(*thread.tell((X, Y, CX, CY), (jnp.zeros_like(x), jnp.zeros_like(y), motion.cx, motion.cy)))
+    at_rest = Motion(*thread.tell((X, Y, CX, CY), (jnp.zeros_like(x), jnp.zeros_like(y), motion.cx, motion.cy)))
     lists = _Lists(jnp.minimum(near, NEAR), jnp.minimum(longest, NEAR), tilt, 0 * side, 0 * side, skin, skin)
-    return still, lists, status_if(longest > NEAR, Status.capacity)
+    return at_rest, lists, status_if(longest > NEAR, Status.capacity)
 
 
 class _Pair(NamedTuple):
@@ -336,7 +336,7 @@ class _Pair(NamedTuple):
 
 
 def _pair(thread: Thread, k: Array, motion: Motion, lists: _Lists) -> _Pair:
-    """The k-th near pair of each thread, with the motion that all have told."""
+    """The k-th near pair of each thread, with the motion that all have reported."""
     block, rate = thread.block, thread.flow.shear_rate
     real = k < lists.near
     other = thread.read(block.near, k, mask=real)
@@ -370,18 +370,18 @@ def _add_flight(thread: Thread, counts: Counts, motion: Motion, flight: Array) -
 
 
 def _collide(
-    thread: Thread, told: Motion, motion: Motion, lists: _Lists, flight: Array, counts: Counts
+    thread: Thread, reported: Motion, motion: Motion, lists: _Lists, flight: Array, counts: Counts
 ) -> tuple[Motion, Counts, Array]:
     """Motion and counts after the contacts of one step, and its status; unchanged where no contact approaches.
 
-    ``told`` is the motion before the flight that led to the step, which is what other threads know of it.
+    ``reported`` is the motion before the flight that led to the step, which is what other threads know of it.
     """
     flow, block = thread.flow, thread.block
 
-    def look(k: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
+    def visit(k: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
         """Write a pair down if it is a contact."""
         contacts, approached, scale, deepest = found
-        pair = _pair(thread, k, told, lists).after(flight)
+        pair = _pair(thread, k, reported, lists).after(flight)
         contact, approaching = overlaps_within(*pair.gap(), flow.activation_fraction * flow.timestep)
         contact = contact & pair.real
         distance = jnp.sqrt(pair.x * pair.x + pair.y * pair.y)
@@ -399,7 +399,7 @@ def _collide(
         )
 
     zero, none = jnp.zeros_like(motion.x), jnp.zeros_like(lists.near)
-    contacts, approached, scale, deepest = lax.fori_loop(0, lists.longest, look, (none, none, zero, zero))
+    contacts, approached, scale, deepest = lax.fori_loop(0, lists.longest, visit, (none, none, zero, zero))
     return lax.cond(
         jnp.max(approached) > 0,
         lambda: collided(thread, motion, contacts, jnp.sum(scale) / 2, jnp.max(deepest), counts),

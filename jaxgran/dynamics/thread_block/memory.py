@@ -1,11 +1,11 @@
-"""What the threads of a thread block know, keep and tell each other: the ground of ``thread_block``.
+"""The memory of a thread block: what each thread holds, and how threads read from each other.
 
 Every array has an entry for each thread, and a thread is a grain: what a thread has written it reads without waiting.
-It learns of other grains through ``shared`` and ``counts``, which all write between two barriers and read after both.
+It reads of other grains from ``shared`` and ``counts``, which all threads write between two barriers and read after.
 
-Pallas lowers kernels to Triton with gaps that show here and in what uses it: a row is a number and not a slice of
-an array of vectors, a branch returns values and not constants (``Flow.ok`` is a zero that is one), and what is not read
-under its mask is given as zero.
+Pallas lowers kernels to Triton with limits that show here: a row is given by its number and not by a slice of an
+array of vectors; a branch returns values and not constants (``Flow.ok`` is the status ok as a value); and what is
+masked out is read as zero.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,11 +1,11 @@
 """Impulses of the contacts of one step within a thread block, and what they add to the sums.
 
-The problem and its solution are those of ``solver``. A thread goes through the contacts of its grain; the sum of their
-impulses is the change of its velocity, which it tells the others, and they tell theirs: that is a product with W. Each
-contact is there twice, once for each of its grains, so sums over the block are halved where they count.
+The problem and its solution are those of ``contact.solver``. A thread adds up the impulses of its contacts, which
+change the grain's velocity. When all threads have exchanged these changes, a product with W is done. Each contact is
+there twice, once for each of its grains, so sums over the block are halved.
 
 Isolated pairs have a closed form. What is left, contacts of grains that touch several or whose partner does, goes
-through the default of ``methods`` together.
+through the default of ``contact.projected_methods`` together.
 """
 
 from typing import NamedTuple
@@ -185,7 +185,7 @@ def collided(
 
 
 class _Descent(NamedTuple):
-    """Where the solve stands, as in ``methods``; residuals are squared."""
+    """Where the solve stands, as in ``contact.projected_methods``; residuals are squared."""
 
     iterations: Array
     stride: Array
@@ -197,7 +197,7 @@ class _Descent(NamedTuple):
 
 
 def _descend(thread: Thread, contacts: Array, most: Array, width: Array, target: Array) -> Solve:
-    """Write the impulses p₀ of the contacts of clusters, by the guarded method of Barzilai and Borwein (``methods``).
+    """Write the impulses p₀ of the contacts of clusters, by the guarded method of Barzilai and Borwein.
 
     Args:
       contacts, most: (threads,) their numbers, and the largest.
