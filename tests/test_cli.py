@@ -27,6 +27,7 @@ from jaxgran.cli import app, fit, info, measure, run
 from jaxgran.cli import map as map_module
 from jaxgran.cli.arguments import FIRST_STRAIN, number_list
 from jaxgran.cli.terminal import print_table
+from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import sweep
@@ -415,7 +416,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert lines["precision"] == "float64"
     assert lines["jaxgran"].startswith(version("jaxgran"))
     assert float(lines["memory"].removesuffix(" GiB")) > 0.1
-    assert str(sweep.usable_cores()) in lines["cores"]
+    assert str(usable_cores()) in lines["cores"]
     assert "jaxgran" in outcome.out.splitlines()[-1]  # the folder of the compilation cache
 
 

@@ -11,27 +11,9 @@ from rich.table import Table
 from jaxgran.cli.arguments import RelativeError, batch_size, first_strain, number_list, numbers_or_auto
 from jaxgran.cli.measure import by_timestep, finish, measured
 from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
+from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.flow import Activation, Solver
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "quick": {
-        "restitution": "0.2,0.35,0.5,0.65,0.8",
-        "packing_fraction": "0.5,0.6,0.65,0.7,0.75,0.79",
-        "grains": 256,
-        "seeds": 2,
-        "timestep": 1e-3,
-        "strain": 8.0,
-    },
-    "paper": {
-        "restitution": "0.1,0.2,0.3,0.4,0.5,0.6,0.7,0.8,0.9,0.98",
-        "packing_fraction": "0.1,0.2,0.3,0.4,0.5,0.56,0.6,0.65,0.7,0.75,0.8,0.82",
-        "grains": 400,
-        "seeds": 4,
-        "timestep": 1e-5,
-        "strain": 4.0,
-    },
-}
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
@@ -86,8 +68,8 @@ def map_command(
     if scheduler is not None and workers is not None:
         raise InputError("--scheduler and --workers exclude each other: give one of them.")
     given = {
-        "restitution": restitution,
-        "packing_fraction": packing_fraction,
+        "restitution": None if restitution is None else number_list(restitution, "restitution"),
+        "packing_fraction": None if packing_fraction is None else number_list(packing_fraction, "packing_fraction"),
         "grains": grains,
         "seeds": seeds,
         "timestep": numbers_or_auto(timestep, "timestep"),
@@ -101,9 +83,6 @@ def map_command(
     chosen = (PRESETS[preset] if like is None else _like(like)) | {
         name: value for name, value in given.items() if value is not None
     }
-    for name in ("restitution", "packing_fraction"):
-        if isinstance(chosen[name], str):
-            chosen[name] = number_list(chosen[name], name)
     data, interrupted = measured(chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler)
 
     from jaxgran.plotting.map_figures import save_figures

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from jaxgran.cli.progress import progress
 from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, say, say_written, stop
+from jaxgran.environment import usable_cores
 
 _MEANINGS = {
     "iteration_limit": "some contact solve ended above the tolerance",
@@ -43,7 +44,7 @@ def measured(
     from jaxgran.maps.dataset import map_dataset
     from jaxgran.maps.results import check_output, write_dataset
     from jaxgran.maps.settings import MapSettings, automatic
-    from jaxgran.maps.sweep import check_batches, predicted_cost, replicas, usable_cores
+    from jaxgran.maps.sweep import check_batches, predicted_cost, replicas
 
     if output is not None:
         check_output(output)

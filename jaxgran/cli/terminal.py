@@ -5,7 +5,6 @@ Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finish
 """
 
 import hashlib
-import platform
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import NoReturn
 import platformdirs
 from rich.console import Console
 from rich.table import Table
+
+from jaxgran.environment import processor_features
 
 NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
 
@@ -30,16 +31,8 @@ def configured_jax():
 
 def _compilation_cache() -> str:
     """Folder of compiled programs, one for each kind of processor: a home folder may be shared by several."""
-    lines = processor_lines()
-    processor = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
-    kind = hashlib.sha256(processor.encode()).hexdigest()[:12]
+    kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
     return str(Path(platformdirs.user_cache_dir("jaxgran")) / kind)
-
-
-def processor_lines() -> list[str]:
-    """What the system tells of its processors, line by line; nothing where it keeps no such file."""
-    information = Path("/proc/cpuinfo")
-    return information.read_text().splitlines() if information.is_file() else []
 
 
 def say(sentence: str) -> None:

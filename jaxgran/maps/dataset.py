@@ -3,18 +3,15 @@
 import math
 import os
 import platform
-import subprocess
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import xarray as xr
 
+from jaxgran import environment
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import stack
@@ -152,17 +149,6 @@ def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
 
 
-def commit() -> str:
-    """The commit of the checkout that this package runs from, empty where it is none."""
-    folder = Path(__file__).parents[2]
-    if not (folder / ".git").exists():
-        return ""
-    with suppress(OSError):
-        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
-        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
-    return ""
-
-
 def _tail(name: str) -> tuple[int, ...]:
     return (2, 2) if name in TENSORS else ()
 
@@ -182,7 +168,6 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         del parameters["strain"]  # every seed has its own
     flow = settings.flows()[0]
     packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
-    device = jax.devices()[0]
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": "CF-1.11",
@@ -194,10 +179,10 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
         "max_iterations": flow.max_iterations,
-        "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
-        "device": f"{device.platform}: {device.device_kind}",
-        "platform": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "precision": environment.precision(),
+        "device": environment.devices()[0],
+        "platform": f"{environment.system()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
-        "commit": commit(),
-        **{f"version_{name.replace('-', '_')}": version(name) for name in packages},
+        "commit": environment.commit(),
+        **{f"version_{name.replace('-', '_')}": number for name, number in environment.versions(packages).items()},
     }

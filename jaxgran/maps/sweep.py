@@ -7,7 +7,6 @@ of workers.
 """
 
 import math
-import os
 import warnings
 from collections.abc import Callable, Container, Generator, Sequence
 from contextlib import closing
@@ -197,11 +196,6 @@ def _plain(value: Any) -> Any:
         return value
     plain = array.astype(float).tolist() if array.ndim and array.dtype.kind in "iu" else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain
-
-
-def usable_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def predicted_cost(flow: ShearFlow) -> float:

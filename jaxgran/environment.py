@@ -1,0 +1,75 @@
+"""What a run was made with: versions, commit, processor, cores, memory, devices and precision."""
+
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+
+
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """The installed versions of packages, by name."""
+    return {name: version(name) for name in packages}
+
+
+def commit() -> str:
+    """The commit of the checkout that this package runs from, empty where it is none."""
+    folder = Path(__file__).parents[1]
+    if not (folder / ".git").exists():
+        return ""
+    with suppress(OSError):
+        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    return ""
+
+
+def system() -> str:
+    """Operating system and architecture."""
+    return f"{platform.system()} {platform.machine()}"
+
+
+def processor() -> str:
+    """The model of the processor, or "unknown" where the system does not tell."""
+    names = [line.split(":", 1)[1].strip() for line in processor_lines() if line.startswith("model name")]
+    return names[0] if names else platform.processor() or "unknown"
+
+
+def processor_features() -> str:
+    """The line of the instruction sets of the processor; its name where the system keeps no such line."""
+    features = (line for line in processor_lines() if line.startswith(("flags", "Features")))
+    return next(features, platform.processor())
+
+
+def processor_lines() -> list[str]:
+    """What the system tells of its processors, line by line; nothing where it keeps no such file."""
+    information = Path("/proc/cpuinfo")
+    return information.read_text().splitlines() if information.is_file() else []
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory() -> str:
+    """The memory of the machine in GiB, or "unknown" where the system does not tell."""
+    try:
+        return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+    except (AttributeError, ValueError, OSError):
+        return "unknown"
+
+
+def devices() -> list[str]:
+    """Platform and kind of each device of JAX; RuntimeError where a driver does not answer."""
+    import jax
+
+    return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+
+
+def precision() -> str:
+    """The precision of JAX: float64 or float32."""
+    import jax
+
+    return "float64" if jax.config.read("jax_enable_x64") else "float32"

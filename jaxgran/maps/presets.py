@@ -1,0 +1,22 @@
+"""The presets of ``jaxgran map``: choices of a whole map by name, as arguments of ``ratio_map``."""
+
+from typing import Any
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "quick": {
+        "restitution": (0.2, 0.35, 0.5, 0.65, 0.8),
+        "packing_fraction": (0.5, 0.6, 0.65, 0.7, 0.75, 0.79),
+        "grains": 256,
+        "seeds": 2,
+        "timestep": 1e-3,
+        "strain": 8.0,
+    },
+    "paper": {
+        "restitution": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98),
+        "packing_fraction": (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7, 0.75, 0.8, 0.82),
+        "grains": 400,
+        "seeds": 4,
+        "timestep": 1e-5,
+        "strain": 4.0,
+    },
+}
