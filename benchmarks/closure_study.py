@@ -4,52 +4,35 @@ Every point of a map of 30 is predicted by the closure that is fitted to the oth
 beside the noise of the point itself, which no closure can predict. Points on the edge of the map, where the closure
 extrapolates, are told apart from those inside.
 
-    python benchmarks/closure_study.py             # maps as `jaxgran map` does first, about 2 minutes on two cores
-    python benchmarks/closure_study.py MAP.nc      # the same of a map that there is
-    python benchmarks/closure_study.py --quick     # small flows, large errors, a minute
+    python -m benchmarks closure_study             # maps as `jaxgran map` does first, about 2 minutes on two cores
+    python -m benchmarks closure_study MAP.nc      # the same of a map that there is
+    python -m benchmarks closure_study --quick     # small flows, large errors, a minute
 """
 
-import argparse
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
-from hardware import hardware, json_with_rows
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, PercentFormatter, StrMethodFormatter
 
 import jaxgran as jg
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
 from jaxgran.inference.closure import LAWS
 from jaxgran.inference.cross_validation import leave_one_out
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import read_dataset
-from jaxgran.maps.sweep import usable_cores
 
-RESTITUTION, PACKING_FRACTION = [0.2, 0.35, 0.5, 0.65, 0.8], [0.5, 0.6, 0.65, 0.7, 0.75, 0.79]
+SMALLER = {"grains": 64, "seeds": 1, "strain": 4.0}
 NAMES = ("pressure", "shear_stress", "force_ratio")
 TARGETS = {"pressure": 0.05, "force_ratio": 0.08}
 STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v"))  # of the restitutions, in turn
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("map", nargs="?", type=Path, help="dataset of a map; without it, one is made")
-    arguments.add_argument("--quick", action="store_true", help="small flows, large errors")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    data = measured(chosen.quick) if chosen.map is None else read_dataset(chosen.map)
-    study(data, chosen.output, "closure_quick" if chosen.quick else "closure")
-
-
-def measured(quick: bool) -> xr.Dataset:
-    """The map that the command line makes first, or one of a quarter of its grains, one seed and half its strain."""
-    size = {"grains": 64, "seeds": 1, "strain": 4.0} if quick else {"grains": 256, "seeds": 2, "strain": 8.0}
-    return jg.ratio_map(RESTITUTION, PACKING_FRACTION, timestep=1e-3, workers=usable_cores(), **size)
-
-
-def study(data: xr.Dataset, output: Path, name: str) -> None:
-    """Fit, leave out, print, and write JSON and PNG."""
+def run(output: Output, dataset: Path | None = None) -> None:
+    """Fit, leave out, print, and write JSON and PNG; of a dataset of a map, or of one that is made."""
+    data = measured(output.quick) if dataset is None else read_dataset(dataset)
     errors, closure = leave_one_out(data), jg.fit_closure(data)
     summary = {name: error_summary(errors, name) for name in NAMES} | {"restitution": restitution_summary(errors)}
     print("relative errors of points left out, in percent")
@@ -64,11 +47,15 @@ def study(data: xr.Dataset, output: Path, name: str) -> None:
         end = "   end of the range, which no estimate leaves" if row["at_end"] else ""
         print("  α = {restitution:4.2f}   {rms:6.3f}   {quoted:6.3f}".format(**row) + end)
     print(f"  pulls, rms: {summary['restitution']['pull']:.2f}")
-    output.mkdir(parents=True, exist_ok=True)
-    run = {k: str(v) for k, v in data.attrs.items()}
-    head = {"hardware": hardware(), "run": run, "closure": coefficients(closure), "summary": summary}
-    (output / f"{name}.json").write_text(json_with_rows(rounded(head), "points", rounded(rows(data, errors))))
-    draw(data, errors).savefig(output / f"{name}.png", dpi=150)
+    made_by = {k: str(v) for k, v in data.attrs.items()}
+    head = {"run": made_by, "closure": coefficients(closure), "summary": summary}
+    output.write_rows("closure", rounded(head), "points", rounded(rows(data, errors)))
+    output.write_picture(draw(data, errors), "closure")
+
+
+def measured(quick: bool) -> xr.Dataset:
+    """The map that the command line makes first, or a smaller one."""
+    return jg.ratio_map(**PRESETS["quick"] | (SMALLER if quick else {}), workers=usable_cores())
 
 
 def rms(values: np.ndarray) -> float:
@@ -192,7 +179,3 @@ def draw(data: xr.Dataset, errors: xr.Dataset) -> Figure:
         fontsize="medium",
     )
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -4,29 +4,25 @@
 advance, and, a few of them, by the rival. Replica-steps per second are printed and written as JSON, with the peak of
 the device's memory where it tells. ``--paper`` adds the seconds of ``jaxgran map --preset paper``.
 
-    python benchmarks/device_batch.py                    # a processor: 3 minutes
-    python benchmarks/device_batch.py --quick            # under a minute
-    python benchmarks/device_batch.py --paper --output .
+    python -m benchmarks device_batch                    # a processor: 3 minutes
+    python -m benchmarks device_batch --quick            # under a minute
+    python -m benchmarks device_batch --paper --output .
 """
 
-import argparse
-import json
 import time
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import rival_numba
-from hardware import hardware
-from step_cost import rival_arguments
 
 import jaxgran as jg
-from jaxgran.cli.arguments import number_list
-from jaxgran.cli.map import PRESETS
+from benchmarks import rival_numba
+from benchmarks.output import Output
+from benchmarks.step_cost import rival_arguments
 from jaxgran.dynamics import advance
 from jaxgran.dynamics import plain as plain_module
-from jaxgran.maps.sweep import usable_cores
+from jaxgran.environment import usable_cores
+from jaxgran.maps.presets import PRESETS
 from jaxgran.sampling.batch import advance_batch, replicated
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
@@ -35,14 +31,9 @@ PLAIN_SHARE = 10  # the plain advance takes a tenth of the strain
 DISTINCT, APART = 16, 0.5  # states of a batch, and the strain between them
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="64 replicas, two points")
-    arguments.add_argument("--paper", action="store_true", help="the map of the paper, too")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    replicas, points, timesteps = (64, POINTS[:2], TIMESTEPS[:1]) if chosen.quick else (REPLICAS, POINTS, TIMESTEPS)
+def run(output: Output, paper: bool = False) -> None:
+    """Compare at every point, print, and write JSON; with the map of the paper where it is asked for."""
+    replicas, points, timesteps = (64, POINTS[:2], TIMESTEPS[:1]) if output.quick else (REPLICAS, POINTS, TIMESTEPS)
     device = jax.local_devices()[0]
     print(f"{jax.device_count()} × {device.device_kind}, {replicas} replicas of {GRAINS} grains")
     print("     dt     α     ν   taken: replica-steps/s   plain    one core of the rival   taken/rival")
@@ -54,19 +45,17 @@ def main() -> None:
                 "{dt:7.0e}{alpha:6.2g}{nu:6.2g}{taken:23.3g}{plain:11.3g}{rival:17.3g}{ratio:14.1f}".format(**rows[-1])
             )
     result = {
-        "hardware": hardware() | {"device": device.device_kind, "devices": jax.device_count()},
+        "hardware": output.hardware | {"device": device.device_kind, "devices": jax.device_count()},
         "engine": rows[0]["engine"],
         "replicas": replicas,
         "grains": GRAINS,
         "peak_bytes": (device.memory_stats() or {}).get("peak_bytes_in_use"),
         "rows": rows,
     }
-    if chosen.paper:
+    if paper:
         result["paper_map_seconds"] = paper_map()
         print(f"the map of the paper: {result['paper_map_seconds']:.0f} s")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    name = f"device_batch_{device.platform}{'_quick' if chosen.quick else ''}.json"
-    (chosen.output / name).write_text(json.dumps(result, indent=1) + "\n")
+    output.write_json(f"device_batch_{device.platform}", result)
 
 
 def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
@@ -107,11 +96,6 @@ def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:
 
 def paper_map() -> float:
     """Seconds of the map of the paper, with a worker for each core of a processor."""
-    axes = {name: number_list(PRESETS["paper"][name], name) for name in ("restitution", "packing_fraction")}
     start = time.perf_counter()
-    jg.ratio_map(**PRESETS["paper"] | axes, workers=usable_cores() if jax.default_backend() == "cpu" else 1)
+    jg.ratio_map(**PRESETS["paper"], workers=usable_cores() if jax.default_backend() == "cpu" else 1)
     return time.perf_counter() - start
-
-
-if __name__ == "__main__":
-    main()

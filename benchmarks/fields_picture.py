@@ -3,28 +3,22 @@
 A flow of 1000 grains is prepared and its next step solved. Density, velocity fluctuation, contact pressure with the
 contacts that push, and dissipation are drawn on a grid of 128 × 128 points; the times are printed and written as JSON.
 
-    python benchmarks/fields_picture.py            # about 1½ minutes
-    python benchmarks/fields_picture.py --quick    # half a minute: 256 grains, 48 × 48 points
+    python -m benchmarks fields_picture            # about 1½ minutes
+    python -m benchmarks fields_picture --quick    # half a minute: 256 grains, 48 × 48 points
 """
 
-import argparse
-import json
-import os
 import time
-from pathlib import Path
-
-os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, Normalize, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.analysis.force_chains import loaded_contacts
@@ -37,29 +31,20 @@ KERNELS = {"gaussian": gaussian(WIDTH), "lucy": lucy(3 * WIDTH), "heaviside": he
 _WIDEST_LINE = 4.0  # points
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer grains and points, a shorter preparation")
-    arguments.add_argument("--repeats", type=int, default=7, help="timed evaluations of each function")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    grains, count, equilibrate = (256, 48, 0.1) if chosen.quick else (1000, 128, 1.0)
-
+def run(output: Output, repeats: int = 7) -> None:
+    """Prepare the flow, time the fields with each kernel, print, and write JSON and PNG."""
+    grains, count, equilibrate = (256, 48, 0.1) if output.quick else (1000, 128, 1.0)
     flow = jg.ShearFlow(grains, RESTITUTION, PACKING_FRACTION, TIMESTEP)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=equilibrate)
     seen = jax.jit(snapshot)(flow, state)
     points = grid(state.side, count)
     loaded = int(jnp.sum(seen.impulses > 0))
     print(f"{grains} grains, {loaded} contacts that push, {count} × {count} points, one core")
-    timings = {name: timed(seen, points, graining, chosen.repeats) for name, graining in KERNELS.items()}
+    timings = {name: timed(seen, points, graining, repeats) for name, graining in KERNELS.items()}
     for name, found in timings.items():
         print(f"{name:10s} compilation {found['compile_seconds']:.1f} s, then {found['seconds']:.3f} s")
 
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    stem = chosen.output / ("fields_quick" if chosen.quick else "fields")
     result = {
-        "hardware": hardware(),
         "precision": str(state.positions.dtype),
         "grains": grains,
         "alpha": RESTITUTION,
@@ -69,11 +54,11 @@ def main() -> None:
         "loaded_contacts": loaded,
         "points": count**2,
         "gaussian_width": WIDTH,
-        "repeats": chosen.repeats,
+        "repeats": repeats,
         "timings": timings,
     }
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(seen, fields_at(seen, points, KERNELS["gaussian"]), count).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("fields", result)
+    output.write_picture(draw(seen, fields_at(seen, points, KERNELS["gaussian"]), count), "fields")
 
 
 def timed(seen: Snapshot, points: jax.Array, graining: CoarseGraining, repeats: int) -> dict:
@@ -141,7 +126,3 @@ def draw_forces(axes: Axes, seen: Snapshot) -> None:
     shifts = side * np.array([(a + tilt * b, b) for a in (-1, 0, 1) for b in (-1, 0, 1)])
     widths = _WIDEST_LINE * load.force / load.force.max()
     axes.add_collection(force_lines(starts, branches, shifts, widths, color="black"), autolim=False)
-
-
-if __name__ == "__main__":
-    main()

@@ -4,23 +4,20 @@ Both flows are sheared to their steady state and on to the same tilt of the cell
 snapshot, and a line shows the mean force between two grains over that short time: at α = 0.9 pairs collide one after
 the other, at α = 0.1 chains of grains push at once.
 
-    python benchmarks/flow_picture.py            # about 2 minutes
-    python benchmarks/flow_picture.py --quick    # about a minute: 100 grains, a longer time step
+    python -m benchmarks flow_picture            # about 2 minutes
+    python -m benchmarks flow_picture --quick    # about a minute: 100 grains, a longer time step
 """
 
-import argparse
-import json
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from hardware import hardware
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.plotting.drawing import LABEL_SIZE, empty_figure, write
+from jaxgran.plotting.drawing import LABEL_SIZE, empty_figure
 from jaxgran.plotting.flow import Colour, Scene, common_scale, draw_picture, scene_of
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
@@ -37,24 +34,16 @@ class Choice(NamedTuple):
 FULL, QUICK = Choice(324, 1e-4, 20, None), Choice(100, 5e-4, 8, 0.5)
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer grains, a longer time step")
-    arguments.add_argument("--colour", choices=("speed", "pressure"), default="speed", help="of the grains")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    choice = QUICK if chosen.quick else FULL
+def run(output: Output, colour: Colour = "speed") -> None:
+    """Shear both flows, print what the picture shows, and write JSON and PNG."""
+    choice = QUICK if output.quick else FULL
     flows = [window(restitution, choice) for restitution in RESTITUTIONS]
 
     rows = [described(restitution, seen) for restitution, seen in zip(RESTITUTIONS, flows, strict=True)]
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    stem = chosen.output / ("flow_quick" if chosen.quick else "flow")
-    head = {"hardware": hardware(), "nu": PACKING_FRACTION, **choice._asdict()}
-    stem.with_suffix(".json").write_text(json.dumps({**head, "flows": rows}, indent=1) + "\n")
-    write(draw([scene_of(seen) for seen in flows], chosen.colour), stem.with_suffix(".png"))
+    output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
+    output.write_picture(draw([scene_of(seen) for seen in flows], colour), "flow", dpi=200)
 
 
 def window(restitution: float, choice: Choice) -> Snapshot:
@@ -87,7 +76,3 @@ def draw(scenes: list[Scene], colour: Colour):
         draw_picture(axes, scene, colour, common_scale([scene], colour))
         axes.text(0.0, 1.02, f"({letter})", transform=axes.transAxes, fontsize=LABEL_SIZE, weight="bold")
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -6,22 +6,20 @@ T = T₀/(1 + t/τ)². It holds while the gas is homogeneous. In a cell that is 
 then clusters form: collisions become gentler than the temperature tells, and T lies above the law. The figure marks
 where that exceeds a tenth, and shows the last state of the most dissipative gas.
 
-    python benchmarks/free_cooling.py           # 1600 grains, two minutes on one core
-    python benchmarks/free_cooling.py --quick   # 256 grains, about a minute
+    python -m benchmarks free_cooling           # 1600 grains, two minutes on one core
+    python -m benchmarks free_cooling --quick   # 256 grains, about a minute
 """
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
-from hardware import hardware, json_with_rows
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.theory.steady_shear import contact_value
 
 ALPHAS, NU, TIMESTEP = (0.8, 0.9, 0.95), 0.3, 2e-3
@@ -29,13 +27,9 @@ EQUILIBRATION = np.linspace(0.1, 5.0, 40)  # at T = 1, a dozen collisions a grai
 DEPARTURE = 0.1  # of T from the law, that the figure marks
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer grains and seeds")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    grains, seeds, latest = (256, 2, 300.0) if chosen.quick else (1600, 3, 3000.0)
+def run(output: Output) -> None:
+    """Cool from several gases, print where the law ends, and write JSON and PNG."""
+    grains, seeds, latest = (256, 2, 300.0) if output.quick else (1600, 3, 3000.0)
     times = np.geomspace(0.2, latest, 40)
     flow = jg.ShearFlow(grains, 1.0, NU, TIMESTEP, shear_rate=0.0, polydispersity=0.0)
     gases = [jg.cooling(flow, jg.heated(flow, jax.random.key(seed)), EQUILIBRATION)[0] for seed in range(seeds)]
@@ -50,11 +44,9 @@ def main() -> None:
         found = departure(some)
         where = f"{found['collisions']:10.1f}{found['time']:12.1f}" if found else f"not within {latest:g}"
         print(f"{alpha:5.2f}{where:>45}{max(row['status'] for row in some):15d}")
-    stem = chosen.output / ("free_cooling_quick" if chosen.quick else "free_cooling")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    run = {"grains": grains, "seeds": seeds, "packing_fraction": NU, "timestep": TIMESTEP}
-    stem.with_suffix(".json").write_text(json_with_rows({"hardware": hardware(), "run": run}, "rows", rows))
-    draw(rows, grains, last).savefig(stem.with_suffix(".png"), dpi=150)
+    choices = {"grains": grains, "seeds": seeds, "packing_fraction": NU, "timestep": TIMESTEP}
+    output.write_rows("free_cooling", {"run": choices}, "rows", rows)
+    output.write_picture(draw(rows, grains, last), "free_cooling")
 
 
 def table(alpha: float, records: list[jg.Cooling]) -> list[dict]:
@@ -129,7 +121,3 @@ def draw(rows: list[dict], grains: int, last: jg.State) -> Figure:
     figure.colorbar(drawn, ax=picture, shrink=0.8, label="speed, in √(T₀/m)")
     figure.suptitle(f"Free cooling at ν = {NU:g} (dotted: a tenth above the law from here on)")
     return figure
-
-
-if __name__ == "__main__":
-    main()

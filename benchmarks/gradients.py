@@ -1,30 +1,23 @@
 """What derivatives of a flow cost, and how fast they grow with strain.
 
-    python benchmarks/gradients.py           # both parts
-    python benchmarks/gradients.py --quick   # one flow, fewer runs
+    python -m benchmarks gradients           # both parts
+    python -m benchmarks gradients --quick   # one flow, fewer runs
 
 The first part times an advance of 100 steps and its derivatives, on one core, and counts the memory of the gradient of
 1000 steps. The second follows ∂(state)/∂α with and without contacts that move in time, beside the difference of two
 neighbouring runs, and fits the exponent of its growth.
 """
 
-import argparse
-import json
-import os
 import time
 from dataclasses import replace
-from pathlib import Path
-
-if __name__ == "__main__":
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
-from hardware import hardware
+from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
 from jaxgran.model.cell import displacement
 
@@ -130,10 +123,11 @@ def differences(flow, state):
     return jax.lax.scan(part, (state, state), length=POINTS)[1]
 
 
-def draw(flows: list[dict], file: Path) -> None:
+def draw(flows: list[dict]) -> Figure:
     """A panel for each flow: geometric means over its runs, with the scatter of the moving derivative as a band."""
-    figure, axes = plt.subplots(1, len(flows), figsize=(3.1 * len(flows) + 0.6, 3.3), sharey=True, layout="constrained")
-    for axis, flow in zip(np.atleast_1d(axes), flows, strict=True):
+    figure = Figure(figsize=(3.1 * len(flows) + 0.6, 3.3), layout="constrained")
+    axes = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
+    for axis, flow in zip(axes, flows, strict=True):
         strain = np.array(flow["strain"])
         logs = {name: np.log(np.array(flow[name])) for name in ("moving", "fixed", "difference")}
         middle, spread = logs["moving"].mean(0), logs["moving"].std(0)
@@ -150,21 +144,15 @@ def draw(flows: list[dict], file: Path) -> None:
         axis.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}${words}", fontsize=10)
         axis.set_yscale("log")
         axis.set_xlabel("strain")
-    first = np.atleast_1d(axes)[0]
-    first.set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ per grain  [$\sigma$, $\sigma\dot\gamma$]")
-    first.legend(fontsize=8, frameon=False)
-    figure.savefig(file, dpi=150)
-    plt.close(figure)
+    axes[0].set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ per grain  [$\sigma$, $\sigma\dot\gamma$]")
+    axes[0].legend(fontsize=8, frameon=False)
+    return figure
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="one flow, two runs")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    flows, runs, costs = (FLOWS[:1], 2, COSTS[:1]) if chosen.quick else (FLOWS, RUNS, COSTS)
-    result = {"hardware": hardware(), "costs": [], "flows": []}
+def run(output: Output) -> None:
+    """Time the derivatives, follow their growth, print, and write JSON and PNG."""
+    flows, runs, costs = (FLOWS[:1], 2, COSTS[:1]) if output.quick else (FLOWS, RUNS, COSTS)
+    result = {"costs": [], "flows": []}
     for grains, alpha, nu in costs:
         result["costs"].append(cost(grains, alpha, nu))
         row = result["costs"][-1]
@@ -174,10 +162,5 @@ def main() -> None:
         result["flows"].append(followed(alpha, nu, runs))
         row = result["flows"][-1]
         print(f"({alpha}, {nu}): exponents {row['exponents']}, horizon {row['horizon_strain']}", flush=True)
-    name = "gradients_quick" if chosen.quick else "gradients"
-    (chosen.output / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(result["flows"], chosen.output / f"{name}.png")
-
-
-if __name__ == "__main__":
-    main()
+    output.write_json("gradients", result)
+    output.write_picture(draw(result["flows"]), "gradients")

@@ -4,20 +4,18 @@
 - 10,000 points of tiny work: the time of a sweep, with its checkpoint and its dataset, less that spent in the batches.
 - A soak: sweeps one after another in one process for a given time, with the resident memory of the process.
 
-    python benchmarks/load.py [--quick] [--soak MINUTES]    # about 4 minutes on one core, and the soak
+    python -m benchmarks load [--quick] [--soak MINUTES]    # about 4 minutes on one core, and the soak
 """
 
-import argparse
 import json
 import tempfile
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
-from hardware import hardware
 from matplotlib.figure import Figure
 
+from benchmarks.output import Output
 from jaxgran.maps import sweep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
@@ -25,27 +23,21 @@ from jaxgran.maps.results import write_dataset
 from jaxgran.maps.settings import MapSettings
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="a hundredth of the points")
-    arguments.add_argument("--soak", type=float, default=0.0, metavar="MINUTES", help="length of the soak")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    stem = chosen.output / ("load_quick" if chosen.quick else "load")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    found = json.loads(stem.with_suffix(".json").read_text()) if stem.with_suffix(".json").exists() else {}
-    found["hardware"] = hardware()
-    if chosen.soak:
-        found["soak"] = soak(60 * chosen.soak)
-        draw(found["soak"]).savefig(chosen.output / "soak.png", dpi=150)
+def run(output: Output, soak: float = 0.0) -> None:
+    """Time the sweeps, or soak for so many minutes; print, and write into the JSON of an earlier run."""
+    earlier = output.path("load", ".json")
+    found = json.loads(earlier.read_text()) if earlier.exists() else {}
+    found["hardware"] = output.hardware
+    if soak:
+        found["soak"] = memory_of_sweeps(60 * soak)
+        output.write_picture(draw(found["soak"]), "soak")
     else:
-        found["replicas"] = timed(settings(3, 3, 4) if chosen.quick else settings(32, 32, 4))
-        found["points"] = timed(settings(10, 10, 1) if chosen.quick else settings(100, 100, 1))
+        found["replicas"] = timed(settings(3, 3, 4) if output.quick else settings(32, 32, 4))
+        found["points"] = timed(settings(10, 10, 1) if output.quick else settings(100, 100, 1))
     for name in ("replicas", "points"):
         if name in found:
             print(name, {key: f"{value:.3g}" for key, value in found[name].items()})
-    stem.with_suffix(".json").write_text(json.dumps(found, indent=1) + "\n")
+    output.write_json("load", found)
 
 
 def settings(restitutions: int, packing_fractions: int, seeds: int) -> MapSettings:
@@ -72,10 +64,10 @@ def timed(chosen: MapSettings) -> dict[str, float]:
         inside += time.perf_counter() - start
         return done
 
-    run(settings(2, 1, 2))  # compiles
+    swept(settings(2, 1, 2))  # compiles
     sweep._measured, start = counted, time.perf_counter()
     try:
-        points, replicas = run(chosen)
+        points, replicas = swept(chosen)
     finally:
         sweep._measured = measured
     seconds = time.perf_counter() - start
@@ -89,7 +81,7 @@ def timed(chosen: MapSettings) -> dict[str, float]:
     }
 
 
-def run(chosen: MapSettings) -> tuple[int, int]:
+def swept(chosen: MapSettings) -> tuple[int, int]:
     """A sweep as the command line does it, in a folder that is thrown away; its points and replicas."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "map.nc"
@@ -101,11 +93,11 @@ def run(chosen: MapSettings) -> tuple[int, int]:
     return data.status.size, len(results)
 
 
-def soak(seconds: float) -> dict[str, list[float]]:
+def memory_of_sweeps(seconds: float) -> dict[str, list[float]]:
     """Resident memory after every sweep, until the time is over."""
     times, memory, start = [], [], time.monotonic()
     while time.monotonic() - start < seconds:
-        run(settings(4, 4, 4))
+        swept(settings(4, 4, 4))
         times.append((time.monotonic() - start) / 60)
         memory.append(resident())
     return {"minutes": times, "resident MiB": memory}
@@ -126,7 +118,3 @@ def draw(soaked: dict[str, list[float]]) -> Figure:
     axes.set_ylim(0, 1.15 * max(soaked["resident MiB"]))
     axes.set_title(f"{len(soaked['minutes'])} sweeps of 64 replicas in one process", fontsize="medium")
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -9,20 +9,19 @@ in a compiled loop on one core, without compilation; Gauss–Seidel is a loop in
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from exact_contacts import Exact, exact
-from gauss_seidel import gauss_seidel
-from hardware import hardware, json_with_rows
 from jax import lax
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from networks import INFEASIBLE, Network, collection
 
+from benchmarks.exact_contacts import Exact, exact
+from benchmarks.gauss_seidel import gauss_seidel
+from benchmarks.networks import INFEASIBLE, Network, collection
+from benchmarks.output import Output
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution, solve
 from jaxgran.model.status import Status
@@ -63,18 +62,12 @@ class Row(NamedTuple):
     status: int
 
 
-def chart(quick: bool, output: Path) -> None:
+def chart(output: Output) -> None:
     """Measure, print the table of median products, and write ``methods.json`` and its figures."""
-    rows = measured(collection(quick), quick)
+    rows = measured(collection(output.quick), output.quick)
     print(table(rows))
-    output.mkdir(parents=True, exist_ok=True)
-    stem = "methods_quick" if quick else "methods"
-    result = {
-        "hardware": hardware(),
-        "cap": QUICK_CAP if quick else CAP,
-        "relaxation": RELAXATION,
-    }
-    (output / f"{stem}.json").write_text(json_with_rows(result, "summary", summary(rows)))
+    head = {"cap": QUICK_CAP if output.quick else CAP, "relaxation": RELAXATION}
+    output.write_rows("methods", head, "summary", summary(rows))
     flows = [group for group in dict.fromkeys(row.group for row in rows) if group not in _CONSTRUCTED]
     solvable = [group for group in _CONSTRUCTED if group != INFEASIBLE]
     for name, groups, precision in (
@@ -82,8 +75,8 @@ def chart(quick: bool, output: Path) -> None:
         ("_constructed", solvable, "float64"),
         ("_float32", flows, "float32"),
     ):
-        draw(rows, groups, precision).savefig(output / f"{stem}{name}.png", dpi=110)
-    draw_profile(rows).savefig(output / f"{stem}_profile.png", dpi=150)
+        output.write_picture(draw(rows, groups, precision), "methods", f"{name}.png", dpi=110)
+    output.write_picture(draw_profile(rows), "methods", "_profile.png")
 
 
 def measured(networks: dict[str, list[Network]], quick: bool) -> list[Row]:

@@ -20,24 +20,16 @@ Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)
 laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has the lattice vectors ``(side, 0)``
 and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
 
-    python benchmarks/rival_numba.py --packing-fraction 0.6 --restitution 0.1 --activation touching --grains 400
-    python benchmarks/rival_numba.py --timing
+``rival_table`` measures with it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import platform
-import subprocess
 import time
-from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
-from llvmlite.binding import get_host_cpu_name
 from numba import njit
 
 ACTIVATION = {"midpoint": 0.5, "touching": 0.0}
@@ -860,111 +852,3 @@ def settled(grains, packing_fraction, seed, timestep, strain, relax, **law):
         coarse = max(coarse / 10.0, timestep)
         state, _, _ = strained(state, relax, timestep=coarse, **law)
     return state
-
-
-def point(arguments):
-    """Force ratio, stresses and the cost of one (restitution, packing fraction), as a dictionary."""
-    law = {
-        "shear_rate": arguments.shear_rate,
-        "restitution": arguments.restitution,
-        "activation": ACTIVATION[arguments.activation],
-        "tolerance": arguments.tolerance,
-    }
-    settle, relax, strain = (
-        (4.0, 0.2, 0.5) if arguments.quick else (arguments.settle, arguments.relax, arguments.strain)
-    )
-    state = settled(
-        arguments.grains, arguments.packing_fraction, arguments.seed, arguments.timestep, settle, relax, **law
-    )
-    windows = [strained(state, strain / 8, timestep=arguments.timestep, **law)]
-    while len(windows) < 8:
-        windows.append(strained(windows[-1][0], strain / 8, timestep=arguments.timestep, **law))
-    tallies = [tally for _, tally, _ in windows]
-    steps = sum(tally.steps for tally in tallies)
-
-    def mean(name):
-        values = [getattr(tally, name) for tally in tallies]
-        return {"mean": float(np.mean(values)), "error": float(np.std(values, ddof=1) / math.sqrt(len(values)))}
-
-    return {
-        "restitution": arguments.restitution,
-        "packing_fraction": arguments.packing_fraction,
-        "activation": arguments.activation,
-        "timestep": arguments.timestep,
-        "grains": arguments.grains,
-        "strain": strain,
-        "force_ratio": sum(t.impulse for t in tallies) / max(sum(t.binary_impulse for t in tallies), 1e-300),
-        "pressure": mean("pressure"),
-        "shear_stress": mean("shear_stress"),
-        "temperature": mean("temperature"),
-        "contact_stress": np.mean([t.contact_stress for t in tallies], 0).tolist(),
-        "binary_stress": np.mean([t.binary_stress for t in tallies], 0).tolist(),
-        "kinetic_stress": np.mean([t.kinetic_stress for t in tallies], 0).tolist(),
-        "collisions_per_grain_and_strain": 2 * sum(t.collisions for t in tallies) / (arguments.grains * strain),
-        "contacts_per_step": sum(t.contacts for t in tallies) / steps,
-        "solves_per_step": sum(t.solves for t in tallies) / steps,
-        "sweeps_per_solve": sum(t.sweeps for t in tallies) / max(1, sum(t.solves for t in tallies)),
-        "updates_per_step": sum(t.updates for t in tallies) / steps,
-        "unconverged": sum(t.unconverged for t in tallies),
-        "largest_overlap": max(t.largest_overlap for t in tallies),
-        "microseconds_per_step": 1e6 * float(np.median([s / t.steps for _, t, s in windows])),
-    }
-
-
-def timings(arguments):
-    """Microseconds per step over restitutions and packing fractions, from coarse to fine time steps."""
-    results = []
-    for restitution in (0.9, 0.5, 0.1):
-        for packing_fraction in (0.56, 0.7, 0.8):
-            for timestep in (1e-3, 1e-4, 1e-5):
-                here = {
-                    "restitution": restitution,
-                    "packing_fraction": packing_fraction,
-                    "timestep": timestep,
-                    "strain": max(arguments.strain, 40_000 * timestep),  # so that the cost of a call does not show
-                }
-                results.append(point(argparse.Namespace(**(vars(arguments) | here))))
-                r = results[-1]
-                print(
-                    f"restitution {restitution:.1f}  packing {packing_fraction:.2f}  timestep {timestep:.0e}  "
-                    f"{r['microseconds_per_step']:8.3f} us/step  force ratio {r['force_ratio']:.3f}  "
-                    f"pressure {r['pressure']['mean']:.3f}",
-                    flush=True,
-                )
-    return results
-
-
-def main():
-    """Measure one point, or the table of timings, from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--grains", type=int, default=256)
-    parser.add_argument("--packing-fraction", type=float, default=0.6)
-    parser.add_argument("--restitution", type=float, default=0.9)
-    parser.add_argument("--activation", choices=ACTIVATION, default="midpoint")
-    parser.add_argument("--timestep", type=float, default=1e-4)
-    parser.add_argument("--shear-rate", type=float, default=1.0)
-    parser.add_argument("--tolerance", type=float, default=1e-4)
-    parser.add_argument("--settle", type=float, default=20.0, help="strain to the steady state, at a time step of 1e-3")
-    parser.add_argument("--relax", type=float, default=0.5, help="strain after each shortening of the time step")
-    parser.add_argument("--strain", type=float, default=2.0, help="strain of the sample")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--timing", action="store_true", help="the table of timings instead of one point")
-    parser.add_argument("--quick", action="store_true", help="short strains, for a first look")
-    parser.add_argument("--output", type=Path, help="write the result here as JSON")
-    arguments = parser.parse_args()
-    advance(*start(32, 0.3, 0), 0.0, 1.0, 0.5, 1e-3, 0.5, 1e-4, 10)  # compile outside the clock
-    results = timings(arguments) if arguments.timing else [point(arguments)]
-    if not arguments.timing:
-        print(json.dumps(results[0], indent=2))
-    if arguments.output:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
-        ).stdout.strip()
-        versions = {"python": platform.python_version(), "numba": numba.__version__, "numpy": np.__version__}
-        machine = {"processor": get_host_cpu_name(), "machine": platform.machine()}
-        report = {"versions": versions, "hardware": machine, "commit": commit, "results": results}
-        arguments.output.write_text(json.dumps(report, indent=2))
-
-
-if __name__ == "__main__":
-    main()

@@ -6,24 +6,22 @@ run longest. A force ratio is a result only together with its time step and rule
 tolerance at the same time step and rule: its error is that of the solver alone.
 """
 
-import json
 import math
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from hardware import hardware
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxgran as jg
-from jaxgran.maps.sweep import usable_cores
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.steady_state import prepare_batch
@@ -74,12 +72,12 @@ QUICK = Plan(
 )
 
 
-def chart(quick: bool, output: Path) -> None:
+def chart(output: Output) -> None:
     """Run the plan on all cores, print a table, and write ``runs.json`` and ``runs.png``."""
-    plan = QUICK if quick else FULL
+    plan = QUICK if output.quick else FULL
     tasks = list(product(plan.flows, range(plan.seeds)))
     start = time.perf_counter()
-    if quick:  # compilation takes longer than the runs: once, here
+    if output.quick:  # compilation takes longer than the runs: once, here
         measured = {task: run(plan, task) for task in tasks}
     else:
         with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
@@ -88,19 +86,16 @@ def chart(quick: bool, output: Path) -> None:
     for flow in flows:
         report(flow)
     result = {
-        "hardware": hardware(),
         "plan": {name: value for name, value in plan._asdict().items() if name != "configs"},
         "wall_seconds": time.perf_counter() - start,
         "flows": flows,
     }
-    stem = output / ("runs_quick" if quick else "runs")
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(flows).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("runs", result)
+    output.write_picture(draw(flows), "runs")
 
 
 def run(plan: Plan, task: tuple[tuple[float, float], int]) -> dict[Config, tuple[jg.Sample, float, int]]:
     """Samples of one seed of one flow for every configuration, with seconds per unit strain and the status."""
-    jax.config.update("jax_enable_x64", True)
     (alpha, nu), seed = task
     flow = jg.ShearFlow(plan.grains, alpha, nu, 1e-3)
     batch = prepare_batch(stack([flow]), jax.random.key(seed)[None])

@@ -4,30 +4,27 @@ Every size of a flow is measured in a process of its own, whose largest resident
 the processor, which do not count what else runs on a machine. The exponent of each growth is a least-squares fit to the
 logarithms.
 
-    python benchmarks/scaling.py           # up to 1e6 grains and 4096 replicas; 6 minutes
-    python benchmarks/scaling.py --quick   # up to 1e4 grains and 64 replicas, no mixed map; most of it compilation
-    python benchmarks/scaling.py --grains 100000   # one flow, for a strain of 0.1, as JSON
+    python -m benchmarks scaling           # up to 1e6 grains and 4096 replicas; 6 minutes
+    python -m benchmarks scaling --quick   # up to 1e4 grains and 64 replicas, no mixed map; most of it compilation
+    python -m benchmarks scaling --grains 100000   # one flow, for a strain of 0.1, as JSON
 """
 
-import argparse
 import json
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.maps.sweep import usable_cores
+from benchmarks.output import Output
+from benchmarks.process import printed_by
+from jaxgran.environment import usable_cores
 from jaxgran.sampling.batch import advance_batch, stack
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
@@ -41,19 +38,14 @@ REPEATS = 5
 LINEAR = 1_000, 100_000  # grains: smaller flows have steps without a contact, larger ones outgrow the caches
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer and smaller flows")
-    arguments.add_argument("--grains", type=int, metavar="N", help="one flow of N grains, as JSON")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    if chosen.grains:
-        print(json.dumps(large_flow(chosen.grains)))
+def run(output: Output, grains: int | None = None) -> None:
+    """Measure all growths, print, and write JSON and PNG; or print one flow of so many grains as JSON."""
+    if grains is not None:
+        print(json.dumps(large_flow(grains)))
         return
     sizes, batches, dts, fractions = (
         (QUICK_GRAINS, QUICK_REPLICAS, QUICK_TIMESTEPS, QUICK_PACKING_FRACTIONS)
-        if chosen.quick
+        if output.quick
         else (GRAINS, REPLICAS, TIMESTEPS, PACKING_FRACTIONS)
     )
     rows = {
@@ -62,19 +54,15 @@ def main() -> None:
         "timestep": [row for at in (LARGE_FLOW, DENSE_FLOW) for row in timesteps(at, dts)],
         "contacts": contacts(fractions),
     }
-    mixed = None if chosen.quick else mixed_map(48.0)
+    mixed = None if output.quick else mixed_map(48.0)
     found = exponents(rows)
     report(rows, found, mixed)
-    stem = chosen.output / ("scaling_quick" if chosen.quick else "scaling")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    result = {"hardware": hardware(), "exponents": found, "mixed map": mixed, **rows}
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(rows, found).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("scaling", {"exponents": found, "mixed map": mixed, **rows})
+    output.write_picture(draw(rows, found), "scaling")
 
 
 def in_a_process_of_its_own(grains: int) -> dict[str, float]:
-    command = [sys.executable, __file__, "--grains", str(grains)]
-    text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    text = printed_by("scaling", "--grains", str(grains))
     print(f"{grains} grains: {text.strip()}", flush=True)
     return json.loads(text)
 
@@ -280,7 +268,3 @@ def draw(rows: dict[str, list[dict]], found: dict[str, float]) -> Figure:
 
 def _guide(axes: Axes, x: np.ndarray, last: float, label: str) -> None:
     axes.plot(x, last * x / x[-1], ":", color="gray", label=label)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,35 +1,21 @@
 """Speed against accuracy: the charts of the contact solve, of whole runs, and of batches.
 
-python benchmarks/speed_vs_accuracy.py                    # all charts
-python benchmarks/speed_vs_accuracy.py --quick            # all, smaller
-python benchmarks/speed_vs_accuracy.py --only throughput  # one of methods, runs, throughput
+python -m benchmarks speed_vs_accuracy                    # all charts
+python -m benchmarks speed_vs_accuracy --quick            # all, smaller
+python -m benchmarks speed_vs_accuracy --only throughput  # one of methods, runs, throughput
 """
 
-import argparse
-import os
 import time
-from importlib import import_module
-from pathlib import Path
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+from benchmarks import method_chart, run_chart, throughput_chart
+from benchmarks.output import Output
 
-import jax
-
-CHARTS = {"methods": "method_chart", "runs": "run_chart", "throughput": "throughput_chart"}
+CHARTS = {"methods": method_chart.chart, "runs": run_chart.chart, "throughput": throughput_chart.chart}
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="smaller charts")
-    arguments.add_argument("--only", choices=CHARTS, help="one chart instead of all")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    for name in [chosen.only] if chosen.only else CHARTS:
+def run(output: Output, only: str | None = None) -> None:
+    """Make all charts, or one."""
+    for name in CHARTS if only is None else [only]:
         start = time.perf_counter()
-        import_module(CHARTS[name]).chart(chosen.quick, chosen.output)
+        CHARTS[name](output)
         print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
-
-
-if __name__ == "__main__":
-    main()

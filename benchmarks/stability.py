@@ -9,24 +9,21 @@ The steps of a cell are done in ten parts, each as long as all before it, and it
 Only deep overlaps do not end it. In the part that fails the worst failure counts, in the order of ``OUTCOMES``. An
 energy gain is a negative dissipation, or kinetic energy beyond the shear work less the dissipation.
 
-    python benchmarks/stability.py            # about 10 minutes on one core
-    python benchmarks/stability.py --quick    # about half a minute
+    python -m benchmarks stability            # about 10 minutes on one core
+    python -m benchmarks stability --quick    # about half a minute
 """
 
-import argparse
-import os
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware, json_with_rows
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.batch import stack
@@ -65,26 +62,16 @@ advance = jax.jit(jg.advance)
 pack = jax.jit(jg.pack)
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="nine cells of two variants")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-    jax.config.update("jax_enable_x64", True)
-    chart(chosen.quick, chosen.output)
-
-
-def chart(quick: bool, output: Path) -> list[dict]:
+def run(output: Output) -> list[dict]:
     """Measure all cells, write them with their figures, and return them (see ``cell``)."""
     restitutions, packing_fractions, crossings, names = RESTITUTIONS, PACKING_FRACTIONS, CROSSINGS, tuple(VARIANTS)
-    if quick:
+    if output.quick:
         restitutions, packing_fractions, crossings = (0.5,), (0.6, 0.75, 0.8), (3e-4, 3e-3, 3e-2)
         names = ("default", "float32")
     starts = {(alpha, nu): prepared(alpha, nu) for alpha in restitutions for nu in packing_fractions}
     cells = []
     for name in names:
-        if name != "default" and not quick:
+        if name != "default" and not output.quick:
             packing_fractions, crossings = COARSE_GRID
         for alpha, nu in ((alpha, nu) for alpha in restitutions for nu in packing_fractions):
             column = [cell(name, alpha, nu, crossing, *starts[alpha, nu]) for crossing in crossings]
@@ -92,17 +79,10 @@ def chart(quick: bool, output: Path) -> list[dict]:
             ratios = [one["pressure"] / whole[0] if one["strain"] > 0.99 * STRAIN else np.nan for one in column]
             cells += [{**one, "pressure_ratio": ratio} for one, ratio in zip(column, ratios, strict=True)]
             print(f"{name:26s} α = {alpha:3g}  ν = {nu:5g}  {' '.join(OUTCOMES[c['outcome']][0] for c in column)}")
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / ("stability_quick" if quick else "stability")
-    result = {
-        "hardware": hardware(),
-        "grains": GRAINS,
-        "strain": STRAIN,
-        "steps": [FEWEST_STEPS, MOST_STEPS],
-    }
-    stem.with_suffix(".json").write_text(json_with_rows(result, "cells", cells))
-    draw_default(cells).savefig(stem.with_suffix(".png"), dpi=150)
-    draw_variants(cells).savefig(stem.with_name(stem.name + "_variants.png"), dpi=150)
+    head = {"grains": GRAINS, "strain": STRAIN, "steps": [FEWEST_STEPS, MOST_STEPS]}
+    output.write_rows("stability", head, "cells", cells)
+    output.write_picture(draw_default(cells), "stability")
+    output.write_picture(draw_variants(cells), "stability", "_variants.png")
     return cells
 
 
@@ -291,7 +271,3 @@ def legend(figure: Figure, cells: list[dict], more: list[str]) -> None:
     entries = [f"{letter} {words}" for name, (letter, _, words) in OUTCOMES.items() if name in seen] + more
     unbroken = ";  ".join(entry.replace(" ", "\u00a0") for entry in entries)
     figure.suptitle(textwrap.fill(unbroken, width=int(11 * figure.get_figwidth())), fontsize="medium")
-
-
-if __name__ == "__main__":
-    main()

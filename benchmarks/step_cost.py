@@ -4,54 +4,38 @@ For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxg
 by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
 printed and written as JSON and PNG. Compilation is reported apart, as is the memory of 1000 replicas.
 
-    python benchmarks/step_cost.py            # about 1 minute
-    python benchmarks/step_cost.py --quick    # half a minute
+    python -m benchmarks step_cost            # about 1 minute
+    python -m benchmarks step_cost --quick    # half a minute
 """
 
-import argparse
-import json
-import os
 import resource
-import subprocess
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
-
-os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rival_numba
-from hardware import hardware
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks import rival_numba
+from benchmarks.output import Output
+from benchmarks.process import printed_by
 
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
 STRAINS = {1e-3: 2.0, 1e-4: 1.0, 1e-5: 0.5}  # advanced at a time
 GRAINS, TOLERANCE = 256, 1e-4
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="two points, three repetitions")
-    arguments.add_argument("--repeats", type=int, default=7, help="timed pairs of each point")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    arguments.add_argument("--memory-only", action="store_true", help=argparse.SUPPRESS)
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    if chosen.memory_only:
+def run(output: Output, repeats: int = 7, memory_only: bool = False) -> None:
+    """Compare at every point, print, and write JSON and PNG; or print the peak memory of 1000 replicas."""
+    if memory_only:
         print(peak_memory(1000))
         return
-
     compile_seconds = compilation()
     grid = [(alpha, nu) for alpha in RESTITUTIONS for nu in PACKING_FRACTIONS]
-    if chosen.quick:
+    if output.quick:
         grid, repeats = [(0.5, 0.56), (0.5, 0.7)], 3
-    else:
-        repeats = chosen.repeats
     print(f"compilation of sample: {compile_seconds:.1f} s")
     print("    dt      α     ν     jaxgran     rival   ratio    force ratio (both)")
     points = []
@@ -66,15 +50,10 @@ def main() -> None:
     means = {dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt]))) for dt in STRAINS}
     for dt, mean in means.items():
         print(f"dt = {dt:g}: geometric mean of jaxgran over rival {mean:.2f}")
-    memory = float(
-        subprocess.run([sys.executable, __file__, "--memory-only"], capture_output=True, text=True, check=True).stdout
-    )
+    memory = float(printed_by("step_cost", "--memory-only"))
     print(f"peak memory of 1000 replicas of {GRAINS} grains: {memory:.2f} GB")
 
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    stem = chosen.output / ("step_cost_quick" if chosen.quick else "step_cost")
     result = {
-        "hardware": hardware(),
         "grains": GRAINS,
         "tolerance": TOLERANCE,
         "repeats": repeats,
@@ -83,8 +62,8 @@ def main() -> None:
         "geometric_mean_ratio": {f"{dt:g}": mean for dt, mean in means.items()},
         "points": points,
     }
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(points, means).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("step_cost", result)
+    output.write_picture(draw(points, means), "step_cost")
 
 
 def compilation() -> float:
@@ -190,7 +169,3 @@ def draw(points: list[dict], means: dict[float, float]) -> Figure:
     figure.axes[0].set_ylabel("µs per replica and step")
     figure.axes[0].legend(loc="upper left", fontsize="small")
     return figure
-
-
-if __name__ == "__main__":
-    main()

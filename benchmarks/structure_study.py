@@ -5,28 +5,23 @@ and all that enters Enskog theory are measured from the same snapshots. A second
 long contacts and clusters last. Pairs at contact are extrapolated from two shells of gaps, the usual one and a quarter
 of it: where the results differ, the pair density has no value at contact.
 
-    python benchmarks/structure_study.py           # about 4 minutes on a core
-    python benchmarks/structure_study.py --quick   # two flows of 64 grains, about a minute
+    python -m benchmarks structure_study           # about 4 minutes on a core
+    python -m benchmarks structure_study --quick   # two flows of 64 grains, about a minute
 """
 
-import argparse
-import os
 import time
 from collections.abc import Iterator
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import numpy as np
-from hardware import hardware, json_with_rows
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.analysis import force_chains, velocity_correlations
 from jaxgran.analysis import order as order_module
 from jaxgran.analysis.series import Curve, Measured, ratio, series, with_errors
@@ -64,18 +59,9 @@ FULL = Plan((0.9, 0.5, 0.1), (0.6, 0.7, 0.8), 400, 1000, 0.01, 1e-4)
 QUICK = Plan((0.9, 0.1), (0.7,), 64, 500, 0.01, 1e-4)
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="two small flows")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    study(chosen.quick, chosen.output)
-
-
-def study(quick: bool, output: Path) -> None:
+def run(output: Output) -> None:
     """Run the plan, print a line for each flow, and write ``structure`` as JSON and two PNG."""
-    plan = QUICK if quick else FULL
+    plan = QUICK if output.quick else FULL
     start, flows = time.perf_counter(), []
     print("   ν    α  force ratio   clusters' P   rate/Enskog   χ/theory  speed²   ⟨cc⟩     a₂   lives (steps)")
     for nu, alpha in product(plan.packing_fraction, plan.restitution):
@@ -87,12 +73,10 @@ def study(quick: bool, output: Path) -> None:
             "{cluster_lifetime:8.2g}".format(nu, alpha, **show),
             flush=True,
         )
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / ("structure_quick" if quick else "structure")
-    head = {"hardware": hardware(), "plan": plan._asdict(), "shells": SHELLS, "seconds": time.perf_counter() - start}
-    stem.with_suffix(".json").write_text(json_with_rows(head, "flows", [as_row(flow) for flow in flows]))
-    draw_structure(plan, flows).savefig(stem.with_suffix(".png"), dpi=120)
-    draw_chaos(plan, flows).savefig(stem.with_name(stem.name + "_chaos.png"), dpi=120)
+    head = {"plan": plan._asdict(), "shells": SHELLS, "seconds": time.perf_counter() - start}
+    output.write_rows("structure", head, "flows", [as_row(flow) for flow in flows])
+    output.write_picture(draw_structure(plan, flows), "structure", dpi=120)
+    output.write_picture(draw_chaos(plan, flows), "structure", "_chaos.png", dpi=120)
 
 
 def measured(plan: Plan, nu: float, alpha: float) -> dict:
@@ -307,7 +291,3 @@ def points(axes: Axes, at, value, error, style: tuple[str, str, str], label: str
         capsize=1.5,
         label=label,
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -3,19 +3,15 @@
 Maps α from 0.8 to 0.95 and ν from 0.1 to 0.6 until force ratio and stresses have a relative standard error of 1 %, and
 prints what each theory predicts over what is measured.
 
-    python benchmarks/theory_check.py           # about 10 minutes on two cores
-    python benchmarks/theory_check.py --quick   # four points to 5 %, about a minute
+    python -m benchmarks theory_check           # about 10 minutes on two cores
+    python -m benchmarks theory_check --quick   # four points to 5 %, about a minute
 """
 
-import argparse
-from pathlib import Path
-
-import jax
-from hardware import hardware, json_with_rows
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.maps.sweep import usable_cores
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 
@@ -24,20 +20,16 @@ NAMES = ("pressure", "shear_stress", "granular_temperature", "collision_rate")
 BAND = 5.0  # percent, drawn for the eye
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="four points, larger errors")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def run(output: Output) -> None:
+    """Map, print what each theory predicts over what is measured, and write JSON and PNG."""
     data = jg.ratio_map(
-        [0.8, 0.9] if chosen.quick else [0.8, 0.9, 0.95],
-        [0.2, 0.6] if chosen.quick else [0.1, 0.2, 0.4, 0.6],
-        grains=128 if chosen.quick else 400,
+        [0.8, 0.9] if output.quick else [0.8, 0.9, 0.95],
+        [0.2, 0.6] if output.quick else [0.1, 0.2, 0.4, 0.6],
+        grains=128 if output.quick else 400,
         seeds=2,
         timestep="auto",
         strain=8.0,
-        error=0.05 if chosen.quick else 0.01,
+        error=0.05 if output.quick else 0.01,
         workers=usable_cores(),
     )
     rows = [
@@ -53,11 +45,8 @@ def main() -> None:
         print(f"{one['nu']:5.2f}{one['alpha']:6.2f}  {one['observable']:22s}{measured}{theories}")
     worst = max(abs(one["moments"] - 1) for one in rows if one["observable"] == "pressure")
     print(f"largest error of the moments in pressure: {100 * worst:.1f} %")
-    stem = chosen.output / ("theory_check_quick" if chosen.quick else "theory_check")
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    head = {"hardware": hardware(), "run": {k: str(v) for k, v in data.attrs.items()}}
-    stem.with_suffix(".json").write_text(json_with_rows(head, "rows", rows))
-    draw(rows).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_rows("theory_check", {"run": {k: str(v) for k, v in data.attrs.items()}}, "rows", rows)
+    output.write_picture(draw(rows), "theory_check")
 
 
 def row(data, nu: float, alpha: float, name: str) -> dict:
@@ -98,7 +87,3 @@ def draw(rows: list[dict]) -> Figure:
         *figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(alphas), fontsize="small"
     )
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -4,19 +4,17 @@
 replicas of a batch are different instants of different packings of one flow. On one core of a CPU.
 """
 
-import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-from hardware import hardware
 from jax import lax
 from matplotlib.figure import Figure
-from networks import TIMESTEP, further, sheared
 
 import jaxgran as jg
+from benchmarks.networks import TIMESTEP, further, sheared
+from benchmarks.output import Output
 from jaxgran.model.control_flow import AXIS
 
 FLOWS = ((0.5, 0.7), (0.5, 0.8))  # restitution, packing fraction
@@ -25,9 +23,9 @@ _SEEDS, _EQUILIBRATION, _APART = 4, 2.0, 0.05  # packings; strains before the fi
 _STEPS, _SHORTEST_TIMING = 200, 0.3  # of one call, which builds its lists anew; seconds of all calls together
 
 
-def chart(quick: bool, output: Path) -> None:
+def chart(output: Output) -> None:
     """Measure, print, and write ``throughput.json`` and ``throughput.png``."""
-    grains, sizes = (64, QUICK_SIZES) if quick else (256, SIZES)
+    grains, sizes = (64, QUICK_SIZES) if output.quick else (256, SIZES)
     batches = {flow: states(*flow, grains, max(sizes)) for flow in FLOWS}
     points = []
     print("way      replicas  compile (s)   α    ν   replica-steps per second")
@@ -41,11 +39,8 @@ def chart(quick: bool, output: Path) -> None:
                     ),
                     flush=True,
                 )
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / ("throughput_quick" if quick else "throughput")
-    result = {"hardware": hardware(), "grains": grains, "timestep": TIMESTEP, "points": points}
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(points).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("throughput", {"grains": grains, "timestep": TIMESTEP, "points": points})
+    output.write_picture(draw(points), "throughput")
 
 
 def _mapped(flow: jg.ShearFlow, states: jg.State, steps: jax.Array) -> jg.State:

@@ -9,34 +9,27 @@ of both, by L + A dt^β with one limit L and an amplitude and an exponent for ea
 exceeds its minimum by no more than its value per degree of freedom (at least one), joined over fits that take in one
 time step less and one more.
 
-    python benchmarks/timestep_study.py           # about 15 minutes on two cores
-    python benchmarks/timestep_study.py --quick   # two flows down to 1e-4, under a minute
+    python -m benchmarks timestep_study           # about 15 minutes on two cores
+    python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
 """
 
-import argparse
-import json
 import multiprocessing
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple
-
-if __name__ == "__main__":
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.optimize import minimize_scalar
 
 import jaxgran as jg
-from jaxgran.maps.sweep import usable_cores
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
 from jaxgran.sampling.sample import estimates
 
 RULES = ("midpoint", "touching")
@@ -68,18 +61,9 @@ FULL = Plan((0.9, 0.5, 0.1), (0.6, 0.8), 256, 3, 4.0, half_decades(-2, -6))
 QUICK = Plan((0.5, 0.1), (0.6,), 64, 3, 1.0, half_decades(-2, -4))
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="two flows, fewer time steps")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    study(chosen.quick, chosen.output)
-
-
-def study(quick: bool, output: Path) -> None:
+def run(output: Output) -> None:
     """Run the plan on all cores, print the extrapolations, and write ``timestep_study`` as JSON and PNG."""
-    plan = QUICK if quick else FULL
+    plan = QUICK if output.quick else FULL
     flows = list(product(plan.packing_fraction, plan.restitution))
     tasks = [(*flow, rule, seed) for flow in flows for rule in RULES for seed in range(plan.seeds)]
     dear_first = sorted(tasks, key=lambda task: (-task[0], task[1]))
@@ -93,16 +77,13 @@ def study(quick: bool, output: Path) -> None:
         limit = "dt → 0: {best:.4g}, between {low:.4g} and {high:.4g}".format(**results[-1]["limit"])
         exponents = ", ".join(f"{rule} {power:.2f}" for rule, power in results[-1]["exponents"].items())
         print(f"ν {nu:g}, α {alpha:g}: {limit}; exponents: {exponents}")
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / ("timestep_study_quick" if quick else "timestep_study")
-    head = {"hardware": hardware(), "plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    stem.with_suffix(".json").write_text(json.dumps({**head, "flows": results}, indent=1) + "\n")
-    draw(results).savefig(stem.with_suffix(".png"), dpi=150)
+    head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
+    output.write_json("timestep_study", {**head, "flows": results})
+    output.write_picture(draw(results), "timestep_study")
 
 
 def samples(plan: Plan, task: tuple[float, float, str, int]) -> dict[float, jg.Sample]:
     """One seed of one flow under one rule: a sample of every time step."""
-    jax.config.update("jax_enable_x64", True)
     nu, alpha, rule, seed = task
 
     def flow(timestep: float) -> jg.ShearFlow:
@@ -240,7 +221,3 @@ def draw_limit(axes: Axes, limit: dict, place: float, style: dict) -> None:
         axes.plot(place, LEAST, "v", color=style["color"], markersize=6)
     if best > LEAST:
         axes.plot(place, best, **{**style, "markersize": 6})
-
-
-if __name__ == "__main__":
-    main()

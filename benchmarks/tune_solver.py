@@ -12,23 +12,23 @@ counts down to 1e-8. A restart has no derivative: training has none, the evaluat
 Half of each group of ``networks.collection`` is for training: the earlier half of a flow, half of the seeds, every
 other size of chains and clusters. The rest is held out; size and mass ratio groups change only their velocities there.
 Networks without a solution are left out. The verdict is about the tuned method that is best on the training networks.
-The whole takes about 2 minutes on one core, ``--quick`` under one.
+
+    python -m benchmarks tune_solver            # about 2 minutes on one core
+    python -m benchmarks tune_solver --quick    # smaller collection, one K, few optimiser steps; under a minute
 """
 
-import argparse
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from hardware import hardware, json_with_rows
 from matplotlib.figure import Figure
-from networks import GRAINS, INFEASIBLE, Network, collection
 
+from benchmarks.networks import GRAINS, INFEASIBLE, Network, collection
+from benchmarks.output import Output
 from jaxgran.contact.delassus import delassus_product, diagonal, spectral_bound
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import METHODS, Method
@@ -42,14 +42,10 @@ _ALIKE = {"chains": 1, "hexagonal cluster": 2}  # so many neighbours in these gr
 _LOOKS, _LINES = {"momentum": ("black", "o"), "relaxation": ("tab:red", "s")}, {40: "-", 120: "--", 400: ":"}
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="smaller collection, one K, few optimiser steps")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    cap, steps, depths = (2000, 40, (40,)) if chosen.quick else (5000, 300, (40, 120, 400))
-    groups = {group: members for group, members in collection(chosen.quick).items() if group != INFEASIBLE}
+def run(output: Output) -> None:
+    """Tune, compare on held-out networks, print the verdict, and write JSON and PNG."""
+    cap, steps, depths = (2000, 40, (40,)) if output.quick else (5000, 300, (40, 120, 400))
+    groups = {group: members for group, members in collection(output.quick).items() if group != INFEASIBLE}
     places = [(group, k) for group, members in groups.items() for k in range(len(members))]
     networks, names = [groups[group][k] for group, k in places], np.array([group for group, _ in places])
     out = [k // _ALIKE[g] % 2 == 1 if g in _ALIKE else k >= len(groups[g]) // 2 for g, k in places]
@@ -62,17 +58,15 @@ def main() -> None:
         spreads[name] = np.stack([*np.percentile(costs, (50, 90), 0, method="higher"), np.isfinite(costs).mean(0)])
         print(f"{name:40s}", *(f"{np.array2string(x, precision=3):>16s}" for x in spreads[name]))
     print(sentence := verdict(products, names, np.array(out), cap))
-    head = {"hardware": hardware() | {"optax": optax.__version__}, "cap": cap, "tolerances": TOLERANCES}
+    head = {"hardware": output.hardware | {"optax": optax.__version__}, "cap": cap, "tolerances": TOLERANCES}
     head |= {"verdict": sentence, "tunings": tunings, "trained on": len(train), "held out": sum(out)}
     # JSON has no infinity.
     costs, shown = jax.tree.map(lambda x: np.where(np.isfinite(x), x, None).tolist(), (products, spreads))
     head["held-out median, 90th percentile, share converged"] = shown
     solves = [{name: costs[name][place] for name in products} for place in range(len(networks))]
     rows = [{"group": str(g), "held out": o} | each for g, o, each in zip(names, out, solves, strict=True)]
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    stem = chosen.output / ("tune_solver_quick" if chosen.quick else "tune_solver")
-    stem.with_suffix(".json").write_text(json_with_rows(head, "products", rows))
-    draw(tunings, spreads).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_rows("tune_solver", head, "products", rows)
+    output.write_picture(draw(tunings, spreads), "tune_solver")
 
 
 def merged(networks: list[Network]) -> tuple[Contacts, np.ndarray]:
@@ -195,7 +189,3 @@ def draw(tunings: list[dict[str, Any]], spreads: dict[str, np.ndarray]) -> Figur
     right.grid(alpha=0.3, axis="x")
     right.legend(fontsize="small", loc="lower left")
     return figure
-
-
-if __name__ == "__main__":
-    main()

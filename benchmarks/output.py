@@ -1,0 +1,86 @@
+"""Where a benchmark writes: JSON with what it was measured with, pictures beside it, and a tree without changes."""
+
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from benchmarks.process import ROOT
+from jaxgran import environment
+
+RESULTS = ROOT / "benchmarks" / "results"
+PACKAGES = ("jaxgran", "jax", "jaxlib", "numpy", "numba")
+
+
+def uncommitted() -> list[str]:
+    """Files of the checkout that differ from its commit, other than results; none where this is no checkout."""
+    if not (ROOT / ".git").exists():
+        return []
+    command = ["git", "status", "--porcelain", "--", ".", ":(exclude)benchmarks/results"]
+    lines = subprocess.run(command, capture_output=True, text=True, cwd=ROOT).stdout.splitlines()
+    return [line[3:] for line in lines]
+
+
+def refusal() -> str | None:
+    """Why a full run would write results that no commit stands for, and what to do; None where it would not."""
+    changed = uncommitted()
+    if not changed:
+        return None
+    others = f" and {len(changed) - 1} more" if changed[1:] else ""
+    return (
+        f"the tree has uncommitted changes ({changed[0]}{others}): commit them, or add --quick or --allow-uncommitted."
+    )
+
+
+def hardware() -> dict[str, str | int]:
+    """Processor, system, versions and commit, for the head of a JSON file of results."""
+    commit = environment.commit().removesuffix("-dirty")
+    return {
+        "processor": environment.processor(),
+        "cores": os.cpu_count() or 0,
+        "system": environment.system(),
+        "python": platform.python_version(),
+        **environment.versions(PACKAGES),
+        "commit": f"{commit}-dirty" if uncommitted() else commit,
+    }
+
+
+@dataclass(frozen=True)
+class Output:
+    """The folder of the results of one run, and what they are measured with, as it was when the run began.
+
+    The names of the files of a quick run contain ``_quick``, so that they are never taken for results.
+    """
+
+    folder: Path
+    quick: bool
+    hardware: dict[str, str | int] = field(default_factory=hardware)
+
+    def path(self, name: str, ending: str) -> Path:
+        """The file of a name and an ending, such as ``stability`` and ``_variants.png``; its folder exists."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self.folder / f"{name}{'_quick' if self.quick else ''}{ending}"
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a result below the hardware, to which the content may add."""
+        text = json.dumps({"hardware": self.hardware, **content}, indent=1)
+        self.path(name, ".json").write_text(text + "\n")
+
+    def write_rows(self, name: str, head: Mapping[str, Any], key: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write a result with many rows, one to a line; what is not a number is null."""
+        start = json.dumps({"hardware": self.hardware, **head}, indent=1, ensure_ascii=False)
+        lines = ",\n".join(
+            "  " + json.dumps({k: None if v != v else v for k, v in row.items()}, ensure_ascii=False, allow_nan=False)
+            for row in rows
+        )
+        self.path(name, ".json").write_text(start[:-2] + f',\n "{key}": [\n{lines}\n ]\n}}\n')
+
+    def write_picture(self, figure: Figure, name: str, ending: str = ".png", dpi: int = 150) -> None:
+        """Write a figure as PNG."""
+        figure.savefig(self.path(name, ending), dpi=dpi)

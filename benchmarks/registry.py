@@ -1,0 +1,200 @@
+"""All benchmarks: what each asks, how long it takes, what it writes, and its own options. Imports nothing heavy."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of one benchmark, given to its ``run`` under the same name; without it the default there holds.
+
+    A name without dashes is a file, which may be left out. The kind ``bool`` is a flag.
+    """
+
+    name: str
+    help: str
+    kind: type = str
+    choices: tuple[str | int, ...] | None = None
+    hidden: bool = False
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark: its module has a function ``run`` that takes an ``Output`` and the options.
+
+    ``minutes`` are those of a full and of a quick run on two cores of a desktop processor. ``files`` are the committed
+    results in ``benchmarks/results``. ``one_core`` says that JAX is held to one core.
+    """
+
+    name: str
+    question: str
+    minutes: tuple[float, float]
+    files: tuple[str, ...] = ()
+    options: tuple[Option, ...] = ()
+    one_core: bool = False
+    module: str = ""
+
+    @property
+    def module_name(self) -> str:
+        return f"benchmarks.{self.module or self.name}"
+
+
+BENCHMARKS = (
+    Benchmark(
+        "validation",
+        "Are stresses, temperature and force ratio those of independent programs?",
+        (2, 1),
+        ("validation.json", "validation.png"),
+    ),
+    Benchmark(
+        "theory_check",
+        "Does kinetic theory hold where it should, in nearly elastic flows that are not dense?",
+        (10, 1),
+        ("theory_check.json", "theory_check.png"),
+    ),
+    Benchmark(
+        "paper",
+        "Where in the plane of restitution and packing fraction are binary collisions all there is?",
+        (9, 0.3),
+        ("paper.nc", "paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_clusters.png"),
+    ),
+    Benchmark(
+        "quick_map",
+        "What does `jaxgran map` draw when it is given no option?",
+        (0.5, 0.3),
+        ("quick_curves.png",),
+    ),
+    Benchmark(
+        "dense_rheology",
+        "Do dense flows obey one friction law of the inertial number?",
+        (3, 0.5),
+        ("dense_rheology.png",),
+    ),
+    Benchmark(
+        "structure_study",
+        "What do the forces look like, and which assumption of kinetic theory fails where?",
+        (6, 1),
+        ("structure.json", "structure.png", "structure_chaos.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "closure_study",
+        "How well does a closure fitted to a map predict points that it has not seen?",
+        (2, 1),
+        ("closure.json", "closure.png"),
+        (Option("dataset", "that of a map, as NetCDF; without it, one is made", Path),),
+    ),
+    Benchmark(
+        "flow_picture",
+        "What do the forces between grains look like at restitutions 0.9 and 0.1?",
+        (2, 1),
+        ("flow.json", "flow.png"),
+        (Option("--colour", "what colours the grains", choices=("speed", "pressure")),),
+    ),
+    Benchmark(
+        "fields_picture",
+        "What do the coarse-grained fields of a dense flow look like, and how long do they take?",
+        (1.5, 0.5),
+        ("fields.json", "fields.png"),
+        (Option("--repeats", "timed evaluations of each function", int),),
+        one_core=True,
+    ),
+    Benchmark(
+        "free_cooling",
+        "How long does a gas without shear follow Haff's law?",
+        (2, 1),
+        ("free_cooling.json", "free_cooling.png"),
+    ),
+    Benchmark(
+        "step_cost",
+        "How long does a step of a replica take, beside a numba loop made for one purpose?",
+        (1, 0.5),
+        ("step_cost.json", "step_cost.png"),
+        (
+            Option("--repeats", "timed pairs of each point", int),
+            Option("--memory-only", "print the peak memory of 1000 replicas", bool, hidden=True),
+        ),
+        one_core=True,
+    ),
+    Benchmark(
+        "rival_numba",
+        "What does the numba loop alone measure, and how long does its step take?",
+        (5, 1),
+        module="rival_table",
+        one_core=True,
+    ),
+    Benchmark(
+        "peers",
+        "How long do other programs take for stresses within 3 % of those of rigid grains?",
+        (18, 3),
+        ("peers.json", "peers.png"),
+        (Option("--flow", "one flow alone, in the place of that of an earlier result", int, (1, 2, 3)),),
+        one_core=True,
+        module="peers.compare",
+    ),
+    Benchmark(
+        "scaling",
+        "How do time and memory grow with grains, replicas, contacts and the time step?",
+        (6, 1.5),
+        ("scaling.json", "scaling.png"),
+        (Option("--grains", "one flow of so many grains, printed as JSON", int),),
+    ),
+    Benchmark(
+        "device_batch",
+        "How many replica-steps per second does this device make, beside one core of the numba loop?",
+        (3, 1),
+        options=(Option("--paper", "the map of the paper, too", bool),),
+    ),
+    Benchmark(
+        "speed_vs_accuracy",
+        "What does accuracy cost in a contact solve, in a whole run, in a batch?",
+        (40, 2),
+        (
+            "methods.json",
+            "methods.png",
+            "methods_constructed.png",
+            "methods_float32.png",
+            "methods_profile.png",
+            "runs.json",
+            "runs.png",
+            "throughput.json",
+            "throughput.png",
+        ),
+        (Option("--only", "one chart instead of all", choices=("methods", "runs", "throughput")),),
+        one_core=True,
+    ),
+    Benchmark(
+        "timestep_study",
+        "What becomes of the force ratio as the time step vanishes?",
+        (25, 1),
+        ("timestep_study.json", "timestep_study.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "stability",
+        "What fails first as the time step grows and the packing becomes dense?",
+        (12, 0.5),
+        ("stability.json", "stability.png", "stability_variants.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "tune_solver",
+        "Does a method tuned by gradient need fewer products than the default?",
+        (2, 1),
+        ("tune_solver.json", "tune_solver.png"),
+    ),
+    Benchmark(
+        "gradients",
+        "What do derivatives of a flow cost, and how fast do they grow with strain?",
+        (5, 1),
+        ("gradients.json", "gradients.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "load",
+        "What do many points cost besides their flows, and does memory stay flat?",
+        (4, 0.5),
+        ("load.json", "soak.png"),
+        (Option("--soak", "sweeps for so many minutes instead, and soak.png", float),),
+    ),
+)
