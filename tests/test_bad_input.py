@@ -341,9 +341,19 @@ def ends(*_) -> Iterator:
 
 RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6")
 MAP_OPTIONS = ["restitution", "packing-fraction", "grains", "seeds", "timestep", "equilibrate", "strain", "error"]
-MAP_OPTIONS += ["tolerance", "target-error", "solver", "activation", "batch", "workers", "scheduler", "preset"]
+MAP_OPTIONS += [
+    "tolerance",
+    "target-error",
+    "solver",
+    "activation",
+    "engine",
+    "batch",
+    "workers",
+    "scheduler",
+    "preset",
+]
 MAP_OPTIONS += ["output", "like"]
-RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "output"]
+RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "engine", "output"]
 RUN_OPTIONS += ["trajectory", "trajectory=x.gsd --every"]
 ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]
 ENORMOUS += ["a" * 5000, "a" * 5000 + ".nc", "n" * 250 + ".nc", "\udcff.nc", "../..", "/", ".nc", "..nc", "~/x", "x.NC"]
@@ -531,7 +541,11 @@ ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until 
         *[("seeds", value) for value in (0, "two", 10**9)],
         *[("timestep", value) for value in ("short", [1e-3, 1e-4], 0.0, 1e-300)],
         *[("strain", value) for value in ("long", 1e30, [1.0, 2.0])],
-        *[(name, value) for name in ("solver", "activation") for value in (3, "other", ["midpoint", "touching"])],
+        *[
+            (name, value)
+            for name in ("solver", "activation", "engine")
+            for value in (3, "other", ["midpoint", "touching"])
+        ],
         *[("tolerance", value) for value in (2.0, "auto ", [1e-3, 1e-4])],
         *[("equilibrate", value) for value in ("soon", -1.0, 1e30)],
         ("error", 7.0),

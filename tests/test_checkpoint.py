@@ -69,7 +69,9 @@ def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
-@pytest.mark.parametrize("change", [{"tolerance": 1e-3}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}])
+@pytest.mark.parametrize(
+    "change", [{"tolerance": 1e-3}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}, {"engine": "jax"}]
+)
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
     with pytest.raises(InputError, match=f"has {next(iter(change))} ") as refused:

@@ -41,7 +41,8 @@ SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
-SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "solver", "activation", "precision")
+SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
+SAME += ("solver", "engine", "solver_asked", "engine_asked")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
 MOVIE = ["--movie", "flow.gif", "--every", "0.02"]
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
@@ -175,6 +176,10 @@ MISTAKES = {
     "map --timestep auto --target-error 1": "--target-error must be between 1e-4 and 0.1",
     "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
+    "map --engine numba": "--engine must be one of 'auto', 'machine_code', 'jax', 'thread_block', not 'numba'",
+    "map --engine thread_block": "--engine must be auto or jax on a CPU, not thread_block",
+    "map --engine machine_code --solver jacobi": "--engine must be auto or jax with the solver jacobi",
+    "run --restitution 0.5 --packing-fraction 0.6 --engine thread_block": "--engine must be auto or jax on a CPU",
     "map --activation always": "'midpoint', 'touching'",
     "map --preset slow": "'quick', 'paper'",
     "map --batch 0": "batch must be auto or a whole number of at least 1",
@@ -385,6 +390,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     folder, outcome = small_run
     data = read_dataset(folder / "flow.nc")
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
+    assert outcome.out.split("\n")[0].startswith(f"Engine machine_code, solver {data.attrs['solver']}")
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
     data = data.isel(restitution=0, packing_fraction=0)
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
@@ -414,6 +420,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
     assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
     assert lines["precision"] == "float64"
+    assert lines["engine"] == "auto takes machine_code" and lines["solver"].startswith("gauss-seidel")
     assert lines["jaxgran"].startswith(version("jaxgran"))
     assert float(lines["memory"].removesuffix(" GiB")) > 0.1
     assert str(usable_cores()) in lines["cores"]
@@ -431,6 +438,7 @@ def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_n
     outcome = jaxgran(tmp_path, "info")
     assert outcome.status == 0
     assert "none: Unable to initialize backend 'cuda': no driver.\n" in outcome.out
+    assert re.search(r"^engine +none$", outcome.out, re.MULTILINE)
     assert "JAX_PLATFORMS=cpu,made-up" in outcome.out
     checkout = (Path(app.__file__).resolve().parents[2] / ".git").exists()
     assert (", commit " in outcome.out.splitlines()[0]) == checkout

@@ -170,8 +170,9 @@ def test_missing_seed_does_not_hide_a_bad_status(settings, results) -> None:
 
 def test_attributes_tell_every_parameter_of_the_run(settings, data) -> None:
     attributes = data.attrs
-    for name in ("grains", "seeds", "timestep", "strain", "tolerance", "solver", "activation"):
+    for name in ("grains", "seeds", "timestep", "strain", "tolerance", "activation"):
         assert attributes[name] == getattr(settings, name)
+    assert (attributes["engine_asked"], attributes["solver_asked"]) == (settings.engine, settings.solver)
     assert (attributes["restitution"], attributes["packing_fraction"]) == (list(ALPHAS), list(NUS))
     assert attributes["equilibrate"] == "until steady"
     assert attributes["timestep_unit"] == "1 / shear rate"

@@ -37,6 +37,7 @@ RANGES = {
     "relaxation": "between 0 and 2, both excluded",
     "activation": "midpoint or touching",
     "solver": "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal",
+    "engine": "auto, machine_code, jax or thread_block",
 }
 
 
@@ -61,6 +62,7 @@ def refusal(**change) -> str:
         *[(name, value) for name in NUMBERS for value in (np.nan, "0.05", True, 0.05j, [0.05, 0.1])],
         *[("activation", value) for value in ("Midpoint", "", 1, None)],
         *[("solver", value) for value in ("gauss-seidel", "", 0, None)],
+        *[("engine", value) for value in ("numba", "", 0, None, ["jax"])],
     ],
 )
 def test_bad_value_is_refused_in_one_sentence_with_the_range(name, value):
@@ -112,7 +114,7 @@ def test_flow_is_a_pytree_of_its_numbers():
     leaves, structure = jax.tree.flatten(FLOW)
     assert leaves == [getattr(FLOW, name) for name in NUMBERS]
     assert jax.tree.unflatten(structure, leaves) == FLOW
-    for change in ({"grains": 65}, {"activation": "touching"}, {"solver": "jacobi"}):
+    for change in ({"grains": 65}, {"activation": "touching"}, {"solver": "jacobi"}, {"engine": "jax"}):
         assert jax.tree.structure(replace(FLOW, **change)) != structure
 
 

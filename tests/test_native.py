@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from numba import njit
 
 from jaxgran.dynamics import advance as advance_module
+from jaxgran.dynamics import engine as engine_module
 from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
 from jaxgran.dynamics.machine_code import cluster_solver, layout, loop
 from jaxgran.dynamics.machine_code.near_pairs import find_near_pairs
 from jaxgran.dynamics.tally import empty_tally
@@ -231,22 +233,10 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     np.testing.assert_allclose(ours[1].impulse, plain[1].impulse, rtol=1e-5)
 
 
-def test_it_serves_where_it_can_and_the_plain_advance_elsewhere(flowing) -> None:
-    flow, state = of(0.6), flowing(0.6)
-    assert advance_module.engine(flow, state) is advance_module.machine_code
-    assert advance_module.engine(replace(flow, solver="nesterov"), state) is None
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), state)
-    assert advance_module.engine(flow, single) is None
-    batched = jax.tree.map(lambda x: x[None], state)
-    found = []
-    jax.vmap(lambda one: found.append(advance_module.engine(flow, one)), axis_name=AXIS)(batched)
-    assert found == [None]
-
-
 @pytest.fixture
 def gpu(monkeypatch):
     """Processors that pass for GPUs, with a kernel that is interpreted."""
-    advance_module._kernel_runs.cache_clear()
+    _forget()
 
     class Device:
         platform = "gpu"
@@ -256,14 +246,25 @@ def gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
     monkeypatch.setattr(kernel, "advance", partial(kernel.advance, interpret=True))
     yield monkeypatch
-    advance_module._kernel_runs.cache_clear()
+    _forget()
+
+
+def _forget() -> None:
+    """What is known of the kernel on a device, and the warning that it does not run."""
+    for kept in (engine_module._kernel_problem, engine_module._warn_once):
+        kept.cache_clear()
 
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
     flow, state = of(0.6, tolerance=1e-4), flowing(0.6)
-    assert advance_module.engine(flow, state) is advance_module.thread_block
-    assert advance_module.engine(replace(flow, solver="nesterov"), state) is None
-    assert advance_module.engine(replace(flow, grains=advance_module.MOST_GRAINS + 1), state) is None
+    assert select_engine(flow, state) == select_engine(replace(flow, engine="thread_block"), state) == "thread_block"
+    refused = {"the solver nesterov": {"solver": "nesterov"}, "more than 1024 grains": {"grains": MOST_GRAINS + 1}}
+    for words, change in refused.items():
+        assert select_engine(replace(flow, **change), state) == "jax"
+        with pytest.raises(InputError, match=f"engine must be auto or jax with {words}, not thread_block: "):
+            select_engine(replace(flow, engine="thread_block", **change), state)
+    with pytest.raises(InputError, match="engine must be auto or jax on a GPU, not machine_code: it is made for proc"):
+        select_engine(replace(flow, engine="machine_code"), state)
 
 
 def unsolved(thread, contacts, most, width, target):
@@ -285,8 +286,10 @@ def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, p
     gpu.setattr(place, "advance" if place is kernel else "_descend", failure)
     flow, state = replace(of(0.6), grains=40 if place is solver else GRAINS), flowing(0.6)  # traced for no other
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
-        assert advance_module.engine(flow, state) is None
-    assert advance_module.engine(flow, state) is None  # and says so once
+        assert select_engine(flow, state) == "jax"
+    assert select_engine(flow, state) == "jax"  # and says so once
+    with pytest.raises(InputError, match=f"engine must be auto or jax here, not thread_block: .*{said}"):
+        select_engine(replace(flow, engine="thread_block"), state)
 
 
 @pytest.mark.parametrize(("count", "dtype"), [(16, jnp.float64), (300, jnp.float32), (1024, jnp.float64)])

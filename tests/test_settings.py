@@ -1,5 +1,6 @@
 """Every mistake in the parameters of a map is one sentence that names the accepted range, before anything runs."""
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -59,6 +60,9 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
     ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
     ({"activation": "always"}, "midpoint or touching"),
+    ({"engine": "numba"}, "auto, machine_code, jax or thread_block"),
+    ({"engine": "thread_block"}, "auto or jax on a CPU, not thread_block: it is made for NVIDIA GPUs"),
+    ({"engine": "machine_code", "solver": "jacobi"}, "auto or jax with the solver jacobi, not machine_code"),
 ]
 
 
@@ -76,11 +80,12 @@ def test_lists_may_fall_as_well_as_rise() -> None:
 
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
-    settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6), "activation": "touching"})
+    settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6)})
+    settings = replace(settings, activation="touching", engine="jax")
     points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
-        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
+        assert (flow.grains, flow.timestep, flow.activation, flow.engine) == (64, 1e-3, "touching", "jax")
 
 
 def test_numbers_of_numpy_are_accepted() -> None:

@@ -24,6 +24,7 @@ def info_command() -> None:
         "cores": f"{os.cpu_count()}, of which this process may use {environment.usable_cores()}",
         "memory": environment.memory(),
         "devices": _devices(),
+        **_engine(),
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
         "settings": ", ".join(f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)) or "none",
@@ -43,3 +44,15 @@ def _devices() -> str:
         return ", ".join(environment.devices())
     except RuntimeError as failure:  # a driver that does not answer is what the report is about
         return f"none: {' '.join(str(failure).split())}"
+
+
+def _engine() -> dict[str, str]:
+    from jaxgran.dynamics.engine import select_engine, solver_in_use
+    from jaxgran.model.flow import ShearFlow
+
+    flow = ShearFlow(grains=256, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+    try:
+        engine = select_engine(flow)
+    except RuntimeError:  # there is no device
+        return {"engine": "none", "solver": "none"}
+    return {"engine": f"auto takes {engine}", "solver": solver_in_use(engine, flow.solver)}

@@ -13,7 +13,7 @@ from jaxgran.cli.measure import by_timestep, finish, measured
 from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.flow import Activation, Solver
+from jaxgran.model.flow import Activation, Engine, Solver
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
@@ -49,8 +49,10 @@ def map_command(
         float, typer.Option(help="Relative error of the stresses that auto aims at, 1e-4 to 0.1.")
     ] = 0.02,
     solver: Annotated[
-        Solver | None, typer.Option(help="Iteration of the contact solve. [default: barzilai-borwein]")
+        Solver | None,
+        typer.Option(help="Iteration of the contact solve in the engine jax. [default: barzilai-borwein]"),
     ] = None,
+    engine: Annotated[Engine | None, typer.Option(help="What advances the flows. [default: auto, the fastest]")] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
@@ -79,6 +81,7 @@ def map_command(
         "tolerance": numbers_or_auto(tolerance, "tolerance"),
         "solver": solver,
         "activation": activation,
+        "engine": engine,
     }
     chosen = (PRESETS[preset] if like is None else _like(like)) | {
         name: value for name, value in given.items() if value is not None
@@ -112,11 +115,9 @@ def _like(file: Path) -> dict[str, Any]:
     """The choices of the map in a file; what else could change its numbers is said on standard error."""
     configured_jax()
     from jaxgran.maps.results import choices_of, differences, read_dataset
-    from jaxgran.maps.settings import MapSettings
 
     data = read_dataset(file)
-    chosen = choices_of(data)
-    others = differences(data, MapSettings(**chosen))
+    chosen, others = choices_of(data), differences(data)
     if others:
         say(f"not as in {file}: {'; '.join(others)}.")
     return chosen

@@ -14,6 +14,7 @@ from jaxgran.cli.measure import finish, measured
 from jaxgran.cli.progress import counted
 from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
 from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.flow import Engine
 
 MOST_RECORDED = 100_000  # of a trajectory
 
@@ -32,6 +33,7 @@ def run_command(
     strain: Annotated[float | None, typer.Option(help="Sampled strain. [default: 5]")] = None,
     error: RelativeError = None,
     timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
+    engine: Annotated[Engine, typer.Option(help="What advances the flow; auto is the fastest.")] = "auto",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
     every: Annotated[
         float | None,
@@ -56,6 +58,7 @@ def run_command(
         "timestep": step,
         "strain": 5.0 if first is None else first,
         "error": error,
+        "engine": engine,
     }
     recorder, frames = _recorder(trajectory, movie, every, chosen["strain"])
     record = None if recorder is None else recorder.recording
@@ -109,7 +112,8 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 def _summary_table(data) -> Table:
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
-    table = Table(box=box.SIMPLE)
+    title = f"Engine {data.attrs['engine']}, solver {data.attrs['solver']}"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left")
     for name in ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory"):
         table.add_column(name)
     point = data.isel(packing_fraction=0, restitution=0)

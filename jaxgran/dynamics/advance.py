@@ -1,23 +1,11 @@
-"""The advance in use: the fastest that there is for a flow here and now.
+"""The public advance of one replica, by the engine that ``engine`` selects.
 
-==================  ==========================================================================================
-on                  what advances a replica
-==================  ==========================================================================================
-a processor         machine code (``event_loop``), in double precision, unless a batch has a named axis
-an NVIDIA GPU       a thread block (``thread_block``), up to 1024 grains, in single or double precision
-anything else       the plain ``dynamics.advance``; so too derivatives, and every method of the contact solve but the
-                    default
-==================  ==========================================================================================
-
-All three solve the same steps to the same tolerance. XLA calls the machine code through its foreign function interface,
-and the thread block as a kernel of Pallas, so ``jit``, ``lax.map`` and ``vmap`` apply to them as to everything else.
+XLA calls the machine code through its foreign function interface, and the thread block as a kernel of Pallas, so
+``jit``, ``lax.map`` and ``vmap`` apply to them as to everything else.
 """
 
-import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, partial
-from typing import Any
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,16 +13,14 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics.engine import select_engine
 from jaxgran.dynamics.plain import ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, Tally, sums_from_row
 from jaxgran.model.cell import wrap
-from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
-MOST_GRAINS = 1024  # of a thread block: the threads that it can have
-_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
-Engine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
+_Compiled = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
 
 
 def advance(
@@ -47,9 +33,10 @@ def advance(
 ) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
 
-    On a processor or an NVIDIA GPU, with the default solver and no more arguments than these three, this is a loop of
-    compiled code that solves the same steps to the same tolerance as the plain advance, see ``native``; on a processor
-    it is typically 5 to 7 times faster. Nothing but rounding and what the tolerance leaves open tells them apart.
+    The ``engine`` of the flow says what runs. With "auto" it is the fastest that can: on a processor or an NVIDIA GPU,
+    with the default solver and no more arguments than these three, a loop of compiled code that solves the same steps
+    to the same tolerance as the engine jax. On a processor it is typically 5 to 7 times faster. Nothing but rounding
+    and what the tolerance leaves open tells them apart.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
     (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
@@ -69,58 +56,25 @@ def advance(
     Returns:
       The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
       the status ``nonfinite``; so does, on a GPU, one whose lists have no room, with ``capacity``.
+
+    Raises:
+      InputError: the flow names an engine that cannot do what is asked.
     """
     require_advance(flow, state, steps)
-    plain = not free_flight or events is not None or moving_contacts
-    by = None if plain else engine(flow, state)
-    if by is None:
+    asked = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
+    engine = select_engine(flow, state, " and ".join(name for name, wanted in asked.items() if wanted))
+    if engine == "jax":
         return plain_module.advance(flow, state, steps, free_flight, events, moving_contacts)
-    return _advance(by, flow, state, steps)
-
-
-def engine(flow: ShearFlow, state: State) -> Engine | None:
-    """What advances a flow here and now: ``machine_code``, ``thread_block``, or None for the plain advance."""
-    dtypes = {x.dtype for x in jax.tree.leaves(state)}
-    if flow.solver != _SOLVER or len(dtypes) > 1:
-        return None
-    (dtype,) = dtypes
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # of ``jax.default_device``
-    device = jax.devices(device)[0] if device is None or isinstance(device, str) else device
-    if device.platform == "cpu":
-        return machine_code if dtype == jnp.float64 and not in_batch() else None
-    fits = device.platform == "gpu" and flow.grains <= MOST_GRAINS
-    return (
-        thread_block if fits and _kernel_runs(flow.grains, dtype, device, jax.config.read("jax_enable_x64")) else None
-    )
-
-
-@cache
-def _kernel_runs(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> bool:
-    """Whether the kernel compiles and keeps the laws of contacts on a device: tried once."""
-
-    def trial() -> None:
-        from jaxgran.dynamics.thread_block import kernel
-
-        with jax.default_device(device), jax.enable_x64(x64):
-            kernel.trial(grains, dtype)
-
-    try:
-        with ThreadPoolExecutor(1) as other:  # what is being traced here is not traced there
-            other.submit(trial).result()
-    except Exception as error:  # of a compiler, a driver or a device: there is no saying which
-        problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        warnings.warn(f"flows take the plain advance: the kernel for GPUs does not run here ({problem}).", stacklevel=2)
-        return False
-    return True
+    return _advance(machine_code if engine == "machine_code" else thread_block, flow, state, steps)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _advance(by: Engine, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+def _advance(by: _Compiled, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
     return by(flow, state, steps)
 
 
 @_advance.defjvp
-def _advance_jvp(by: Engine, primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
+def _advance_jvp(by: _Compiled, primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
     return jax.jvp(plain_module.advance, primals, tangents)
 
 

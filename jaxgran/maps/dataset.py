@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran import environment
+from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import stack
@@ -160,18 +161,25 @@ def _worst(status: np.ndarray) -> np.ndarray:
 
 
 def run_attributes(settings: MapSettings) -> dict[str, Any]:
-    """Every parameter of the run, in types that NetCDF can hold."""
+    """Every parameter of the run, in types that NetCDF can hold.
+
+    ``engine`` and ``solver`` name what runs; ``engine_asked`` and ``solver_asked`` are those of the settings.
+    """
     parameters = asdict(settings)
     equilibrate, error = parameters.pop("equilibrate"), parameters.pop("error")
     if error is not None:
         parameters["error"] = error
         del parameters["strain"]  # every seed has its own
     flow = settings.flows()[0]
-    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
+    engine = select_engine(flow)
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": "CF-1.11",
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
+        "engine": engine,
+        "solver": solver_in_use(engine, settings.solver),
+        "engine_asked": settings.engine,
+        "solver_asked": settings.solver,
         "equilibrate": "until steady" if equilibrate is None else equilibrate,
         "timestep_unit": "1 / shear rate",
         "strain_meaning": "sampled strain of each seed; where an error is given, see strain_by_seed",
@@ -179,6 +187,14 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
         "max_iterations": flow.max_iterations,
+        **made_with(),
+    }
+
+
+def made_with() -> dict[str, str]:
+    """Precision, device, platform, versions and commit of this process."""
+    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
+    return {
         "precision": environment.precision(),
         "device": environment.devices()[0],
         "platform": f"{environment.system()}, {os.cpu_count()} cores",

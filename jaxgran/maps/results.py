@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.io.atomic import replaced, require_place
-from jaxgran.maps.dataset import run_attributes
+from jaxgran.maps.dataset import made_with
 from jaxgran.maps.schema import RATIO, what_lacks
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError, shown
@@ -57,15 +57,19 @@ def read_dataset(path: Path) -> xr.Dataset:
 
 
 def choices_of(data: xr.Dataset) -> dict[str, Any]:
-    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them."""
+    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them.
+
+    Engine and solver are those that were asked for. Files from before the engine had a name tell the solver only.
+    """
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
+            told = next((name for name in (f"{field.name}_asked", field.name) if name in data.attrs), None)
             if field.name in data.dims:
                 chosen[field.name] = tuple(data[field.name].values.tolist())
-            elif field.name in data.attrs:
-                chosen[field.name] = np.asarray(data.attrs[field.name]).tolist()
-            elif field.name not in ("strain", "error"):  # one is there in place of the other
+            elif told is not None:
+                chosen[field.name] = np.asarray(data.attrs[told]).tolist()
+            elif field.name not in ("strain", "error", "engine"):  # of strain and error one is there
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         return chosen | {
@@ -75,9 +79,9 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
         raise InputError(f"this dataset does not tell the {missing.args[0]} of its map.") from None
 
 
-def differences(data: xr.Dataset, settings: MapSettings) -> list[str]:
+def differences(data: xr.Dataset) -> list[str]:
     """What of the versions, the device and the precision of a dataset is other than here, in words."""
-    here = run_attributes(settings)
+    here = made_with()
     names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
     return [
         f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"

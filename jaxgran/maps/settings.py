@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxgran.dynamics.engine import select_engine
 from jaxgran.model.checks import InputError, require_number, require_whole, shown, two_digits
-from jaxgran.model.flow import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, ShearFlow, Solver
+from jaxgran.model.flow import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, ShearFlow, Solver
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.steady_state import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
@@ -34,6 +35,7 @@ class MapSettings:
     tolerance: float = 1e-4
     solver: Solver = "barzilai-borwein"
     activation: Activation = "midpoint"
+    engine: Engine = "auto"
 
     def __post_init__(self):
         for name, values in self.axes.items():
@@ -63,6 +65,8 @@ class MapSettings:
             require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
         require_number("tolerance", self.tolerance, lambda x: x > 0, "between 1e-12 and 0.1")
         flows = stack(self._made_flows())
+        if self.engine != "auto":
+            select_engine(flows)
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
             raise InputError(
@@ -112,6 +116,7 @@ class MapSettings:
                 tolerance=self.tolerance,
                 solver=self.solver,
                 activation=self.activation,
+                engine=self.engine,
             )
             for dt in self._timesteps
             for nu in self.packing_fraction

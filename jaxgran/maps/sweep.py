@@ -29,9 +29,9 @@ from jaxgran.maps.journal import Journal
 from jaxgran.maps.pool import Died, run_tasks, send
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.flow import MAX_REPLICAS, Activation, ShearFlow, Solver
+from jaxgran.model.flow import MAX_REPLICAS, Activation, Engine, ShearFlow, Solver
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, reporting, stack
+from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, in_lockstep, reporting, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
@@ -57,6 +57,7 @@ def ratio_map(
     target_error: float = 0.02,
     solver: Solver = "barzilai-borwein",
     activation: Activation = "midpoint",
+    engine: Engine = "auto",
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
     report: Report | None = None,
@@ -76,8 +77,10 @@ def ratio_map(
         seed is doubled until its share of the error is reached, or the strain would exceed 256. None keeps the strain.
       tolerance: relative residual of a contact solve, or "auto".
       target_error: relative error of pressure and shear stress that "auto" aims at.
-      solver: projected method of the contact solve, see ``methods``.
+      solver: projected method of the contact solve, see ``projected_methods``.
       activation: "midpoint" or "touching".
+      engine: what advances the flows, see ``ShearFlow``; "auto" for the fastest that can. "jax" advances the replicas
+        of a batch in lockstep by ``vmap``, on a processor too.
       batch: replicas that run together, or "auto".
       workers: processes; more than one only on a CPU, and then a script must guard its main part by
         ``if __name__ == "__main__":``.
@@ -103,6 +106,7 @@ def ratio_map(
         "tolerance": tolerance,
         "solver": solver,
         "activation": activation,
+        "engine": engine,
     }
     numbers, automatic_choice = automatic({name: _plain(x) for name, x in choices.items()}, target_error)
     settings = MapSettings(**numbers)
@@ -226,7 +230,7 @@ def _tasks(
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
     keys = [(point, seed) for point in order for seed in range(settings.seeds) if (point, seed) not in without]
     size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" and keys else batch
-    lockstep = jax.default_backend() != "cpu"
+    lockstep = in_lockstep(settings.engine)
     tasks: list[list[Key]] = []
     for key in keys:
         full = not tasks or len(tasks[-1]) == size

@@ -12,6 +12,7 @@ from jaxgran.model.checks import InputError, known, require, require_number, req
 from jaxgran.model.display import Row, display_methods
 
 Activation = Literal["midpoint", "touching"]
+Engine = Literal["auto", "machine_code", "jax", "thread_block"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83
@@ -36,7 +37,7 @@ class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
     Units: length in mean grain diameters σ, mass in masses m of a grain of diameter σ. ``grains``,
-    ``activation`` and ``solver`` are static; all else is traced, so that a change recompiles nothing and a
+    ``activation``, ``solver`` and ``engine`` are static; all else is traced, so that a change recompiles nothing and a
     batch of flows is one ``ShearFlow`` whose numbers carry a leading ``(replicas,)`` axis.
 
     ================  =================  ===============================================================
@@ -53,8 +54,16 @@ class ShearFlow:
     activation        –                  "midpoint": contact if half a step of free flight overlaps;
                                          "touching": contact if the grains overlap
     relaxation        –                  ω in (0, 2) of the Jacobi methods
-    solver            –                  projected method of the contact solve, see ``methods``; with the default, a
-                                         processor may solve by the machine code of ``native``
+    solver            –                  projected method of the contact solve in the engine jax, see
+                                         ``projected_methods``; the other engines have one of their own, which
+                                         stands for the default alone
+    engine            –                  what advances the flow, see ``dynamics.engine``; they differ in speed and
+                                         rounding, not in the law:
+                                         "auto": the fastest that can do what is asked;
+                                         "machine_code": on processors, in float64;
+                                         "thread_block": on NVIDIA GPUs, up to 1024 grains;
+                                         "jax": everywhere, every solver, derivatives; a map advances its batches
+                                         in lockstep by ``vmap``
     ================  =================  ===============================================================
 
     Raises:
@@ -72,12 +81,14 @@ class ShearFlow:
     relaxation: float | jax.Array = 1.8
     activation: Activation = field(default="midpoint", metadata=_STATIC)
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
+    engine: Engine = field(default="auto", metadata=_STATIC)
 
     __repr__, _repr_html_ = display_methods("ShearFlow", _rows)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
-        for name, allowed in (("activation", get_args(Activation)), ("solver", get_args(Solver))):
+        for name, kind in (("activation", Activation), ("solver", Solver), ("engine", Engine)):
+            allowed = get_args(kind)
             value = getattr(self, name)
             if not isinstance(value, str) or value not in allowed:
                 raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")

@@ -20,7 +20,7 @@ from jaxtyping import Array, Int
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.control_flow import AXIS
-from jaxgran.model.flow import ShearFlow
+from jaxgran.model.flow import Engine, ShearFlow
 from jaxgran.model.state import State
 
 Report = Callable[[float], None]  # told the replica-steps done since the last call
@@ -41,8 +41,17 @@ def stack(flows: list[ShearFlow]) -> ShearFlow:
     return jax.tree_util.tree_map_with_path(joined, *flows)
 
 
-def replicated(function: Callable) -> Callable:
-    """The function of one replica for a batch: ``lax.map`` on a CPU, ``vmap`` with a named axis elsewhere.
+def in_lockstep(engine: Engine = "auto") -> bool:
+    """Whether the replicas of a batch advance together: on an accelerator, and everywhere if the engine jax is named.
+
+    Then a batch waits for its slowest replica. On a processor that is what ``engine="jax"`` is asked for: the batch as
+    one array program. Where "auto" takes the engine jax there, replicas go one after another, which is faster.
+    """
+    return engine == "jax" or jax.default_backend() != "cpu"
+
+
+def replicated(function: Callable, engine: Engine = "auto") -> Callable:
+    """The function of one replica for a batch: ``vmap`` with a named axis ``in_lockstep``, or else ``lax.map``.
 
     On several devices every one does so with its share of the replicas.
     """
@@ -50,7 +59,7 @@ def replicated(function: Callable) -> Callable:
     def in_turn(*arguments):
         return lax.map(lambda one: function(*one), arguments)
 
-    together = in_turn if jax.default_backend() == "cpu" else jax.vmap(function, axis_name=AXIS)
+    together = jax.vmap(function, axis_name=AXIS) if in_lockstep(engine) else in_turn
     return together if jax.device_count() == 1 else _shared_out(together)
 
 
@@ -80,7 +89,7 @@ def _shared_out(together: Callable) -> Callable:
 @jax.jit
 def advance_batch(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
     """Advance every replica of a batch by its own number of steps: the plain ``Drive`` of the protocol."""
-    return replicated(advance)(flow, state, steps)
+    return replicated(advance, flow.engine)(flow, state, steps)
 
 
 def reporting(drive: Drive, report: Report | None) -> Drive:

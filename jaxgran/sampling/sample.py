@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import select_engine
 from jaxgran.dynamics.plain import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
@@ -252,7 +253,7 @@ def sample(
       strain: strain γ̇t to sample, rounded to whole time steps. A change of it compiles nothing anew.
       blocks: number of equal parts that the tallies are kept for, static.
       observe: what else to average, a function of a ``Snapshot`` that returns a pytree of arrays; looked at by the
-        plain advance, which on a processor takes 5 to 7 times as long as the machine code; static, so that a new
+        engine jax, which on a processor takes 5 to 7 times as long as the machine code; static, so that a new
         function compiles anew. The contacts of a snapshot are those of a step in which some approach, before they act,
         in buffers of several sizes: sum over them. A step without has none, so a mean over steps counts zero for it.
       callback: called after each block with the state and the sample so far; where it returns something true, the
@@ -263,8 +264,8 @@ def sample(
 
     Raises:
       ValueError: the flow is not sheared, the strain is not a positive number, shorter than a time step for each block
-        or longer than 2**31 - 1 of them, positions in float32 cannot resolve the time step, or what is observed is no
-        sums over the contacts.
+        or longer than 2**31 - 1 of them, positions in float32 cannot resolve the time step, what is observed is no
+        sums over the contacts, or the flow names an engine that cannot do what is asked.
     """
     require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
@@ -297,6 +298,8 @@ def _measured(
     flow: ShearFlow, state: State, steps: Int[Array, " blocks"], observe: Callable[[Snapshot], Any] | None
 ) -> tuple[State, Sample]:
     """The sample of blocks of so many time steps."""
+    if observe is not None:
+        select_engine(flow, state, "observe")
 
     def block(now: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
         if observe is None:

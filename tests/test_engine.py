@@ -1,0 +1,224 @@
+"""An engine has a name: it runs what it can, refuses in a sentence what it cannot, and stands in what it has made."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic import one_sentence
+
+import jaxgran as jg
+from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.results import choices_of, differences, read_dataset, write_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.control_flow import AXIS
+from jaxgran.sampling.batch import advance_batch, in_lockstep, stack
+
+STEPS = jnp.int32(100)
+SETTINGS = MapSettings((0.5, 0.9), (0.6,), grains=64, seeds=1, strain=2.0)
+
+
+def of(engine: str = "auto", **others) -> jg.ShearFlow:
+    return jg.ShearFlow(pytest.GRAINS, 0.5, 0.7, 1e-3, engine=engine, **others)
+
+
+def single(state: jg.State) -> jg.State:
+    return jax.tree.map(lambda x: x.astype(jnp.float32), state)
+
+
+def assert_same_bits(one, other) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def refusal(call) -> str:
+    with pytest.raises(jg.InputError) as caught:
+        call()
+    assert one_sentence(str(caught.value))
+    return str(caught.value)
+
+
+# What is selected
+
+
+def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> None:
+    state = flowing(0.7)
+    assert select_engine(of()) == select_engine(of(), state) == "machine_code"
+    assert select_engine(of(solver="nesterov"), state) == "jax"
+    assert select_engine(of(), single(state)) == "jax"
+    assert select_engine(of(), replace(state, tilt=state.tilt.astype(jnp.float32))) == "jax"
+    assert select_engine(of(), state, "events") == "jax"
+    found = []
+    batch = jax.tree.map(lambda x: x[None], state)
+    jax.vmap(lambda one: found.append(select_engine(of(), one)), axis_name=AXIS)(batch)
+    jax.vmap(lambda one: found.append(select_engine(of(), one)))(batch)
+    assert found == ["jax", "machine_code"]
+
+
+def test_jax_takes_whatever_it_is_asked_for(flowing) -> None:
+    for state in (flowing(0.7), single(flowing(0.7))):
+        for solver in ("barzilai-borwein", "jacobi"):
+            assert select_engine(of("jax", solver=solver), state, "events") == "jax"
+
+
+IMPOSSIBLE = {
+    "thread block on a processor": (
+        lambda state: jg.advance(of("thread_block"), state, STEPS),
+        "on a CPU, not thread_block: it is made for NVIDIA GPUs",
+    ),
+    "another solver": (
+        lambda state: jg.advance(of("machine_code", solver="jacobi"), state, STEPS),
+        "with the solver jacobi, not machine_code",
+    ),
+    "single precision": (
+        lambda state: jg.advance(of("machine_code"), single(state), STEPS),
+        "in float32, not machine_code: it computes in float64",
+    ),
+    "several precisions": (
+        lambda state: jg.advance(of("machine_code"), replace(single(state), side=state.side), STEPS),
+        "where the numbers of a state differ in precision, not machine_code",
+    ),
+    "a named axis": (
+        lambda state: jax.vmap(lambda one: jg.advance(of("machine_code"), one, STEPS), axis_name=AXIS)(
+            jax.tree.map(lambda x: x[None], state)
+        ),
+        "in a vmap with the axis name 'replica', not machine_code",
+    ),
+    "every step": (
+        lambda state: jg.advance(of("machine_code"), state, STEPS, free_flight=False),
+        "with free_flight=False, not machine_code",
+    ),
+    "moving contacts": (
+        lambda state: jg.advance(of("machine_code"), state, STEPS, moving_contacts=True),
+        "with moving_contacts, not machine_code",
+    ),
+    "derivatives in reverse mode": (
+        lambda state: jax.grad(
+            lambda alpha: jnp.sum(
+                jg.advance(replace(of("machine_code"), restitution=alpha), state, STEPS, events=50)[0].velocities ** 2
+            )
+        )(0.5),
+        "with events, not machine_code: only the engine jax does that",
+    ),
+    "an observable": (
+        lambda state: jg.sample(of("machine_code"), state, 0.1, observe=lambda seen: seen.state.side),
+        "with observe, not machine_code",
+    ),
+    "an observable, block by block": (
+        lambda state: jg.sample(
+            of("machine_code"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
+        ),
+        "with observe, not machine_code",
+    ),
+    "a sample": (lambda state: jg.sample(of("thread_block"), state, 0.1), "on a CPU, not thread_block"),
+    "a preparation": (lambda _: jg.prepare(of("thread_block"), jax.random.key(0)), "on a CPU, not thread_block"),
+    "snapshots": (lambda state: jg.snapshot_series(of("thread_block"), state, 0.1, 2), "on a CPU, not thread_block"),
+    "free cooling": (
+        lambda state: jg.cooling(of("thread_block", shear_rate=0.0), state, [0.1]),
+        "on a CPU, not thread_block",
+    ),
+    "a map": (
+        lambda _: jg.ratio_map([0.5], [0.6], engine="machine_code", solver="nesterov"),
+        "with the solver nesterov, not machine_code",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> None:
+    call, words = IMPOSSIBLE[case]
+    sentence = refusal(lambda: call(flowing(0.7)))
+    assert sentence.startswith(f"engine must be auto or jax {words}")
+
+
+# What runs
+
+
+def test_the_named_engine_is_auto_to_the_bit_where_auto_takes_it(flowing) -> None:
+    state, advance = flowing(0.7), jax.jit(jg.advance)
+    by_code, by_jax = advance(of(), state, STEPS), advance(of(solver="jacobi"), state, STEPS)
+    assert_same_bits(advance(of("machine_code"), state, STEPS), by_code)
+    assert_same_bits(advance(of("jax", solver="jacobi"), state, STEPS), by_jax)
+    by_name = advance(of("jax"), state, STEPS)
+    assert not np.array_equal(by_name[0].positions, by_code[0].positions)  # other rounding
+    np.testing.assert_allclose(by_name[0].positions, by_code[0].positions, atol=1e-2)
+
+
+def test_forward_derivatives_pass_through_the_machine_code(flowing) -> None:
+    def energy(alpha, engine):
+        end, _ = jg.advance(replace(of(engine), restitution=alpha), flowing(0.7), jnp.int32(20))
+        return jnp.sum(end.velocities**2)
+
+    slopes = [
+        jax.jvp(lambda alpha, e=engine: energy(alpha, e), (0.5,), (1.0,))[1] for engine in ("auto", "machine_code")
+    ]
+    assert slopes[0] == slopes[1] != 0
+
+
+def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) -> None:
+    states = jax.tree.map(lambda *x: jnp.stack(x), *(flowing(0.7, seed) for seed in range(3)))
+    steps = jnp.asarray([50, 0, 80], jnp.int32)
+    assert in_lockstep("jax") and not in_lockstep("auto") and not in_lockstep("machine_code")
+    flow = stack([of("jax", solver="jacobi")] * 3)
+    together = jax.jit(jax.vmap(jg.advance, axis_name=AXIS))(flow, states, steps)
+    assert_same_bits(advance_batch(flow, states, steps), together)
+    one_by_one = advance_batch(replace(flow, engine="auto"), states, steps)
+    np.testing.assert_allclose(together[0].velocities, one_by_one[0].velocities, atol=1e-3)
+
+
+# What stands in a dataset
+
+
+@pytest.mark.parametrize(
+    ("asked", "engine", "solver"),
+    [
+        ({}, "machine_code", "gauss-seidel, barzilai-borwein where stiff"),
+        ({"engine": "machine_code"}, "machine_code", "gauss-seidel, barzilai-borwein where stiff"),
+        ({"engine": "jax"}, "jax", "barzilai-borwein"),
+        ({"solver": "nesterov"}, "jax", "nesterov"),
+        ({"engine": "jax", "solver": "jacobi"}, "jax", "jacobi"),
+    ],
+)
+def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: str, solver: str) -> None:
+    settings = replace(SETTINGS, **asked)
+    data = map_dataset(settings, {}, {})
+    assert (data.attrs["engine"], data.attrs["solver"]) == (engine, solver)
+    assert (data.attrs["engine_asked"], data.attrs["solver_asked"]) == (settings.engine, settings.solver)
+    assert MapSettings(**choices_of(data)) == settings
+
+
+def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
+    with jax.enable_x64(False):
+        data = map_dataset(SETTINGS, {}, {})
+        assert "in float32, not machine_code" in refusal(lambda: replace(SETTINGS, engine="machine_code"))
+    assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
+        "float32",
+        "jax",
+        "barzilai-borwein",
+    )
+
+
+def test_the_thread_block_solves_by_its_own_method() -> None:
+    assert solver_in_use("thread_block", "barzilai-borwein") == "barzilai-borwein"
+
+
+def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path: Path) -> None:
+    settings = replace(SETTINGS, solver="nesterov")
+    data = map_dataset(settings, {}, {})
+    old = {name: x for name, x in data.attrs.items() if "_asked" not in name and name != "engine"}
+    write_dataset(xr.Dataset(data.data_vars, data.coords, old | {"solver": "nesterov"}), tmp_path / "old.nc")
+    again = read_dataset(tmp_path / "old.nc")
+    assert MapSettings(**choices_of(again)) == settings
+    assert differences(again) == []
+
+
+def test_a_map_by_jax_and_jacobi_agrees_with_the_machine_code_within_errors() -> None:
+    choices = {"grains": 64, "seeds": 1, "equilibrate": 1.0, "strain": 2.0}
+    way = {"engine": "jax", "solver": "jacobi", "batch": 2}
+    original, usual = jg.ratio_map([0.5, 0.9], [0.6], **choices, **way), jg.ratio_map([0.5, 0.9], [0.6], **choices)
+    error = np.hypot(original.pressure_stderr, usual.pressure_stderr)
+    assert np.all(abs(original.pressure - usual.pressure) < 5 * error)
+    assert (original.attrs["engine"], original.attrs["solver"]) == ("jax", "jacobi")
