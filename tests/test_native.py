@@ -373,7 +373,8 @@ def test_transformations_apply(flowing) -> None:
             jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found))
 
 
-def test_derivatives_go_through_the_plain_advance(flowing, monkeypatch) -> None:
+@pytest.mark.parametrize("engine", ["auto", "machine_code"])
+def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) -> None:
     state = flowing(0.6)
 
     def plain(flow, state, steps):
@@ -382,7 +383,8 @@ def test_derivatives_go_through_the_plain_advance(flowing, monkeypatch) -> None:
     monkeypatch.setattr(plain_module, "advance", plain)
 
     def velocities(alpha):
-        return advance_module.advance(replace(of(0.6), restitution=alpha), state, jnp.int32(30))[0].velocities
+        flow = replace(of(0.6, engine=engine), restitution=alpha)
+        return advance_module.advance(flow, state, jnp.int32(30))[0].velocities
 
     np.testing.assert_array_equal(jax.jvp(velocities, (0.5,), (1.0,))[1], state.velocities)
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
