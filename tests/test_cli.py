@@ -430,7 +430,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
 def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_not_answer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def silent() -> NoReturn:
+    def silent(*_) -> NoReturn:
         raise RuntimeError("Unable to initialize backend 'cuda':\n no driver.")
 
     monkeypatch.setattr(jax, "devices", silent)
