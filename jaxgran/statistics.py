@@ -1,4 +1,4 @@
-"""Standard errors of sums over blocks by the jackknife, their correlation, and the drift of a series."""
+"""Standard errors of sums over blocks by the jackknife, the correlation of blocks, and the drift of a series."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -6,28 +6,28 @@ from typing import Any
 import jax
 import numpy as np
 
-BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # with 32 blocks a seed, the last compares whole seeds
-_FEWEST_GROUPS = 4  # a spread over fewer says little, unless there is nothing better
+BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # blocks in a group; with 32 blocks a seed, the last compares whole seeds
+_FEWEST_GROUPS = 4  # the spread over fewer groups is too uncertain; single blocks are used in any case
 Estimates = dict[str, np.ndarray]
 
 
 def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
-    Every estimate is a function of sums (a ratio of sums, as a rule), so its error comes from leaving out one block at
-    a time. Blocks that follow each other are correlated; merged in groups of up to 32 they are less so, and the
-    largest of the errors is taken, as far as there are four groups (the blocking method: Flyvbjerg and Petersen,
+    Every estimate is a function of sums, usually a ratio. Its error comes from leaving out one block at a time.
+    Successive blocks are correlated, and groups of up to 32 merged blocks are less so. The error returned is the
+    largest over the group sizes that leave at least four groups (the blocking method: Flyvbjerg and Petersen,
     J. Chem. Phys. 91, 461, 1989).
 
     Args:
       estimate: maps a pytree of sums with any leading axes to named estimates with the same leading axes.
-      sums: pytree of arrays of shape (seeds, blocks, ...).
+      sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
 
     Returns:
       Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks.
 
     Examples:
-      Eight blocks that drift. Were they independent the error would be 0.87; joined in pairs they show a larger one.
+      Eight blocks that drift. Independent blocks would have an error of 0.87. Merged in pairs they have a larger one.
 
       >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
       >>> value, error = jackknife(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
@@ -45,11 +45,11 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
 def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> Estimates:
     """Number of successive blocks that count as one independent sample, for every estimate; at least one.
 
-    It is the statistical inefficiency g = 1 + 2 Σ (1 − k/B) ρ_k, with ρ_k the autocorrelation at a distance of k of the
-    B blocks of a seed, averaged over the seeds, so that n blocks are worth n/g samples. What is correlated is the
-    influence of each block on the estimate, from the jackknife. The sum ends before the first pair ρ_2k + ρ_2k+1 that
-    is not positive (C. J. Geyer, Stat. Sci. 7, 473, 1992), beyond which there is only noise. A series that is not many
-    times longer than g shows it too short: one of 32 blocks finds 3 for 4, and 4.6 for 9.
+    It is the statistical inefficiency g = 1 + 2 Σ (1 − k/B) ρ_k: n blocks are worth n/g independent samples. ρ_k is the
+    autocorrelation at lag k of the B blocks of a seed, averaged over the seeds. It is that of the influence of each
+    block on the estimate, from the jackknife. The sum ends before the first pair ρ_2k + ρ_2k+1 that is not positive
+    (C. J. Geyer, Stat. Sci. 7, 473, 1992), because later terms are only noise. A series that is not many times longer
+    than g gives too small a value: with 32 blocks it is 3 instead of 4, and 4.6 instead of 9.
 
     Args:
       estimate, sums: as in ``jackknife``.
@@ -65,10 +65,9 @@ def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
     """Difference of the means of the second and first half of a series, and its standard error.
 
-    The error allows for the correlation of neighbouring values: the variance of a mean is multiplied by
-    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series shows it too
-    small, so ρ is taken between ``least_correlation`` and 0.9.
-    The series has at least four values.
+    The error includes the correlation of neighbouring values: the variance of a mean is multiplied by
+    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series gives too
+    small a ρ, so it is limited to the range from ``least_correlation`` to 0.9. The series has at least four values.
     """
     half = len(series) // 2
     halves = np.stack([series[:half], series[-half:]])
@@ -99,12 +98,12 @@ def _all_but_one(groups: np.ndarray) -> np.ndarray:
 
 
 def _spread(without: np.ndarray) -> np.ndarray:
-    """Standard errors (n,) of n estimates from those without one group, (groups, n)."""
+    """Jackknife standard errors (n,) of n estimates, from the estimates without one group each, (groups, n)."""
     return np.sqrt((len(without) - 1) * np.mean((without - without.mean(axis=0)) ** 2, axis=0))
 
 
 def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """All estimates with a leading axis as one array (rows, n), and what names the parts of a row (n,) of it."""
+    """All estimates with a leading axis as one array (rows, n), and a function that names the parts of a row (n,)."""
     arrays = {name: np.asarray(x) for name, x in estimates.items()}
     rows = len(next(iter(arrays.values())))
     edges = np.cumsum([x[0].size for x in arrays.values()])[:-1]
@@ -121,8 +120,8 @@ def _inefficiency(series: np.ndarray) -> np.ndarray:
     blocks = series.shape[1]
     if blocks < 4:
         return np.full(series.shape[2], np.nan)
-    away = series - series.mean(axis=(0, 1))
-    products = [np.mean(away[:, : blocks - k] * away[:, k:], axis=(0, 1)) for k in range(blocks // 2)]
+    deviations = series - series.mean(axis=(0, 1))
+    products = [np.mean(deviations[:, : blocks - k] * deviations[:, k:], axis=(0, 1)) for k in range(blocks // 2)]
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.stack(products) / products[0]
     weighted = correlation * (1 - np.arange(len(products)) / blocks)[:, None]

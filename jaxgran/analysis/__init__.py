@@ -1,4 +1,4 @@
 """Numbers from snapshots: force chains, order, velocities, coarse-grained fields.
 
-It imports `dynamics` and what is below, but neither `sampling` nor `io`. Begin with `series`.
+It imports `dynamics` and the folders below it, but neither `sampling` nor `io`. Begin with `series`.
 """

@@ -1,7 +1,7 @@
 """Coarse-graining functions: how a grain is spread over the plane, and a contact along its branch.
 
-Each is normalised in the plane and knows its integral along a line in closed form. A new one takes two functions and
-two numbers: see ``Kernel``.
+Each function is normalised in the plane. Its integral along a line is known in closed form. To add a function, give
+the two functions and the two numbers of ``Kernel``.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,11 @@ from jaxtyping import Array, Float
 
 from jaxgran.model.checks import require_number
 
+_ON_CENTRE = 1e-100  # b² in squared widths, at or below which a line passes through the centre
+
 
 class Kernel(NamedTuple):
-    """A coarse-graining function of unit width, g(q), normalised in the plane.
+    """A coarse-graining function of unit width, g(q), normalised in the plane; all lengths are in widths.
 
     =============  ==============  ==========================================================================
     field          signature       meaning
@@ -26,7 +28,7 @@ class Kernel(NamedTuple):
     value          q² → g          the function
     line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line that passes the centre at the distance b
     second_moment  number          ∫ g q_x² d²q
-    reach          number          g vanishes beyond it, or may be left out
+    reach          number          distance beyond which g is zero or negligible
     =============  ==============  ==========================================================================
     """
 
@@ -37,12 +39,12 @@ class Kernel(NamedTuple):
 
 
 def _root(square: Array) -> Array:
-    """A square root whose derivative at zero is zero: it is only used in odd powers of three and more."""
+    """A square root with derivative zero at zero; it is only used in odd powers of three and more."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _in_disc(s: Array, b2: Array) -> Array:
-    """The part of s on the chord of the unit disc at the distance b from the centre."""
+    """s limited to the chord of the unit disc at the distance b from the centre; zero outside the disc."""
     half = jnp.sqrt(jnp.where(b2 < 1, 1 - b2, 1))
     return jnp.where(b2 < 1, jnp.clip(s, -half, half), 0)
 
@@ -52,11 +54,11 @@ def _lucy_value(q2: Array) -> Array:
 
 
 def _lucy_line(s: Array, b2: Array) -> Array:
-    s, passes = _in_disc(s, b2), b2 > 1e-100
-    s2, b = s**2, jnp.sqrt(jnp.where(passes, b2, 1))
+    s, off_centre = _in_disc(s, b2), b2 > _ON_CENTRE
+    s2, b = s**2, jnp.sqrt(jnp.where(off_centre, b2, 1))
     q2 = b2 + s2
-    odd = s * _root(q2) * (2 * q2 + 3 * b2) + jnp.where(passes, 3 * b2**2 * jnp.arcsinh(s / b), 0)  # 8 ∫ q³
-    return 5 / jnp.pi * (s - s * (6 * b2 + 2 * s2) + odd - s * (3 * b2**2 + 2 * b2 * s2 + 0.6 * s2**2))
+    cubic = s * _root(q2) * (2 * q2 + 3 * b2) + jnp.where(off_centre, 3 * b2**2 * jnp.arcsinh(s / b), 0)  # 8 ∫ q³
+    return 5 / jnp.pi * (s - s * (6 * b2 + 2 * s2) + cubic - s * (3 * b2**2 + 2 * b2 * s2 + 0.6 * s2**2))
 
 
 GAUSSIAN = Kernel(
@@ -98,7 +100,16 @@ class CoarseGraining:
     def segment(
         self, separations: Float[Array, "n 2"], normals: Float[Array, "n 2"], lengths: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """∫₀¹ G along branches of some directions and positive lengths, seen from their middles, in 1/σ²."""
+        """∫₀¹ G along branches, in 1/σ².
+
+        ===========  ======  ====  =================================================
+        argument     shape   unit  meaning
+        ===========  ======  ====  =================================================
+        separations  (n, 2)  σ     of one point from the middles of the branches
+        normals      (n, 2)  –     unit vectors along the branches
+        lengths      (n,)    σ     of the branches, positive
+        ===========  ======  ====  =================================================
+        """
         per_width, (x, y), (nx, ny) = 1 / self.width, separations.T, normals.T
         along, across, half = nx * x + ny * y, (nx * y - ny * x) * per_width, lengths / 2
         start, end, line, b2 = (along - half) * per_width, (along + half) * per_width, self.kernel.line, across**2
@@ -111,22 +122,22 @@ class CoarseGraining:
 
     @property
     def reach(self) -> float | Array:
-        """Distance beyond which G vanishes or, for the Gaussian, may be left out, in σ."""
+        """Distance beyond which G is zero or, for the Gaussian, negligible, in σ."""
         return self.kernel.reach * self.width
 
 
 def gaussian(width: float | Array) -> CoarseGraining:
-    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w: smooth everywhere, not cut off within the cell."""
+    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w (σ). It is smooth and not cut off within the cell."""
     return _of_width(width, GAUSSIAN)
 
 
 def lucy(radius: float | Array) -> CoarseGraining:
-    """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c: compact, with two continuous derivatives."""
+    """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c (σ), with two continuous derivatives."""
     return _of_width(radius, LUCY)
 
 
 def heaviside(radius: float | Array) -> CoarseGraining:
-    """The average over a disc of radius c, 1/(πc²): fields jump where a grain enters, so no derivatives."""
+    """The average over a disc of radius c (σ), 1/(πc²). Fields jump where a grain enters and have no derivatives."""
     return _of_width(radius, HEAVISIDE)
 
 

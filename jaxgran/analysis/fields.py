@@ -1,17 +1,19 @@
 """Fields: density, velocity, stress, dissipation and heat flux at any points, coarse-grained from a snapshot.
 
-A coarse-graining function G spreads every grain over the plane. What grains carry is weighted by G(r − r_i), and what
-contacts hand over by ∫₀¹ G(r − r_i + s σ_ij) ds, the mean of G over the branch σ_ij = r_i − r_j between the centres. So
-the fields obey the balance equations of mass, momentum and energy exactly, at every point and for every G:
+A coarse-graining function G spreads every grain over the plane. Quantities that grains carry are weighted by
+G(r − r_i). Quantities that contacts transfer are weighted by ∫₀¹ G(r − r_i + s σ_ij) ds. This is the mean of G over
+the branch σ_ij = r_i − r_j between the centres. With these weights the fields obey the balance equations of mass,
+momentum and energy exactly, at every point and for every G:
 
     ∂ρ/∂t = −∇·(ρV),   ∂(ρV)/∂t = −∇·(ρVV + Σ),   ∂(ρe)/∂t = −∇·(ρeV + Σ·V + J_Q) − ζ.
 
-A time step is a collision at once and a flight. What the grains carry is taken from the flight, with the velocities
-after the collision; forces are impulses over dt. So the fields of a snapshot are those of the step that begins with it:
-over this step the densities change by dt times the right-hand sides, to first order in the flight alone.
+A time step is an instantaneous collision, then a flight. Quantities that grains carry use the velocities of the
+flight, after the collision. Forces are impulses over dt. So the fields of a snapshot belong to the step that begins
+with it. Over this step the densities change by dt times the right-hand sides: exactly for the contacts, to first order
+in dt for the flight.
 
-Sources: Lois, Lemaître and Carlson, equations of ρ, ρV and Σ (their energy equation has the opposite signs on the
-right); Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
+Sources: Lois, Lemaître and Carlson for ρ, ρV and Σ (their energy equation has the opposite signs on the right);
+Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
 """
 
 from dataclasses import dataclass
@@ -31,14 +33,15 @@ from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError, require, shown
 from jaxgran.model.state import State
 
-_POINTS_AT_ONCE, _BRANCHES_AT_ONCE = 128, 128
+_POINTS_AT_ONCE = 128  # points in one matrix product
+_BRANCHES_AT_ONCE = 128  # branches in one matrix product
 _dot = partial(jnp.dot, precision=lax.Precision.HIGHEST)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Fields:
-    """Coarse-grained fields at some points, in the frame of the laboratory (mean velocity γ̇ y x̂).
+    """Coarse-grained fields at points of the plane, in the laboratory frame (mean velocity γ̇ y x̂).
 
     ==============  ==============  =======  ===========================================================================
     field           shape           unit     meaning
@@ -50,8 +53,8 @@ class Fields:
     contact_stress  (points, 2, 2)  mγ̇²      Σ σ F ∫G over the contacts; positive for pressure
     heat_flux       (points, 2)     mσγ̇³     J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i + v̄_j)/2 − V) ∫G, with v̄ the
                                              mean of the velocities before and after the collision
-    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each at either grain; below zero where
-                                             a contact that others press together gains what they lose
+    dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at either grain; negative
+                                             where neighbours press a contact together and it gains energy from them
     ==============  ==============  =======  ===========================================================================
     """
 
@@ -80,7 +83,7 @@ class Fields:
 
     @property
     def temperature(self) -> Float[Array, " points"]:
-        """Granular temperature tr Σ_k / (2 Σ G), in mσ²γ̇²; zero where no grain is near."""
+        """Granular temperature tr Σ_k / (2 Σ G), in mσ²γ̇², with Σ_k the kinetic stress; zero where no grain is near."""
         number = jnp.where(self.number_density > 0, self.number_density, 1)
         return jnp.trace(self.kinetic_stress, axis1=1, axis2=2) / (2 * number)
 
@@ -97,12 +100,22 @@ class Fields:
 
 
 class _Branches(NamedTuple):
-    """What contacts hand over, those that carry an impulse first; F the force, c̄ the mean of all four velocities."""
+    """Branches of the contacts, and what each contact transfers.
+
+    ===========  =============  ==============================================================================
+    middles      (contacts, 2)  middle of the branch, σ
+    normals      (contacts, 2)  unit vector along the branch
+    lengths      (contacts,)    length of the branch, σ
+    transferred  (contacts, 6)  the four components of σ F, and the two of σ (F·c̄); F is the force, c̄ the mean
+                                of the velocities of both grains before and after the collision
+    loaded       (contacts,)    whether the contact carries an impulse
+    ===========  =============  ==============================================================================
+    """
 
     middles: Float[Array, "contacts 2"]
     normals: Float[Array, "contacts 2"]
     lengths: Float[Array, " contacts"]
-    handed: Float[Array, "contacts 6"]  # σ F by component, and σ (F·c̄)
+    transferred: Float[Array, "contacts 6"]
     loaded: Bool[Array, " contacts"]
 
 
@@ -111,18 +124,18 @@ def fields_at(seen: Snapshot, points: Float[Array, "points 2"], graining: Coarse
 
     Args:
       seen: one snapshot.
-      points: (points, 2) in σ, in the cell or in any of its images, for example ``grid``.
-      graining: G; its width is traced, so that a change of it compiles nothing anew.
+      points: (points, 2) in σ, in the cell or in any of its images, for example from ``grid``.
+      graining: G. Its width is traced, so a new width needs no new compilation.
 
     Returns:
       The fields of the step that begins with the snapshot: ρ, V and Σ_k after its collision.
 
     Raises:
-      InputError: the width is not positive, or G reaches farther than half the side less the largest radius, so that
-        a point would be within reach of two images. The reach of a Gaussian is six widths: what is left out, of the
-        next images, is e⁻¹⁸ = 1.5e-8 of the peak or less.
+      InputError: the width is not positive, or G reaches farther than half the side less the largest radius. A point
+        would then be within reach of two images of one grain. The reach of a Gaussian is six widths: the next images
+        are neglected, and they are at most e⁻¹⁸ = 1.5e-8 of the peak.
 
-    Sources: see the head of this file.
+    Sources: see the top of this file.
     """
     if not isinstance(seen, Snapshot) or jnp.ndim(seen.state.positions) != 2:
         raise InputError("seen must be one Snapshot: one of a series is jax.tree.map(lambda x: x[k], series).")
@@ -137,7 +150,7 @@ def fields_at(seen: Snapshot, points: Float[Array, "points 2"], graining: Coarse
 def flight_fields_at(
     state: State, shear_rate: float | Array, points: Float[Array, "points 2"], graining: CoarseGraining
 ) -> Fields:
-    """Fields of grains in free flight: those of ``fields_at`` where no contact carries an impulse."""
+    """Fields of grains in free flight: ``fields_at`` without contact impulses; arguments as there."""
     _check(graining, state)
     return _flight_fields_at(state, shear_rate, points, graining)
 
@@ -155,13 +168,13 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
 def plane_flux(seen: Snapshot, heights: Float[Array, " heights"]) -> Float[Array, "heights 2"]:
     """Momentum that crosses planes y = h upwards during the step of a snapshot, per length and time, in mγ̇².
 
-    Contacts whose branch crosses the plane hand over their impulse; grains that cross it in the flight carry their
-    momentum relative to the mean flow at the plane. The average over all heights is (1/A) Σ σ_y F for the contacts and
-    the average over the flight of (1/A) Σ m c_y c for the grains: the stress Σ^{yb} by another route.
+    Contacts whose branch crosses the plane transfer their impulse. Grains that cross it in the flight carry their
+    momentum relative to the mean flow at the plane. Averaged over all heights, the contacts give (1/A) Σ σ_y F, and the
+    grains give the average over the flight of (1/A) Σ m c_y c. So this is a second way to measure the stress Σ^{yb}.
 
     Args:
       seen: one snapshot.
-      heights: (heights,) in σ, anywhere.
+      heights: (heights,) in σ, any numbers.
     """
     state, contacts = collided(seen), seen.contacts
     y, (cx, cy), area = state.positions[:, 1], state.velocities.T, state.side * seen.timestep
@@ -170,12 +183,14 @@ def plane_flux(seen: Snapshot, heights: Float[Array, " heights"]) -> Float[Array
         return jnp.floor((start + rise - height) / state.side) - jnp.floor((start - height) / state.side)
 
     def through(height: Array) -> Array:
-        by_contact = crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height) * seen.impulses
-        by_grain = crossings(y, seen.timestep * cy, height) * state.grains.masses
+        crossing_impulses = (
+            crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height) * seen.impulses
+        )
+        crossing_masses = crossings(y, seen.timestep * cy, height) * state.grains.masses
         above = y - height
         above = above - state.side * jnp.round(above / state.side)
-        carried = jnp.stack([cx + seen.shear_rate * above, cy], axis=-1)
-        return (_dot(by_contact, contacts.normals) + _dot(by_grain, carried)) / area
+        velocities = jnp.stack([cx + seen.shear_rate * above, cy], axis=-1)
+        return (_dot(crossing_impulses, contacts.normals) + _dot(crossing_masses, velocities)) / area
 
     return lax.map(through, heights, batch_size=max(1, min(heights.size, _POINTS_AT_ONCE)))
 
@@ -192,73 +207,73 @@ def _check(graining: CoarseGraining, state: State) -> None:
 def _fields_at(seen: Snapshot, points: Array, graining: CoarseGraining) -> Fields:
     before, after, contacts = seen.state, collided(seen), seen.contacts
     mean = (before.velocities + after.velocities) / 2
-    at_i, at_j = mean[contacts.i], mean[contacts.j]
+    velocity_i, velocity_j = mean[contacts.i], mean[contacts.j]
     branches = contacts.normals * contacts.distances[:, None]
     forces = contacts.normals * (seen.impulses / seen.timestep)[:, None]
 
-    power_lost = -jnp.sum(forces * (at_i - at_j), axis=1) - seen.shear_rate * forces[:, 0] * branches[:, 1]
-    loss = power_lost / 2  # at each of the two grains
+    power_lost = -jnp.sum(forces * (velocity_i - velocity_j), axis=1) - seen.shear_rate * forces[:, 0] * branches[:, 1]
+    loss = power_lost / 2  # half of the loss goes to each of the two grains
     losses = jnp.zeros_like(before.grains.masses).at[contacts.i].add(loss).at[contacts.j].add(loss)
 
     stress = branches[:, :, None] * forces[:, None, :]
-    work = branches * jnp.sum(forces * (at_i + at_j) / 2, axis=1)[:, None]
-    handed = jnp.concatenate([stress.reshape(-1, 4), work], axis=1)
+    work = branches * jnp.sum(forces * (velocity_i + velocity_j) / 2, axis=1)[:, None]
+    transferred = jnp.concatenate([stress.reshape(-1, 4), work], axis=1)
     middles = before.positions[contacts.j] + branches / 2
-    found = _Branches(middles, contacts.normals, contacts.distances, handed, seen.impulses > 0)
-    return _fields_of(after, losses, _in_blocks(found), seen.shear_rate, points, graining)
+    transfers = _Branches(middles, contacts.normals, contacts.distances, transferred, seen.impulses > 0)
+    return _coarse_grained(after, losses, _in_blocks(transfers), seen.shear_rate, points, graining)
 
 
 @jax.jit
 def _flight_fields_at(state: State, shear_rate: Array, points: Array, graining: CoarseGraining) -> Fields:
-    return _fields_of(state, jnp.zeros_like(state.grains.masses), None, shear_rate, points, graining)
+    return _coarse_grained(state, jnp.zeros_like(state.grains.masses), None, shear_rate, points, graining)
 
 
 def _in_blocks(branches: _Branches) -> _Branches:
-    """The branches with those that carry an impulse first, cut into (blocks, size)."""
+    """The branches, loaded ones first, in blocks (blocks, size)."""
     order = jnp.argsort(~branches.loaded)
     size = min(order.size, _BRANCHES_AT_ONCE)
     order = jnp.pad(order, (0, -order.size % size), constant_values=order.size).reshape(-1, size)
     ordered = jax.tree.map(lambda x: x[jnp.minimum(order, branches.loaded.size - 1)], branches)
     loaded = ordered.loaded & (order < branches.loaded.size)
-    return ordered._replace(loaded=loaded, handed=jnp.where(loaded[:, :, None], ordered.handed, 0))
+    return ordered._replace(loaded=loaded, transferred=jnp.where(loaded[:, :, None], ordered.transferred, 0))
 
 
-def _fields_of(
+def _coarse_grained(
     state: State, losses: Array, blocks: _Branches | None, shear_rate: Array, points: Array, graining: CoarseGraining
 ) -> Fields:
-    """The fields, written for one point; ``lax.map`` makes matrix products of many points at once.
+    """The fields, written for one point; ``lax.map`` evaluates many points at once as matrix products.
 
-    All sums are taken in the frame of the mean flow at the point, where an image at the separation d has the velocity
-    w = c − γ̇ d_y x̂: so no image needs a velocity of its own, and nothing cancels far from the origin.
+    All sums are taken in the frame of the mean flow at the point. There an image at the separation d has the velocity
+    w = c − γ̇ d_y x̂. So the velocities of images need no correction, and far from the origin no digits cancel.
     """
     masses, (cx, cy) = state.grains.masses, state.velocities.T
     carried = jnp.stack([masses, masses * cy, masses * cy**2, masses * cy**3, jnp.ones_like(cy), losses], axis=1)
 
-    def handed_at(point: Array) -> Float[Array, "2 6"]:
-        def with_block(sums: Array, block: _Branches) -> tuple[Array, None]:
-            def more() -> Array:
+    def transferred_at(point: Array) -> Float[Array, "2 6"]:
+        def add_block(sums: Array, block: _Branches) -> tuple[Array, None]:
+            def added() -> Array:
                 d = displacement(point[None], block.middles, state.side, state.tilt)
                 g = graining.segment(d, block.normals, block.lengths)
-                return sums + _dot(jnp.stack([g, g * d[:, 1]]), block.handed)
+                return sums + _dot(jnp.stack([g, g * d[:, 1]]), block.transferred)
 
-            return lax.cond(jnp.any(block.loaded), more, lambda: sums), None
+            return lax.cond(jnp.any(block.loaded), added, lambda: sums), None
 
-        nothing = jnp.zeros((2, 6), masses.dtype)
-        return nothing if blocks is None else lax.scan(with_block, nothing, blocks)[0]
+        zeros = jnp.zeros((2, 6), masses.dtype)
+        return zeros if blocks is None else lax.scan(add_block, zeros, blocks)[0]
 
-    def at(point: Array) -> Fields:
+    def fields(point: Array) -> Fields:
         d = displacement(point[None], state.positions, state.side, state.tilt)
         g, wx = graining.value(d), cx - shear_rate * d[:, 1]
         moments = _dot(jnp.stack([g, g * wx, g * wx**2, g * wx**3]), carried)
         (rho, y, yy, yyy, number, loss), (x, xy, xyy, *_), (xx, xxy, *_), (xxx, *_) = moments
-        handed, handed_above = handed_at(point)
+        transferred, first_moment = transferred_at(point)  # weighted by G, and by G d_y
 
         w = jnp.stack([x, y]) / jnp.where(rho > 0, rho, 1)
         kinetic_stress = jnp.stack([xx, xy, xy, yy]).reshape(2, 2) - rho * w[:, None] * w[None, :]
-        contact_stress = handed[:4].reshape(2, 2)
-        energy_flux = jnp.stack([xxx + xyy, xxy + yyy]) / 2 + handed[4:] - shear_rate * handed_above[0:4:2]
+        contact_stress = transferred[:4].reshape(2, 2)
+        energy_flux = jnp.stack([xxx + xyy, xxy + yyy]) / 2 + transferred[4:] - shear_rate * first_moment[0:4:2]
         heat_flux = energy_flux - (xx + yy) / 2 * w - _dot(kinetic_stress + contact_stress, w)
         velocity = w + shear_rate * jnp.stack([point[1], jnp.zeros_like(rho)])
         return Fields(rho, number, velocity, kinetic_stress, contact_stress, heat_flux, loss)
 
-    return lax.map(at, points, batch_size=max(1, min(points.shape[0], _POINTS_AT_ONCE)))
+    return lax.map(fields, points, batch_size=max(1, min(points.shape[0], _POINTS_AT_ONCE)))

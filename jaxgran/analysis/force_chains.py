@@ -1,6 +1,6 @@
-"""Force chains: clusters of grains that push at once, their life times, their forces and the fabric of their contacts.
+"""Force chains: clusters of grains that push at the same time, their lifetimes, their forces and their fabric.
 
-A contact is *loaded* when it carries an impulse; a *cluster* is a set of grains that loaded contacts connect.
+A contact is *loaded* when it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
 """
 
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from jaxgran.analysis.series import Curve, Measured, Sums, by_time, centres, his
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
 
-_DIRECTIONS = 12  # on the half circle, for the mean force at an angle
+_DIRECTIONS = 12  # bins of 15° on the half circle, for the mean force at an angle
 
 
 class Loaded(NamedTuple):
@@ -40,12 +40,12 @@ class Loaded(NamedTuple):
     distances: Float[np.ndarray, " loaded"]
 
     def moments(self) -> Float[np.ndarray, "loaded 2 2"]:
-        """σ^a F^b of each contact, the contact stress being their sum over the area."""
+        """σ^a F^b of each contact, in mσ²γ̇². The contact stress is their sum divided by the area of the cell."""
         return (self.force * self.distances)[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
 
 
 class PairForces(NamedTuple):
-    """The pairs of grains that push each other at some time of a series, and their mean forces over all its times.
+    """The pairs of grains that push each other at any time of a series, and their mean forces over all its times.
 
     =============  ========  =====  ===================================================================
     field          shape     unit   meaning
@@ -63,7 +63,7 @@ class PairForces(NamedTuple):
 
 
 class Clusters(NamedTuple):
-    """Clusters of each time; labels are unique in the series.
+    """Clusters at each time; no label occurs at two times.
 
     ======  ===============  ====  ==================================================================
     field   shape            unit  meaning
@@ -80,8 +80,9 @@ class Clusters(NamedTuple):
 class ClusterShare(NamedTuple):
     """Shares of clusters of three or more grains in the loaded contacts, and in their force, pressure and shear stress.
 
-    The pressure is Σ tr(σF)/2 and the shear stress −Σ σ^x F^y of the contacts. Clusters of two are binary collisions:
-    there F = F_bc exactly, so only these shares can make the force ratio exceed one.
+    All are scalars between snapshots of one series. The pressure of the contacts is Σ tr(σF)/2, their shear stress
+    −Σ σ^x F^y. Clusters of two grains are binary collisions, in which F = F_bc exactly. So only larger clusters can
+    raise the force ratio above one.
     """
 
     contacts: Measured
@@ -91,10 +92,19 @@ class ClusterShare(NamedTuple):
 
 
 class Persistence(NamedTuple):
-    """Probability that grains joined at t are joined at t + τ, and the τ (strain) at which it falls to 1/e.
+    """Probability C(τ) that grains joined at t are joined at t + τ, and the lifetime: the τ at which C falls to 1/e.
 
-    ``contact``: joined by a loaded contact; ``cluster``: in the same cluster. A life time shorter than the first lag is
-    interpolated towards C(0) = 1 and only tells that order of magnitude; one longer than the last lag is NaN.
+    ================  =========  ======  ===========================================
+    field             shape      unit    meaning
+    ================  =========  ======  ===========================================
+    contact           (lags+1,)  strain  C of pairs with a loaded contact
+    cluster           (lags+1,)  strain  C of pairs in the same cluster
+    contact_lifetime  ()         strain  of the contacts
+    cluster_lifetime  ()         strain  of the clusters
+    ================  =========  ======  ===========================================
+
+    A lifetime shorter than the first lag is interpolated from C(0) = 1, so it is only an order of magnitude. A lifetime
+    longer than the last lag is NaN.
     """
 
     contact: Curve
@@ -104,7 +114,7 @@ class Persistence(NamedTuple):
 
 
 class Fabric(NamedTuple):
-    """Anisotropies of the loaded contacts; angles are those of the normals, in radians in (−π/2, π/2].
+    """Anisotropies of the loaded contacts. Angles are those of the normals, in radians in (−π/2, π/2].
 
     =================  ======  ====  ====================================================================
     field              shape   unit  meaning
@@ -136,7 +146,7 @@ def loaded_contacts(seen: Snapshot) -> Loaded:
 
 
 def clusters(seen: Snapshot) -> Clusters:
-    """Clusters of grains that loaded contacts connect, at each time."""
+    """Clusters of grains connected by loaded contacts, at each time."""
     times, grains = series(seen).state.positions.shape[:2]
     load = loaded_contacts(seen)
     edges = load.time * grains + load.i, load.time * grains + load.j
@@ -147,7 +157,7 @@ def clusters(seen: Snapshot) -> Clusters:
 
 
 def pair_forces(seen: Snapshot) -> PairForces:
-    """Mean force between each two grains over a series: with one snapshot a time step, impulse over elapsed time."""
+    """Mean force of each pair over a series. With one snapshot a time step it is the impulse over the elapsed time."""
     load, sizes = loaded_contacts(seen), clusters(seen).sizes
     times, grains = sizes.shape
     keys = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
@@ -158,21 +168,21 @@ def pair_forces(seen: Snapshot) -> PairForces:
 
 
 def cluster_sizes(seen: Snapshot, edges: ArrayLike | None = None) -> Curve:
-    """Share of the clusters of two or more grains that have a size, averaged over the whole numbers in each bin.
+    """Share of each size among the clusters of two or more grains, averaged over the sizes in each bin.
 
-    The edges of the bins are whole numbers, each bin containing its lower one; without them, every size is one.
+    ``edges`` are the edges of the bins, whole numbers; a bin contains its lower edge. Without them each size is a bin.
     """
     sizes = clusters(seen).sizes
     edges = np.arange(2, max(sizes.max(), 2) + 2) if edges is None else np.asarray(edges)
     time = np.repeat(np.arange(len(sizes)), sizes.shape[1])
-    once = np.where(sizes > 1, 1 / sizes, 0)  # so that the grains of a cluster make one
-    sums = {"n": histograms(len(sizes), time, sizes.ravel(), edges, once.ravel()), "all": once.sum(axis=1)}
+    weights = np.where(sizes > 1, 1 / sizes, 0)  # the weights of the grains of a cluster add up to one
+    sums = {"n": histograms(len(sizes), time, sizes.ravel(), edges, weights.ravel()), "all": weights.sum(axis=1)}
     found = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
     return Curve(centres(edges) - 0.5, *found)
 
 
 def cluster_share(seen: Snapshot) -> ClusterShare:
-    """What clusters of three or more grains carry of the contacts, forces and contact stress."""
+    """Shares of clusters of three or more grains in the contacts, forces and contact stress."""
     load, sizes = loaded_contacts(seen), clusters(seen).sizes
     moments = load.moments()
     pressure, shear = (moments[:, 0, 0] + moments[:, 1, 1]) / 2, -moments[:, 0, 1]
@@ -183,16 +193,16 @@ def cluster_share(seen: Snapshot) -> ClusterShare:
         "many": by_time(len(sizes), load.time, carried * in_cluster),
     }
     found = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
-    return ClusterShare(*(Measured(*both) for both in zip(*found, strict=True)))
+    return ClusterShare(*(Measured(*share) for share in zip(*found, strict=True)))
 
 
 def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence:
     """How long contacts and clusters last: the intermittent correlation function, in which a pair may part in between.
 
     Args:
-      seen: a series at equal distances of strain, best one at every time step.
-      interval: strain between its snapshots.
-      lags: numbers of snapshots from 1 to less than the times, in rising order.
+      seen: a series at equal intervals of strain, best with a snapshot of every time step.
+      interval: strain between successive snapshots.
+      lags: whole numbers of snapshots in rising order, at least 1 and below the number of times.
 
     Source: D. C. Rapaport, Mol. Phys. 50, 1151 (1983), for bonds.
     """
@@ -202,29 +212,30 @@ def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence
     bonds = coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
 
     def joined(lag: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs joined both at t and at t + lag, for each t, by contact and by cluster."""
+        """Number of pairs joined both at t and at t + lag, for each t: by a contact, and by a cluster."""
         now, later = labels[: times - lag].astype(np.int64), labels[lag:].astype(np.int64)
         _, first, common = np.unique(now * (labels.max() + 1) + later, return_index=True, return_counts=True)
         pairs = np.bincount(first // grains, common * (common - 1) / 2, minlength=times)
         return np.pad(np.asarray(bonds[: times - lag].multiply(bonds[lag:]).sum(axis=1)).ravel(), (0, lag)), pairs
 
-    at = np.append(0, lags)
-    both = np.stack([np.stack(joined(lag), axis=-1) for lag in at.tolist()], axis=1)  # (times, lags, 2)
-    before = (np.arange(times)[:, None] < times - at)[:, :, None]  # the t that have a t + lag
-    sums = {"both": both, "once": both[:, :1] * before}
+    all_lags = np.append(0, lags)
+    both = np.stack([np.stack(joined(lag), axis=-1) for lag in all_lags.tolist()], axis=1)  # (times, lags, 2)
+    in_series = (np.arange(times)[:, None] < times - all_lags)[:, :, None]  # times t for which t + lag is in the series
+    sums = {"both": both, "start": both[:, :1] * in_series}
 
     def estimate(s: Sums) -> Sums:
-        curves = ratio(s["both"], s["once"])
-        return {"curves": curves, **{name: _fold(at, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}}
+        curves = ratio(s["both"], s["start"])
+        lifetimes = {name: _decay(all_lags, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}
+        return {"curves": curves, **lifetimes}
 
     found = with_errors(estimate, sums)
-    contact, cluster = (Curve(at * interval, *(x[:, k] for x in found["curves"])) for k in (0, 1))
+    contact, cluster = (Curve(all_lags * interval, *(x[:, k] for x in found["curves"])) for k in (0, 1))
     lifetimes = (Measured(*(np.asarray(x * interval) for x in found[name])) for name in ("contact", "cluster"))
     return Persistence(contact, cluster, *lifetimes)
 
 
 def force_distribution(seen: Snapshot, edges: ArrayLike) -> Curve:
-    """Probability density P of F/⟨F⟩ over the loaded contacts, in bins with the given edges; its integral is one."""
+    """Probability density of F/⟨F⟩ over the loaded contacts, in bins with the given edges; its integral is one."""
     load, edges = loaded_contacts(seen), np.asarray(edges)
     times = len(series(seen).impulses)
     counts = histograms(times, load.time, load.force * load.force.size / load.force.sum(), edges)
@@ -236,25 +247,25 @@ def force_distribution(seen: Snapshot, edges: ArrayLike) -> Curve:
 def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
     """Correlation g_F(r) = ⟨F F'⟩(r)/⟨F⟩² − 1 of loaded contacts of one time whose contact points are r apart.
 
-    ⟨F⟩ is the mean over the series, so what all forces of a snapshot have in common stays as a constant at large r.
-    The edges of the bins, in σ, are below half the side.
+    ⟨F⟩ is the mean over the series. Variations common to all forces of a snapshot therefore remain as a constant at
+    large r. The edges of the bins, in σ, are below half the side.
     """
     frames, load, edges = series(seen), loaded_contacts(seen), np.asarray(edges)
     radii, times = frames.state.grains.radii, len(frames.impulses)
-    reach = radii[load.time, load.i] + radii[load.time, load.j]
-    share = radii[load.time, load.j] / reach * load.distances
-    points = frames.state.positions[load.time, load.j] + share[:, None] * load.normals
+    contact_distances = radii[load.time, load.i] + radii[load.time, load.j]
+    from_j = radii[load.time, load.j] / contact_distances * load.distances
+    points = frames.state.positions[load.time, load.j] + from_j[:, None] * load.normals
     both, pairs = np.zeros((2, times, len(edges) - 1))
     for t in range(times):
         here, force = points[load.time == t], load.force[load.time == t]
         a, b = np.triu_indices(len(here), 1)
         r = np.linalg.norm(minimum_image(here[a] - here[b], frames.state.side[t], frames.state.tilt[t]), axis=-1)
         pairs[t], both[t] = np.histogram(r, edges)[0], np.histogram(r, edges, weights=force[a] * force[b])[0]
-    alone = np.stack([np.ones_like(load.force), load.force], axis=-1)
-    sums = {"both": both, "pairs": pairs, "alone": by_time(times, load.time, alone)}
+    single = np.stack([np.ones_like(load.force), load.force], axis=-1)
+    sums = {"both": both, "pairs": pairs, "single": by_time(times, load.time, single)}
 
     def estimate(s: Sums) -> Sums:
-        mean = ratio(s["alone"][..., 1:], s["alone"][..., :1])
+        mean = ratio(s["single"][..., 1:], s["single"][..., :1])
         return {"g": ratio(ratio(s["both"], s["pairs"]), mean**2) - 1}
 
     return Curve(centres(edges), *with_errors(estimate, sums)["g"])
@@ -263,9 +274,9 @@ def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
 def fabric(seen: Snapshot) -> Fabric:
     """Fabric tensor and the anisotropies of contacts and forces.
 
-    For discs of about one size the stress follows from them: (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, with the product kept
-    (a_c + a_n)/(2 + a_c a_n), where all principal directions agree. The mean force at an angle is taken in
-    bins of 15°; the anisotropies of force are NaN if one of them is empty.
+    For discs of about one size whose principal directions agree, the stress follows from them:
+    (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, or (a_c + a_n)/(2 + a_c a_n) with the product kept. The mean force at an
+    angle is taken in bins of 15°. The anisotropies of force are NaN if a bin is empty.
 
     Source: L. Rothenburg and R. J. Bathurst, Géotechnique 39, 601 (1989).
     """
@@ -279,8 +290,9 @@ def fabric(seen: Snapshot) -> Fabric:
         "contacts": histograms(times, load.time, angle, edges),
         "force": histograms(times, load.time, angle, edges, load.force),
     }
-    wide = np.pi / _DIRECTIONS
-    wave = np.stack([np.cos(2 * centres(edges)), np.sin(2 * centres(edges))]) * wide / np.sin(wide)  # undoes the bins
+    width = np.pi / _DIRECTIONS
+    wave = np.stack([np.cos(2 * centres(edges)), np.sin(2 * centres(edges))])
+    wave = wave * width / np.sin(width)  # corrects for the average over the width of a bin
 
     def estimate(s: Sums) -> Sums:
         normals, stress = (ratio(x, np.trace(x, axis1=-2, axis2=-1)[..., None, None]) for x in (s["nn"], s["stress"]))
@@ -300,12 +312,12 @@ def fabric(seen: Snapshot) -> Fabric:
 
 
 def _mode(x: Any, y: Any) -> tuple[Any, Any]:
-    """Amplitude of a second Fourier mode and its angle."""
+    """Amplitude and angle of a second Fourier mode."""
     return np.hypot(x, y), np.arctan2(y, x) / 2
 
 
-def _fold(at: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """Where a curve (..., points), one at its first point, first falls to 1/e; NaN if it does not."""
+def _decay(at: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """Where a curve (..., points) that starts at one first falls to 1/e, by interpolation; NaN if it does not."""
     below = curve < 1 / np.e
     k = np.maximum(np.argmax(below, axis=-1), 1)
     low, high = (np.take_along_axis(curve, n[..., None], axis=-1)[..., 0] for n in (k, k - 1))

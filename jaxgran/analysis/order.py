@@ -11,11 +11,14 @@ from jaxgran.analysis.force_chains import loaded_contacts
 from jaxgran.analysis.series import Curve, Measured, all_pairs, centres, histograms, ratio, series, with_errors
 from jaxgran.dynamics.snapshots import Snapshot
 
-_IMAGE_SPACINGS = 5  # margin of images around the cell, in mean spacings: wider than any edge of the triangulation
+_IMAGE_SPACINGS = 5  # margin of images around the cell, in mean grain spacings; longer than any Delaunay edge
 
 
 class Coordination(NamedTuple):
-    """Contacts per grain, twice their number over the grains; a rattler has fewer than three, found recursively."""
+    """Contacts per grain: twice the number of contacts over the number of grains.
+
+    A rattler has fewer than three contacts. Rattlers are removed until none is left.
+    """
 
     loaded: Measured
     loaded_without_rattlers: Measured
@@ -24,7 +27,10 @@ class Coordination(NamedTuple):
 
 
 class HexaticOrder(NamedTuple):
-    """|⟨ψ₆⟩| over the grains, about N^(−1/2) without order, and ⟨|ψ₆|⟩; both are 1 in a hexagonal crystal."""
+    """``overall`` |⟨ψ₆⟩| over the grains, about N^(−1/2) without order, and ``local`` ⟨|ψ₆|⟩.
+
+    Both are 1 in a hexagonal crystal.
+    """
 
     overall: Measured
     local: Measured
@@ -43,7 +49,9 @@ def coordination(seen: Snapshot, tolerance: float = 1e-3) -> Coordination:
     frames, load = series(seen), loaded_contacts(seen)
     times, grains = frames.state.positions.shape[:2]
     radii = frames.state.grains.radii
-    ends = np.zeros((4, times))  # twice the contacts: loaded, those without rattlers, touching, those without rattlers
+    ends = np.zeros(
+        (4, times)
+    )  # twice the contacts: loaded, loaded without rattlers, touching, touching without rattlers
     kept = np.full((4, times), float(grains))
     for t, (i, j, separations) in enumerate(all_pairs(frames)):
         touching = np.linalg.norm(separations, axis=-1) - radii[t, i] - radii[t, j] <= tolerance
@@ -52,23 +60,23 @@ def coordination(seen: Snapshot, tolerance: float = 1e-3) -> Coordination:
             ends[2 * k, t] = 2 * len(a)
             ends[2 * k + 1, t], kept[2 * k + 1, t] = _without_rattlers(a, b, grains)
     found = with_errors(lambda s: {"z": ratio(s["ends"], s["kept"])}, {"ends": ends.T, "kept": kept.T})["z"]
-    return Coordination(*(Measured(*both) for both in zip(*found, strict=True)))
+    return Coordination(*(Measured(*number) for number in zip(*found, strict=True)))
 
 
 def pair_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
-    """Pair correlation g at the separation scaled by the contact distance, r/((d_i + d_j)/2), so that contact is at 1.
+    """Pair correlation g against r/((d_i + d_j)/2), the separation over the contact distance, so that contact is at 1.
 
-    The pairs of a bin over those of points at random in the cell, so g = 1 without correlations; right while the last
-    edge times the largest diameter is below half the side.
+    g is the number of pairs in a bin over the number for random points in the cell: g = 1 without correlations. It is
+    valid while the last edge times the largest diameter is below half the side.
     """
     frames, edges = series(seen), np.asarray(edges)
     i, j = np.triu_indices(frames.state.positions.shape[1], 1)
-    reach = frames.state.grains.radii[:, i] + frames.state.grains.radii[:, j]
+    contact_distances = frames.state.grains.radii[:, i] + frames.state.grains.radii[:, j]
     pairs = [
-        np.histogram(np.linalg.norm(separations, axis=-1) / here, edges)[0]
-        for (_, _, separations), here in zip(all_pairs(frames), reach, strict=True)
+        np.histogram(np.linalg.norm(separations, axis=-1) / touching, edges)[0]
+        for (_, _, separations), touching in zip(all_pairs(frames), contact_distances, strict=True)
     ]
-    at_random = np.pi * np.sum(reach**2, axis=1) / frames.state.side**2
+    at_random = np.pi * np.sum(contact_distances**2, axis=1) / frames.state.side**2
     expected = at_random[:, None] * np.diff(edges**2)
     found = with_errors(
         lambda s: {"g": ratio(s["pairs"], s["expected"])}, {"pairs": np.stack(pairs), "expected": expected}
@@ -77,7 +85,7 @@ def pair_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
 
 
 def hexatic_order(seen: Snapshot) -> HexaticOrder:
-    """Order in sixfold bond angles, ψ₆ of a grain being the mean of exp(6iθ) over its Delaunay neighbours.
+    """Sixfold order of the bond angles θ: ψ₆ of a grain is the mean of exp(6iθ) over its Delaunay neighbours.
 
     Source: D. R. Nelson and B. I. Halperin, Phys. Rev. B 19, 2457 (1979).
     """
@@ -92,11 +100,11 @@ def hexatic_order(seen: Snapshot) -> HexaticOrder:
         psi = np.add.reduceat(waves, first[:grains]) / count
         orders.append([1.0, np.abs(psi.mean()), np.abs(psi).mean()])
     found = with_errors(lambda s: {"psi": s["x"][..., 1:] / s["x"][..., :1]}, {"x": np.array(orders)})["psi"]
-    return HexaticOrder(*(Measured(*both) for both in zip(*found, strict=True)))
+    return HexaticOrder(*(Measured(*order) for order in zip(*found, strict=True)))
 
 
 def profiles(seen: Snapshot, bins: int = 10) -> Profiles:
-    """Density and mean velocity in bands of equal height across the cell, for a flow with one side at all times."""
+    """Density and mean velocity in bands of equal height across the cell. The side must be the same at all times."""
     frames = series(seen)
     state, shear_rate = frames.state, frames.shear_rate
     times, grains = state.positions.shape[:2]
@@ -113,7 +121,7 @@ def profiles(seen: Snapshot, bins: int = 10) -> Profiles:
 
 
 def _without_rattlers(i: np.ndarray, j: np.ndarray, grains: int) -> tuple[int, int]:
-    """Twice the contacts, and the grains, that are left when grains with fewer than three are taken out in turn."""
+    """Twice the contacts, and the grains, left when grains with fewer than three contacts are removed in turn."""
     while True:
         count = np.bincount(np.concatenate([i, j]), minlength=grains)
         kept = (count[i] > 2) & (count[j] > 2)
@@ -123,7 +131,7 @@ def _without_rattlers(i: np.ndarray, j: np.ndarray, grains: int) -> tuple[int, i
 
 
 def _with_images(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "points 2"]:
-    """The grains, first, and their images in a margin around the cell."""
+    """Positions of the grains, then of their images in a margin around the cell."""
     lattice = side * np.array([[1, 0], [tilt, 1]])
     fractional = positions @ np.linalg.inv(lattice)
     fractional -= np.floor(fractional)

@@ -1,11 +1,11 @@
-"""How fast the derivatives of a flow grow with strain, and how near a run comes to points that have none.
+"""How fast the derivatives of a flow grow with strain, and how near a run comes to points without a derivative.
 
-Colliding discs are chaotic: a change of the restitution changes the state exponentially in the strain. A derivative of
-the state is therefore exact and of no use beyond a horizon at which it exceeds the size of the state itself.
+Colliding discs are chaotic: the effect of a change of the restitution on the state grows exponentially with strain.
+The derivative of the state is exact, but it is useless beyond the strain at which it exceeds the size of the state.
 
-Within the fixed time steps of a run the state is a smooth function of its parameters, except where it jumps: a contact
-of the solve neither presses nor parts, or a pair becomes a contact at the very end of a step. There left and right
-derivatives differ, and the one returned is that of the contacts found.
+Within the fixed time steps of a run the state is a smooth function of its parameters, except at two kinds of points. At
+one kind a contact of the solve neither presses nor parts. At the other a pair becomes a contact exactly at the end of a
+step. There left and right derivatives differ, and the derivative returned is that of the contacts found.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 
-_MOST_POINTS = 10**6
+_MOST_POINTS = 10**6  # of a growth curve, which is held in memory
 
 
 @jax.tree_util.register_dataclass
@@ -51,14 +51,14 @@ class Growth:
 
 
 def growth(flow: ShearFlow, state: State, strain: float | Array, count: int, moving_contacts: bool = True) -> Growth:
-    """The derivative of a flow with respect to its restitution at equal distances of strain.
+    """The derivative of a flow with respect to its restitution at equal intervals of strain.
 
     Args:
       flow: parameters, with a small ``tolerance`` (1e-8 or less).
       state: the flow at the beginning.
-      strain: strain in all.
+      strain: total strain.
       count: number of points, static.
-      moving_contacts: whether contacts move in time, see ``dynamics``.
+      moving_contacts: whether the derivative lets contacts move in time, see ``dynamics.plain``.
 
     Raises:
       ValueError: the strain is shorter than a time step for each point.
@@ -74,8 +74,8 @@ def _growth(flow: ShearFlow, state: State, strain: Array, count: int, moving_con
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
 
-    def part(at, steps: Array):
-        (now, change), status = at
+    def interval(carry, steps: Array):
+        (now, change), status = carry
 
         def run(alpha, positions, velocities, tilt):
             start = State(now.grains, positions, velocities, now.side, tilt)
@@ -89,20 +89,20 @@ def _growth(flow: ShearFlow, state: State, strain: Array, count: int, moving_con
         size = jnp.sqrt(jnp.mean(jnp.sum(dx**2 + (dc / flow.shear_rate) ** 2, axis=-1)))
         return ((State(now.grains, x, c, now.side, tilt), (dx, dc, dtilt)), status), (size, status)
 
-    none = (jnp.zeros_like(state.positions), jnp.zeros_like(state.velocities), jnp.zeros_like(state.tilt))
-    _, (sizes, status) = lax.scan(part, ((state, none), jnp.int32(0)), jnp.diff(edges).astype(jnp.int32))
+    zero = (jnp.zeros_like(state.positions), jnp.zeros_like(state.velocities), jnp.zeros_like(state.tilt))
+    _, (sizes, status) = lax.scan(interval, ((state, zero), jnp.int32(0)), jnp.diff(edges).astype(jnp.int32))
     return Growth(edges[1:] * flow.shear_rate * flow.timestep, sizes, status)
 
 
 def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float, float]:
-    """Rate λ of |∂(state)/∂α| ∝ exp(λ γ), per unit strain, with its standard error.
+    """Rate λ of |∂(state)/∂α| ∝ exp(λ γ), per unit strain γ, with its standard error.
 
-    The rate of each run is the least-squares slope over the later three quarters of its strain, as the derivative is
-    zero at the beginning; the error is that of the mean over runs.
+    The rate of each run is the least-squares slope over the last three quarters of its strain, because the derivative
+    is zero at the beginning. The error is that of the mean over runs.
 
     Args:
       strain: (points,).
-      derivative: (runs, points), of two or more runs.
+      derivative: (runs, points), of two or more runs, as in ``Growth``.
     """
     later = strain >= strain[-1] / 4
     slopes = np.polyfit(strain[later], np.log(derivative[:, later]).T, 1)[0]
@@ -110,17 +110,17 @@ def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float
 
 
 class Margins(NamedTuple):
-    """How far each step of a run is from a change of its contacts, zero at a point without a derivative.
+    """How far each step of a run is from a change of its contacts; zero at a point without a derivative.
 
-    ==========  ========  ==============================================================================
-    field       shape     meaning
-    ==========  ========  ==============================================================================
-    pressing    (times,)  least over the contacts of the larger of W_kk p_k and the velocity at which the
-                          contact parts, over the root mean square velocity of approach; infinite without
-                          contacts
-    activation  (times,)  least over the pairs of the distance, in time steps, between the time at which
-                          the pair touches and the end of the look-ahead that makes it a contact
-    ==========  ========  ==============================================================================
+    ==========  ========  ====  ============================================================================
+    field       shape     unit  meaning
+    ==========  ========  ====  ============================================================================
+    pressing    (times,)  –     for each contact the larger of W_kk p_k and the velocity at which it parts;
+                                the smallest of these over the root mean square velocity of approach;
+                                infinite without contacts
+    activation  (times,)  dt    for each pair the time between its touching and the end of the look-ahead
+                                that makes it a contact; the smallest of these
+    ==========  ========  ====  ============================================================================
     """
 
     pressing: Float[Array, " times"]
@@ -134,7 +134,7 @@ def margins(activation_fraction: float, series: Snapshot) -> Margins:
     All pairs of grains are compared, so memory and time grow as N².
 
     Args:
-      activation_fraction: that of the flow, static.
+      activation_fraction: look-ahead of the flow in time steps, static.
       series: snapshots with a leading (times,) axis.
     """
 
@@ -142,11 +142,11 @@ def margins(activation_fraction: float, series: Snapshot) -> Margins:
         state, contacts = seen.state, seen.contacts
         count = state.grains.radii.size
         impulses = seen.impulses / (1 + seen.restitution)
-        pushed = diagonal(contacts, count) * impulses
+        pressing = diagonal(contacts, count) * impulses
         parting = delassus_product(contacts, impulses, count) + contacts.approach
-        used = jnp.sum(contacts.used.astype(pushed.dtype))
+        used = jnp.sum(contacts.used.astype(pressing.dtype))
         scale = jnp.sqrt(jnp.sum(contacts.approach**2) / jnp.maximum(1, used))
-        strict = jnp.where(contacts.used, jnp.maximum(pushed, parting), jnp.inf)
+        strict = jnp.where(contacts.used, jnp.maximum(pressing, parting), jnp.inf)
         i, j = jnp.triu_indices(count, 1)
         separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)
         velocities = relative_velocity(state.velocities, i, j, separations, seen.shear_rate)

@@ -1,7 +1,7 @@
 """Averages over a series of snapshots on the host, with standard errors.
 
-Every average over times comes with its standard error, by the jackknife over blocks of successive times, as the times
-are correlated (``statistics``).
+The standard errors are those of the jackknife over blocks of successive times, because successive times are correlated
+(``statistics``).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -15,20 +15,20 @@ from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import minimum_image
 from jaxgran.statistics import jackknife
 
-Sums = Mapping[str, Any]  # arrays, or scalars of NumPy, by name
+Sums = Mapping[str, Any]  # NumPy arrays or scalars by name
 
 BLOCKS = 32  # of successive times, for the standard errors
 
 
 class Measured(NamedTuple):
-    """An average over the times of a series and its standard error, arrays of one shape; NaN where nothing was seen."""
+    """An average over the times of a series and its standard error, of one shape; NaN where nothing was counted."""
 
     value: np.ndarray
     error: np.ndarray
 
 
 class Curve(NamedTuple):
-    """A measured function, three arrays of shape (points,): where, its value, and the standard error of the value."""
+    """A measured function: points, values and standard errors of the values, arrays of shape (points,)."""
 
     at: np.ndarray
     value: np.ndarray
@@ -36,7 +36,7 @@ class Curve(NamedTuple):
 
 
 def series(seen: Snapshot) -> Any:
-    """The Snapshot in NumPy arrays (it declares those of JAX), with a (times,) axis also where one time was given."""
+    """A Snapshot with NumPy arrays in place of JAX arrays; a single snapshot becomes a series of one time."""
     seen = jax.tree.map(np.asarray, seen)
     return seen if seen.state.side.ndim else jax.tree.map(lambda x: x[None], seen)
 
@@ -44,8 +44,9 @@ def series(seen: Snapshot) -> Any:
 def with_errors(estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]) -> dict[str, Measured]:
     """Estimates from sums of shape (times, ...) and their standard errors by the jackknife over blocks of times.
 
-    ``estimate`` maps sums with any leading axes in place of the times to named estimates with the same axes. The times
-    are joined in at most ``BLOCKS`` blocks, and these in larger ones, so that correlation between times counts.
+    ``estimate`` maps sums with any leading axes in place of (times,) to named estimates with the same leading axes. The
+    times are joined into at most ``BLOCKS`` blocks, and these into larger ones. So the errors include the correlation
+    between times.
     """
     times = len(next(iter(sums.values())))
     blocks = min(times, BLOCKS)
@@ -56,21 +57,21 @@ def with_errors(estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]
     return {name: Measured(x, np.asarray(error[name])) for name, x in value.items()}
 
 
-def ratio(over: Any, under: Any) -> np.ndarray:
-    """A quotient that is NaN, without a warning, where nothing was counted."""
-    over, under = np.broadcast_arrays(over, under)
-    return np.divide(over, under, out=np.full(over.shape, np.nan), where=under != 0)
+def ratio(numerator: Any, denominator: Any) -> np.ndarray:
+    """A quotient that is NaN, without a warning, where the denominator is zero."""
+    numerator, denominator = np.broadcast_arrays(numerator, denominator)
+    return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator != 0)
 
 
 def all_pairs(frames: Any) -> Iterator[tuple[np.ndarray, np.ndarray, Float[np.ndarray, "pairs 2"]]]:
-    """For each time of a series: grains i < j of every pair, and the minimum-image separation from j to i."""
+    """For each time of a series: grains i < j of every pair, and the minimum-image separation from j to i in σ."""
     i, j = np.triu_indices(frames.state.positions.shape[1], 1)
     for positions, side, tilt in zip(frames.state.positions, frames.state.side, frames.state.tilt, strict=True):
         yield i, j, minimum_image(positions[i] - positions[j], side, tilt)
 
 
 def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Sums of the values of each time, (times, ...)."""
+    """Sums of the values at each time, (times, ...)."""
     sums = np.zeros((times, *values.shape[1:]))
     np.add.at(sums, time, values)
     return sums
@@ -79,7 +80,7 @@ def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:
 def histograms(
     times: int, time: np.ndarray, x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None
 ) -> Float[np.ndarray, "times bins"]:
-    """A histogram of each time; bins contain their lower edge."""
+    """A histogram for each time; bins contain their lower edge."""
     bins = len(edges) - 1
     place = np.searchsorted(edges, x, side="right") - 1
     inside = (place >= 0) & (place < bins)

@@ -1,14 +1,17 @@
-"""What kinetic theory assumes of a flow, measured from snapshots: velocities, pairs at contact, and their correlation.
+"""Tests of the assumptions of kinetic theory on snapshots: velocities, pairs at contact, and their correlation.
 
-Enskog theory takes the velocities of a pair about to collide as independent (molecular chaos) and nearly Gaussian, and
-the number of such pairs as that of equilibrium, χ times that of points at random. In a snapshot, taken before its
-contacts act, they are the pairs that approach each other. Their density over the gap g is extrapolated to contact: a
-sum over the approaching pairs with 0 ≤ g < ε, weighted by W(g) = (9 − 36 g/ε + 30 g²/ε²)/ε, is the value at g = 0 of
-the least-squares parabola. Overlapping pairs have no weight: a contact may act up to half a step's flight after
-touching, so they would be counted on top. Pairs that recede tell of the collision behind them, not of the one that
-theory asks about, and are fewer than they should be within a step's flight of contact.
+Enskog theory makes two assumptions about a pair that is about to collide. The velocities of its grains are independent
+(molecular chaos) and nearly Gaussian. The number of such pairs is that of equilibrium, χ times that of random points.
 
-Snapshots are read on the host, and standard errors are those of blocks of times, see ``series``.
+A snapshot is taken before its contacts act, so the pairs about to collide are those that approach each other. Their
+density over the gap g is extrapolated to contact. A sum over the approaching pairs with 0 ≤ g < ε, weighted by
+W(g) = (9 − 36 g/ε + 30 g²/ε²)/ε, is the value at g = 0 of the least-squares parabola.
+
+Overlapping pairs have no weight. A contact may act up to half a step's flight after touching, so they would be counted
+in addition. Receding pairs are left out: they describe the collision behind them, not the next one. Within a step's
+flight of contact they are also too few.
+
+Snapshots are read on the host. Standard errors are those of blocks of times, see ``series``.
 """
 
 from typing import Any, NamedTuple
@@ -20,10 +23,10 @@ from scipy.special import ndtr
 from jaxgran.analysis.series import Measured, Sums, all_pairs, ratio, series, with_errors
 from jaxgran.dynamics.snapshots import Snapshot
 
-SIZE_CLASSES = 3
-WIDEST_SHELL = 0.1  # σ
-_ANGLES = 32
-_TINY = np.finfo(float).tiny
+SIZE_CLASSES = 3  # classes of equally many grains
+WIDEST_SHELL = 0.1  # σ, largest range of gaps of an extrapolation to contact
+_ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic
+_TINY = np.finfo(float).tiny  # avoids a division by zero
 
 
 class VelocityDistribution(NamedTuple):
@@ -40,11 +43,12 @@ class VelocityDistribution(NamedTuple):
     sonine_excess       ()         –       a₂ less that of an anisotropic Gaussian
     size_classes        (classes,) σ       mean diameters of classes of equally many grains
     size_temperatures   (classes,) mσ²γ̇²   T of each class; all equal with equipartition
-    size_tensors        (classes, 2, 2)    ⟨w w⟩ of each class
+    size_tensors        (classes,  mσ²γ̇²   ⟨w w⟩ of each class
+                        2, 2)
     ==================  =========  ======  ============================================================================
 
     An anisotropic Gaussian has ⟨w⁴⟩ = (tr S)² + 2 tr S² with S = ⟨w w⟩, hence a₂ = (anisotropy² + shear²)/2.
-    Temperatures that differ from grain to grain or vary in time add their relative variance to a₂.
+    If the temperature differs from grain to grain or varies in time, its relative variance adds to a₂.
     """
 
     temperature: Measured
@@ -59,26 +63,26 @@ class VelocityDistribution(NamedTuple):
 
 
 class NearContact(NamedTuple):
-    """Approaching pairs at contact, alone and over what Enskog theory has at the temperatures measured.
+    """Approaching pairs at contact, measured and relative to Enskog theory at the measured temperatures.
 
     ====================  ======  =====  =========================================================================
     field                 shape   unit   meaning
     ====================  ======  =====  =========================================================================
-    contact_value         ()      –      χ: approaching pairs over those of points at random
-    contact_ratio         ()      –      the same over the χ of an equilibrium mixture
-    collision_rate        ()      –      collisions per grain and unit strain, each grain counting its own
-    rate_ratio            ()      –      the same over Enskog's
+    contact_value         ()      –      χ: approaching pairs over those of random points
+    contact_ratio         ()      –      contact_value over the χ of an equilibrium mixture
+    collision_rate        ()      –      collisions per grain and unit strain; each grain counts all its collisions
+    rate_ratio            ()      –      collision_rate over Enskog's
     binary_stress         (2, 2)  mγ̇²    collisional stress of kinetic theory, its integral taken over these pairs
     speed_ratio           ()      –      ⟨u_n²⟩ over that of independent Gaussian velocities
     velocity_correlation  ()      –      ⟨w_i·w_j⟩/2T, w = √m c; 0 for independent velocities
     ====================  ======  =====  =========================================================================
 
-    The binary stress is Σ^{ab} = (1/A) Σ W r n^a n^b (1 + α) μ u_n², μ the reduced mass and u_n the normal velocity: a
-    route to the stress of the binary forces without any contact (Lois, Lemaître and Carlson, equation of Σ_bc).
-    Enskog's rate has isotropic directions; the speed ratio takes them as they are, so that fabric does not enter. The
-    collision rate counts encounters, not the steps over which a lasting contact goes on approaching.
+    The binary stress is Σ^{ab} = (1/A) Σ W r n^a n^b (1 + α) μ u_n², μ the reduced mass and u_n the normal velocity. It
+    gives the stress of the binary forces without using any contact (Lois, Lemaître and Carlson, equation of Σ_bc).
+    Enskog's rate has isotropic directions. The speed ratio uses the measured directions, so that fabric does not enter.
+    The collision rate counts encounters. It does not count the steps in which a lasting contact goes on approaching.
 
-    Source: that χ is to be taken before collision, R. Soto and M. Mareschal, Phys. Rev. E 63, 041303 (2001).
+    Source for χ before, not after, the collision: R. Soto and M. Mareschal, Phys. Rev. E 63, 041303 (2001).
     """
 
     contact_value: Measured
@@ -91,16 +95,21 @@ class NearContact(NamedTuple):
 
 
 def velocity_distribution(seen: Snapshot, classes: int = SIZE_CLASSES) -> VelocityDistribution:
-    """Temperature tensor, equipartition and kurtosis of the peculiar velocities."""
+    """Temperature tensor, equipartition and kurtosis of the peculiar velocities.
+
+    Args:
+      seen: a series of snapshots.
+      classes: number of size classes, of equally many grains each.
+    """
     state = series(seen).state
     w = np.sqrt(state.grains.masses)[..., None] * state.velocities
     square = np.sum(w**2, axis=-1)
     radii = state.grains.radii[0]
     members = np.array_split(np.argsort(radii), classes)
-    of_class = np.stack([np.einsum("tia,tib->tab", w[:, m], w[:, m]) for m in members], axis=1)
+    class_sums = np.stack([np.einsum("tia,tib->tab", w[:, m], w[:, m]) for m in members], axis=1)
     sums = {
         "grains": np.ones((len(w), 1, 1, 1)) * np.array([len(m) for m in members])[:, None, None],
-        "ww": of_class,
+        "ww": class_sums,
         "fourth": np.sum(square**2, axis=1),
     }
 
@@ -126,21 +135,22 @@ def velocity_distribution(seen: Snapshot, classes: int = SIZE_CLASSES) -> Veloci
     return VelocityDistribution(**with_errors(estimate, sums), size_classes=diameters)
 
 
-def mixture_contact_value(own: Any, other: Any, radii: Float[np.ndarray, " grains"], nu: float) -> Any:
-    """χ of pairs of discs with the given diameters, numbers or arrays, in an equilibrium mixture of packing fraction ν.
+def mixture_contact_value(d_i: Any, d_j: Any, radii: Float[np.ndarray, " grains"], nu: float) -> Any:
+    """χ of pairs of discs of diameters d_i and d_j, numbers or arrays in σ, in an equilibrium mixture.
 
+    ``radii`` (grains,) in σ are those of the mixture, ν is its packing fraction.
     χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)². For discs of one size it is Henderson's value.
 
     Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
     mean, square = 2 * radii.mean(), 4 * np.mean(radii**2)
-    return 1 / (1 - nu) + 9 / 8 * own * other / (own + other) * nu * mean / square / (1 - nu) ** 2
+    return 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / square / (1 - nu) ** 2
 
 
 def contact_shell(packing_fraction: float) -> float:
-    """Width ε (σ) of the shell of gaps around a grain with about one neighbour, (1 − ν)²/8ν, at most 0.1.
+    """Width ε (σ) of the shell of gaps around a grain that holds about one neighbour, (1 − ν)²/8ν, at most 0.1.
 
-    The number of neighbours per gap is 8νχ, and it falls over about the gap in which one is found.
+    The number of neighbours per unit gap is 8νχ at contact. It decreases over about the gap that holds one neighbour.
     """
     return min(WIDEST_SHELL, (1 - packing_fraction) ** 2 / (8 * packing_fraction))
 
@@ -149,10 +159,10 @@ def near_contact(seen: Snapshot, shell: float | None = None) -> NearContact:
     """Contact value, collision rate, binary stress and velocity correlation of the pairs at contact.
 
     Args:
-      seen: a series; several snapshots while a pair crosses the shell add little.
+      seen: a series. Several snapshots during the time in which a pair crosses the shell add little.
       shell: ε in σ, over which the densities are extrapolated, by default ``contact_shell``. It should be several times
-        the flight of a time step. Where results go on changing as it is narrowed, as in clustering flows, the density
-        has no value at contact, and they are those of the pairs within ε.
+        the flight of a time step. If the results keep changing as it is narrowed, as in clustering flows, the density
+        has no value at contact. The results are then those of the pairs within ε.
     """
     frames = series(seen)
     state, velocities = frames.state, velocity_distribution(seen)
@@ -185,9 +195,7 @@ def near_contact(seen: Snapshot, shell: float | None = None) -> NearContact:
         mean = s["rows"] / s["rows"][..., -1:]
         pairs, flux, square, independent, correlation = np.moveaxis(mean[..., :5], -1, 0)
         temperature = mean[..., 9]
-        heated = ratio(
-            temperature, velocities.temperature.value
-        )  # Enskog's rate goes as √T: the noise they share cancels
+        heated = ratio(temperature, velocities.temperature.value)  # Enskog's rate goes as √T: common noise cancels
         return {
             "contact_value": ratio(pairs, at_random),
             "contact_ratio": ratio(pairs, enskog),
@@ -202,7 +210,7 @@ def near_contact(seen: Snapshot, shell: float | None = None) -> NearContact:
 
 
 def _grain_tensors(radii: np.ndarray, velocities: VelocityDistribution) -> Float[np.ndarray, "grains 2 2"]:
-    """The temperature tensor of the size class of each grain."""
+    """For each grain the temperature tensor of its size class, in mσ²γ̇²."""
     tensors = np.zeros((len(radii), 2, 2))
     classes = len(velocities.size_classes)
     for members, tensor in zip(np.array_split(np.argsort(radii), classes), velocities.size_tensors.value, strict=True):
@@ -213,12 +221,12 @@ def _grain_tensors(radii: np.ndarray, velocities: VelocityDistribution) -> Float
 def _normal_variance(tensors: np.ndarray, i: np.ndarray, j: np.ndarray, n: np.ndarray) -> np.ndarray:
     """Variance of the relative velocity along n of independent grains; n is (pairs, 2)."""
     x, y = n[..., 0], n[..., 1]
-    both = tensors[i] + tensors[j]
-    return x * x * both[:, 0, 0] + 2 * x * y * both[:, 0, 1] + y * y * both[:, 1, 1]
+    relative = tensors[i] + tensors[j]
+    return x * x * relative[:, 0, 0] + 2 * x * y * relative[:, 0, 1] + y * y * relative[:, 1, 1]
 
 
 def _approach_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """⟨1⟩, ⟨−u⟩ and ⟨u²⟩ over the negative values of a Gaussian u."""
+    """Averages of 1, −u and u² over the negative values of a Gaussian u, zero elsewhere."""
     deviation = np.sqrt(np.maximum(variance, _TINY))
     z = -mean / deviation
     share, bell = ndtr(z), np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
@@ -228,17 +236,18 @@ def _approach_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarra
 def _enskog(
     radii: np.ndarray, masses: np.ndarray, tensors: np.ndarray, side: float, shear_rate: float
 ) -> tuple[float, float, float]:
-    """Approaching pairs per gap at contact: points at random, with Enskog's χ, and the flux of these towards contact.
+    """Approaching pairs per gap at contact: of random points, with Enskog's χ, and the flux of the latter to contact.
 
-    Sums over all pairs of (d/A) ∮ dn, without and with χ, of the moments of the approach of Gaussian velocities.
+    Each is a sum over all pairs of (d/A) ∮ dn, without or with χ, of a moment of the approach of Gaussian velocities.
     """
     i, j = np.triu_indices(len(radii), 1)
-    reach = radii[i] + radii[j]
+    contact_distances = radii[i] + radii[j]
     chi = mixture_contact_value(2 * radii[i], 2 * radii[j], radii, np.pi * np.sum(radii**2) / side**2)
     sums = np.zeros(3)
     for angle in (np.arange(_ANGLES) + 0.5) * np.pi / _ANGLES:
         n = np.array([np.cos(angle), np.sin(angle)])
-        share, first, _ = _approach_moments(shear_rate * reach * n[0] * n[1], _normal_variance(tensors, i, j, n))
-        sums += reach @ np.stack([share, chi * share, chi * first], axis=-1)
+        sheared = shear_rate * contact_distances * n[0] * n[1]
+        share, first, _ = _approach_moments(sheared, _normal_variance(tensors, i, j, n))
+        sums += contact_distances @ np.stack([share, chi * share, chi * first], axis=-1)
     at_random, enskog, flux = sums * 2 * np.pi / _ANGLES / side**2
     return at_random, enskog, flux
