@@ -1,19 +1,19 @@
 """A closure for flows beyond kinetic theory: its stresses times fitted corrections, and a law of the force ratio.
 
-With ε = 1 − α² the energy that a collision loses, x = −ln(1 − ν/ν_J) the crowding and ν_J the packing fraction of
-jamming,
+ε = 1 − α² is the share of energy that a collision loses, ν_J the packing fraction of jamming and x = −ln(1 − ν/ν_J) the
+crowding. The laws are
 
     ln(P/P_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · a
     ln(μ/μ_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · b,  μ = τ/P
     ln(force ratio − 1) = (1, 1 − α, ln(1 − α), x, (1 − α) x) · c
 
-The theory is that of anisotropic Gaussian velocities. Both corrections of stresses vanish with ν and as α → 1; the
-excess of the force ratio is positive, vanishes as α → 1, and grows at jamming as a power of ν_J − ν. The powers of ε
-are a choice, made by the errors of points left out: one correction of all α < 1, one of strongly dissipative flows.
-Friction is fitted in place of the shear stress because the noise of τ and P is common and nearly cancels in it.
+The theory is that of anisotropic Gaussian velocities. Both corrections of the stresses vanish as ν → 0 and as α → 1.
+The excess of the force ratio is positive, vanishes as α → 1, and grows at jamming as a power of ν_J − ν. The powers of
+ε were chosen by cross-validation: ε corrects all flows with α < 1, ε⁶ the strongly dissipative ones. Friction is fitted
+instead of the shear stress, because τ and P have common noise that nearly cancels in τ/P.
 
-The laws of the stresses are linear in their coefficients, and fitted by linear least squares; that of the force ratio
-is not, because F itself and not ln(F − 1) has Gaussian errors, and L-BFGS minimises its squares.
+The laws of the stresses are linear in their coefficients and fitted by linear least squares. The law of the force ratio
+F is not linear: F has Gaussian errors, but ln(F − 1) has not. L-BFGS minimises its squares.
 """
 
 from __future__ import annotations
@@ -44,11 +44,14 @@ NEEDED = (*LAWS, *(f"{name}_stderr" for name in LAWS))
 class Law:
     """Fitted coefficients of one law, for the logarithm of what it predicts.
 
-    ============  ==============  ======================================================================
-    coefficients  (terms,)
-    deviations    (terms, terms)  a square root D of their covariance, D Dᵀ, which loses fewer digits
-    scatter       ()              standard deviation of the points about the law beyond their own errors
-    ============  ==============  ======================================================================
+    ============  ==============  =====================================================================
+    field         shape           meaning; all are dimensionless
+    ============  ==============  =====================================================================
+    coefficients  (terms,)        a, b or c of the formulas above
+    deviations    (terms, terms)  square root D of their covariance D Dᵀ; it keeps more digits
+    scatter       ()              standard deviation of the points about the law that their own errors
+                                  do not explain
+    ============  ==============  =====================================================================
     """
 
     coefficients: Float[Numbers, " terms"]
@@ -64,17 +67,20 @@ class Law:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Closure:
-    """Three fitted laws and the plane in which they were fitted; a pytree, so that it passes through ``jit``.
+    """Three fitted laws and the ranges in which they were fitted; a pytree, so it can be passed to ``jit``.
 
-    ======================  ====  ===========================================================================
-    pressure                Law   of P over that of theory, 6 terms
-    macroscopic_friction    Law   of τ/P over that of theory, 6 terms
-    force_ratio             Law   of ⟨F⟩/⟨F_bc⟩, 5 terms
-    restitution_range       (2,)  smallest and largest of the fitted points
-    packing_fraction_range  (2,)  the same
-    jamming_fraction        ()    ν_J
-    timestep                ()    of the fitted map, in 1/γ̇, on which its force ratios depend; NaN if unknown
-    ======================  ====  ===========================================================================
+    ======================  =====  ====  =================================================================
+    field                   shape  unit  meaning
+    ======================  =====  ====  =================================================================
+    pressure                Law    –     of P over that of theory, 6 terms
+    macroscopic_friction    Law    –     of μ = τ/P over that of theory, 6 terms
+    force_ratio             Law    –     of ⟨F⟩/⟨F_bc⟩, 5 terms
+    restitution_range       (2,)   –     smallest and largest α of the fitted points
+    packing_fraction_range  (2,)   –     smallest and largest ν of the fitted points
+    jamming_fraction        ()     –     ν_J
+    timestep                ()     1/γ̇   dt of the fitted map, on which the force ratio depends; NaN if
+                                         unknown
+    ======================  =====  ====  =================================================================
     """
 
     pressure: Law
@@ -89,16 +95,18 @@ class Closure:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Prediction:
-    """What a closure predicts, in units of m = σ = γ̇ = 1; each field has the shape of the flows asked for.
+    """What a closure predicts; each field has the shape (*flows) of α and ν.
 
-    ==============  ============================================================================
-    force_ratio     ⟨F⟩/⟨F_bc⟩
-    pressure        half the trace of the stress, contacts and kinetic
-    shear_stress    positive, contacts and kinetic
-    …_stderr        standard errors of a measurement without noise about the prediction: from the
-                    covariance of the coefficients and the scatter of the points about the law
-    extrapolated    outside the fitted restitutions or packing fractions: the errors mean little
-    ==============  ============================================================================
+    ==============  ====  ====================================================================================
+    field           unit  meaning
+    ==============  ====  ====================================================================================
+    force_ratio     –     ⟨F⟩/⟨F_bc⟩
+    pressure        mγ̇²   half the trace of the stress, contacts and kinetic
+    shear_stress    mγ̇²   positive, contacts and kinetic
+    …_stderr        as …  standard errors of the prediction, compared with a measurement without noise: from
+                          the covariance of the coefficients and the scatter of the points about the law
+    extrapolated    –     true outside the fitted restitutions or packing fractions; the errors are unreliable
+    ==============  ====  ====================================================================================
     """
 
     force_ratio: Float[Array, "*flows"]
@@ -111,14 +119,14 @@ class Prediction:
 
 
 def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> Prediction:
-    """Predict force ratio and stresses; differentiable, and for ``jit`` and ``vmap``.
+    """Predict force ratio and stresses; it can be differentiated, and used in ``jit`` and ``vmap``.
 
     ================  ==========  ==================================================================
-    closure           Closure
+    closure           Closure     as :func:`fit_closure` returns
     restitution       (*flows)    0 ≤ α < 1; as α → 1 the stresses are those of theory, which diverge
     packing_fraction  (*flows)    0 < ν ≤ 0.83, of a shape that broadcasts with that of α
     returns           Prediction  with ``extrapolated`` set outside the fitted ranges
-    raises            InputError  a number is outside its range; traced numbers are not judged
+    raises            InputError  a number is outside its range; traced numbers are not checked
     ================  ==========  ==================================================================
     """
     require_closure(closure)
@@ -129,11 +137,12 @@ def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> 
 
 @jax.jit
 def _predictions(closure: Closure, alpha: Array, nu: Array) -> Prediction:
-    return each(partial(prediction, closure), alpha, nu)
+    return elementwise(partial(prediction, closure), alpha, nu)
 
 
 def prediction(closure: Closure, alpha: Array, nu: Array) -> Prediction:
-    closure = of_type(closure, alpha.dtype)
+    """The prediction for one flow; α and ν are scalars."""
+    closure = with_dtype(closure, alpha.dtype)
     logs, variances = log_laws(closure, alpha, nu)
     pressure, shear_stress, ratio = jnp.exp(jnp.stack([logs[0], logs[0] + logs[1], logs[2]]))
     errors = jnp.sqrt(jnp.stack([variances[0], variances[0] + variances[1], variances[2]]))
@@ -158,8 +167,9 @@ def stress_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Arra
 def excess_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Array:
     """Terms of the logarithm of the force ratio's excess over one, (..., 5)."""
     crowding = -jnp.log1p(-nu / jamming_fraction)
-    rest = 1 - alpha
-    return jnp.stack([jnp.ones_like(rest), rest, jnp.log(rest), crowding, rest * crowding], axis=-1)
+    inelasticity = 1 - alpha
+    terms = [jnp.ones_like(inelasticity), inelasticity, jnp.log(inelasticity), crowding, inelasticity * crowding]
+    return jnp.stack(terms, axis=-1)
 
 
 def log_laws(closure: Closure, alpha: Array, nu: Array) -> tuple[Array, Array]:
@@ -211,11 +221,11 @@ def broadcast(**numbers: Scalar | np.ndarray) -> list[Array]:
     return [jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in numbers.values()]
 
 
-def each(function: Callable, *arrays: Array):
-    """A function of scalars at every entry of arrays of one shape."""
+def elementwise(function: Callable, *arrays: Array):
+    """Apply a function of scalars to every entry of arrays of one shape."""
     results = jax.vmap(function)(*(x.reshape(-1) for x in arrays))
     return jax.tree.map(lambda x: x.reshape(arrays[0].shape), results)
 
 
-def of_type(closure: Closure, dtype: jnp.dtype) -> Closure:
+def with_dtype(closure: Closure, dtype: jnp.dtype) -> Closure:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), closure)

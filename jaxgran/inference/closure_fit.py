@@ -21,23 +21,27 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.timestep import JAMMING
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
-FEWEST_POINTS, FEWEST_VALUES = 12, 3  # points of a map, and values of each axis among them
-_LEAST_ERROR = 1e-4  # relative, of a measured value: blocks without a single cluster agree by chance
-_ROUNDS = 50  # of fits and scatters, at most; they end when the scatter changes by less than _SAME
-_SAME = 1e-5
-_MAX_ITERATIONS, _SMALLEST_GRADIENT = 200, 1e-4  # of L-BFGS, in standard errors of the coefficients
+FEWEST_POINTS = 12  # of a map
+FEWEST_VALUES = 3  # of restitution, and of packing fraction, among the points
+_LEAST_ERROR = (
+    1e-4  # relative, of a measured value: blocks without clusters agree by chance, and their error is too small
+)
+_MAX_ROUNDS = 50  # of fit and scatter
+_SCATTER_TOLERANCE = 1e-5  # the rounds end when the scatter changes by less
+_MAX_ITERATIONS = 200  # of L-BFGS
+_GRADIENT_TOLERANCE = 1e-4  # of L-BFGS, for coefficients in units of their standard errors
 
 
 def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
     """Fit the closure to a ratio map.
 
-    Weights come from the standard errors of the points and a scatter of the points about the law, of each law the one
-    at which χ² is its number of degrees of freedom, or none.
+    The weights come from the standard errors of the points and from their scatter about the law. The scatter of each
+    law makes χ² equal to the number of degrees of freedom. It is zero where χ² is smaller without it.
 
     ================  ===============================  ==============================================================
     data              (packing_fraction, restitution)  `pressure`, `macroscopic_friction` and `force_ratio` with
-                                                       `_stderr`, and `status`; points of status ok count, the
-                                                       shortest of several time steps, and α < 1
+                                                       `_stderr`, and `status`; fitted are points with status ok
+                                                       and α < 1, at the shortest of several time steps
     jamming_fraction  ()                               ν_J, above 0.83; by default that of a random quench of the
                                                        size distribution of maps
     returns           Closure
@@ -54,13 +58,17 @@ def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
 
 
 class Points(NamedTuple):
-    """Points of a map that a closure is fitted to.
+    """Points of a map to which a closure is fitted.
 
-    place                          (points,)    in the raveled map, ν before α
-    restitution, packing_fraction  (points,)
+    =============================  ===========  ==================================================================
+    field                          shape        meaning
+    =============================  ===========  ==================================================================
+    place                          (points,)    index in the flattened map, ν before α
+    restitution, packing_fraction  (points,)    α and ν
     logs, errors                   (points, 3)  logarithms of the quantities in ``LAWS`` and their standard errors
     theory                         (points, 2)  logarithms of the pressure and the friction of theory
-    timestep                       float        NaN if unknown
+    timestep                       float        dt in 1/γ̇, NaN if unknown
+    =============================  ===========  ==================================================================
     """
 
     place: np.ndarray
@@ -72,12 +80,12 @@ class Points(NamedTuple):
     timestep: float
 
     def chosen(self, which: np.ndarray) -> Points:
-        """Some of the points."""
+        """The points that a mask or an index array selects."""
         return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "timestep"})
 
 
 def closure_points(data: xr.Dataset) -> Points:
-    """The points that :func:`fit_closure` fits: of status ok, positive, with errors, and not elastic."""
+    """The points that :func:`fit_closure` fits: of status ok, positive, with known errors, and with α < 1."""
     data = finest(data)
     alpha, nu = (data[name].astype(float).values for name in ("restitution", "packing_fraction"))
     nu, alpha = (x.ravel() for x in np.meshgrid(nu, alpha, indexing="ij"))
@@ -101,6 +109,7 @@ def closure_points(data: xr.Dataset) -> Points:
 
 
 def fit_points(points: Points, jamming_fraction: float) -> Closure:
+    """Fit the three laws to points of a map."""
     alpha, nu, jamming = points.restitution, points.packing_fraction, np.asarray(jamming_fraction, float)
     stress, excess = (np.asarray(f(alpha, nu, jamming), float) for f in (stress_terms, excess_terms))
     laws = [
@@ -117,42 +126,45 @@ def fit_points(points: Points, jamming_fraction: float) -> Closure:
     )
 
 
-class _Solved(NamedTuple):
-    """coefficients (terms,), prediction (points,) and its derivative by the coefficients (points, terms)."""
+class _Solution(NamedTuple):
+    """Coefficients (terms,), prediction (points,) and its derivative by the coefficients (points, terms)."""
 
     coefficients: np.ndarray
     predicted: np.ndarray
     gradient: np.ndarray
 
 
-def _fit(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray, solve: Callable[..., _Solved]) -> Law:
-    """Fit with a scatter that makes χ² the number of degrees of freedom, or none where χ² is below it."""
-    freedom, scatter, before, rounds = len(logs) - terms.shape[1], 0.0, np.inf, 0
-    solved = solve(terms, logs, errors)
-    while abs(scatter - before) >= _SAME and rounds < _ROUNDS:
-        before, scatter = scatter, _scatter(logs - solved.predicted, errors, freedom)
-        solved, rounds = solve(terms, logs, np.hypot(errors, scatter)), rounds + 1
-    triangle = np.linalg.qr(solved.gradient / np.hypot(errors, scatter)[:, None], mode="r")
-    return Law(solved.coefficients, np.linalg.inv(triangle), np.asarray(scatter))
+def _fit(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray, solve: Callable[..., _Solution]) -> Law:
+    """Fit with a scatter that makes χ² equal to the degrees of freedom, or without one where χ² is below them."""
+    freedom, scatter, previous, rounds = len(logs) - terms.shape[1], 0.0, np.inf, 0
+    solution = solve(terms, logs, errors)
+    while abs(scatter - previous) >= _SCATTER_TOLERANCE and rounds < _MAX_ROUNDS:
+        previous, scatter = scatter, _scatter(logs - solution.predicted, errors, freedom)
+        solution, rounds = solve(terms, logs, np.hypot(errors, scatter)), rounds + 1
+    triangle = np.linalg.qr(solution.gradient / np.hypot(errors, scatter)[:, None], mode="r")
+    return Law(solution.coefficients, np.linalg.inv(triangle), np.asarray(scatter))
 
 
 def _scatter(residuals: np.ndarray, errors: np.ndarray, freedom: int) -> float:
-    def too_much(scatter: float) -> float:
+    """The scatter at which χ² is the number of degrees of freedom, or zero where χ² is below it."""
+
+    def excess(scatter: float) -> float:
         return float(np.sum(residuals**2 / (errors**2 + scatter**2)) - freedom)
 
-    most = float(np.sqrt(np.sum(residuals**2) / freedom))
-    return cast(float, brentq(too_much, 0.0, most)) if too_much(0.0) > 0 else 0.0
+    largest = float(np.sqrt(np.sum(residuals**2) / freedom))
+    return cast(float, brentq(excess, 0.0, largest)) if excess(0.0) > 0 else 0.0
 
 
-def _linear_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solved:
+def _linear_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solution:
+    """Linear least squares of terms · coefficients."""
     coefficients = np.linalg.lstsq(terms / errors[:, None], logs / errors)[0]
-    return _Solved(coefficients, terms @ coefficients, terms)
+    return _Solution(coefficients, terms @ coefficients, terms)
 
 
-def _excess_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solved:
-    """Least squares of ln F = ln(1 + exp(terms · c)), from those of the logarithm of the excess.
+def _excess_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solution:
+    """Least squares of ln F = ln(1 + exp(terms · c)), started at the linear fit of the logarithm of the excess F − 1.
 
-    The iteration is over c in units of its standard errors, where the squares are nearly a sphere.
+    The iteration is over c in units of its standard errors. In these units the contours of χ² are nearly spheres.
     """
     excess = np.maximum(np.expm1(logs), errors)
     start = _linear_coefficients(terms, np.log(excess), errors * (1 + excess) / excess).coefficients
@@ -163,16 +175,17 @@ def _excess_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray
         change = _least_squares(*numbers)
     coefficients = start + units @ np.asarray(change, float)
     log_excess = terms @ coefficients
-    return _Solved(coefficients, np.logaddexp(0, log_excess), _slope(log_excess)[:, None] * terms)
+    return _Solution(coefficients, np.logaddexp(0, log_excess), _slope(log_excess)[:, None] * terms)
 
 
 def _slope(log_excess: np.ndarray) -> np.ndarray:
+    """d ln F/d ln(F − 1) = (F − 1)/F."""
     return np.exp(log_excess - np.logaddexp(0, log_excess))
 
 
 @jax.jit
 def _least_squares(start: Array, terms: Array, logs: Array, errors: Array) -> Array:
-    """Change of the coefficients, (terms,), at which the squares of ln F are least, by L-BFGS."""
+    """Change of the coefficients, (terms,), that minimises the squares of ln F, by L-BFGS."""
 
     def cost(change):
         return jnp.sum(((jax.nn.softplus(start + terms @ change) - logs) / errors) ** 2) / 2
@@ -181,7 +194,7 @@ def _least_squares(start: Array, terms: Array, logs: Array, errors: Array) -> Ar
 
     def unfinished(carry: Any):
         _, _, gradient, iteration = carry
-        return (jnp.linalg.norm(gradient) > _SMALLEST_GRADIENT) & (iteration < _MAX_ITERATIONS)
+        return (jnp.linalg.norm(gradient) > _GRADIENT_TOLERANCE) & (iteration < _MAX_ITERATIONS)
 
     def iterate(carry: Any) -> Any:
         change, state, _, iteration = carry
@@ -194,6 +207,7 @@ def _least_squares(start: Array, terms: Array, logs: Array, errors: Array) -> Ar
 
 
 def finest(data: xr.Dataset) -> xr.Dataset:
+    """The map at its shortest time step."""
     return data.sortby("timestep").isel(timestep=0) if "timestep" in data.dims else data
 
 

@@ -1,4 +1,4 @@
-"""The errors of a closure at points that it has not seen: each is left out of the fit in turn."""
+"""Cross-validation of a closure: each point of a map is left out in turn, and predicted by the fit to the others."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import xarray as xr
 
-from jaxgran.inference.closure import NEEDED, broadcast, prediction, require_jamming
+from jaxgran.inference.closure import NEEDED, broadcast, require_jamming
+from jaxgran.inference.closure import prediction as closure_prediction
 from jaxgran.inference.closure_fit import (
     FEWEST_POINTS,
     Points,
@@ -22,67 +23,81 @@ from jaxgran.sampling.timestep import JAMMING
 
 
 def leave_one_out(data: xr.Dataset, jamming_fraction: float = JAMMING) -> xr.Dataset:
-    """Predict every point of a map by the closure that is fitted to all others.
+    """Predict every point of a map by the closure fitted to all other points.
 
     ================  ===============================  ==============================================================
     data              (packing_fraction, restitution)  as for :func:`fit_closure`, and `shear_stress` with `_stderr`
     jamming_fraction  ()                               ν_J
-    returns           (packing_fraction, restitution)  of pressure, shear_stress and force_ratio: NAME_predicted;
-                                                       NAME_error, predicted over measured less one; NAME_noise, the
-                                                       relative standard error of the point itself; NAME_stderr, the
-                                                       error expected of prediction and point together.
-                                                       Of the restitution found from the point's stresses by that
-                                                       closure: restitution_found, restitution_stderr. `edge`: α or
-                                                       ν is the smallest or largest. NaN where a point is not fitted
-    raises            InputError                       fewer than 13 points, or than 3 values of α or of ν without one
+    returns           (packing_fraction, restitution)  the variables below; NaN where a point is not fitted
+    raises            InputError                       fewer than 13 points, or fewer than 3 values of α or of ν
+                                                       when one point is left out
     ================  ===============================  ==============================================================
+
+    ==================  =============================================================================================
+    variable            meaning; NAME is pressure, shear_stress or force_ratio
+    ==================  =============================================================================================
+    NAME_predicted      prediction, in units of m = σ = γ̇ = 1
+    NAME_error          predicted over measured, less one
+    NAME_noise          relative standard error of the measured point
+    NAME_stderr         relative standard error expected of prediction and point together
+    restitution_found   restitution from the stresses of the point, by the closure fitted without it
+    restitution_stderr  its standard error
+    edge                whether α or ν is the smallest or largest of the fitted points
+    ==================  =============================================================================================
     """
     require_map(data, *NEEDED, "shear_stress", "shear_stress_stderr")
     require_jamming(jamming_fraction)
     points = closure_points(data)
     require_enough(points, FEWEST_POINTS + 1)
-    every, closures = np.arange(len(points.place)), []
-    for k in every:
-        others = points.chosen(every != k)
+    indices, closures = np.arange(len(points.place)), []
+    for k in indices:
+        others = points.chosen(indices != k)
         require_enough(others, FEWEST_POINTS)
         closures.append(fit_points(others, jamming_fraction))
     batch = jax.tree.map(lambda *x: np.stack(x), *closures)
     alpha, nu = broadcast(restitution=points.restitution, packing_fraction=points.packing_fraction)
-    predicted = _predictions_of_each(batch, alpha, nu)
+    predicted = _batch_predictions(batch, alpha, nu)
 
     measured = {name: table(finest(data), [name, f"{name}_stderr"])[points.place] for name in _PREDICTED}
     columns = {}
-    for name, pair in measured.items():
-        value, error = pair.T
-        foreseen, its_error = (np.asarray(getattr(predicted, f"{name}{end}"), float) for end in ("", "_stderr"))
-        columns[f"{name}_predicted"] = foreseen
-        columns[f"{name}_error"] = foreseen / value - 1
+    for name, value_and_error in measured.items():
+        value, error = value_and_error.T
+        prediction, prediction_error = (
+            np.asarray(getattr(predicted, f"{name}{end}"), float) for end in ("", "_stderr")
+        )
+        columns[f"{name}_predicted"] = prediction
+        columns[f"{name}_error"] = prediction / value - 1
         columns[f"{name}_noise"] = error / value
-        columns[f"{name}_stderr"] = np.hypot(error, its_error) / value
+        columns[f"{name}_stderr"] = np.hypot(error, prediction_error) / value
 
-    (pressure, first), (shear, second) = measured["pressure"].T, measured["shear_stress"].T
-    correlation = _correlation(first / pressure, second / shear, points.errors[:, 1])
-    numbers = broadcast(p=pressure, s=shear, first=first, second=second, correlation=correlation)
-    found = _estimates_of_each(batch, nu, *numbers)
+    (pressure, pressure_error), (shear, shear_error) = measured["pressure"].T, measured["shear_stress"].T
+    correlation = _correlation(pressure_error / pressure, shear_error / shear, points.errors[:, 1])
+    numbers = broadcast(
+        pressure=pressure,
+        shear_stress=shear,
+        pressure_stderr=pressure_error,
+        shear_stress_stderr=shear_error,
+        correlation=correlation,
+    )
+    found = _batch_estimates(batch, nu, *numbers)
     columns["restitution_found"] = np.asarray(found.restitution, float)
     columns["restitution_stderr"] = np.asarray(found.stderr, float)
     return _as_map(data, points, columns)
 
 
 _PREDICTED = ("pressure", "shear_stress", "force_ratio")
-_predictions_of_each, _estimates_of_each = (
-    jax.jit(jax.vmap(f)) for f in (prediction, estimate_restitution)
-)  # of many closures
+_batch_predictions = jax.jit(jax.vmap(closure_prediction))  # one closure for each point
+_batch_estimates = jax.jit(jax.vmap(estimate_restitution))
 
 
 def _correlation(pressure: np.ndarray, shear: np.ndarray, friction: np.ndarray) -> np.ndarray:
-    """Correlation of the errors of two logarithms from those of both and of their difference."""
+    """Correlation of the errors of ln P and ln τ, from these errors and that of their difference, the friction."""
     product = np.maximum(pressure * shear, np.finfo(float).tiny)
     return np.clip((pressure**2 + shear**2 - friction**2) / (2 * product), -1.0, 1.0)
 
 
 def _as_map(data: xr.Dataset, points: Points, columns: dict[str, np.ndarray]) -> xr.Dataset:
-    """Columns of points on the plane of the map, NaN elsewhere."""
+    """Values at the fitted points as variables of the map, NaN elsewhere."""
     dims = ("packing_fraction", "restitution")
     shape = tuple(data.sizes[name] for name in dims)
     variables = {}

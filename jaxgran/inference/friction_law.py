@@ -1,9 +1,9 @@
-"""Dense flow as one law: friction and packing fraction as power laws of the inertial number, fitted to a map.
+"""Laws of dense flow: friction and packing fraction as power laws of the inertial number I, fitted to a map.
 
-Without friction between the grains, μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c: a packing of frictionless grains at the
-onset of flow still has a friction μ₀, from the anisotropy of its contacts.
+For frictionless grains μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c. At the onset of flow a packing of frictionless grains
+still has the macroscopic friction μ₀, because of the anisotropy of its contacts.
 
-Source: GDR MiDi, Eur. Phys. J. E 14, 341 (2004); without friction P.-E. Peyneau and J.-N. Roux, Phys. Rev. E 78,
+Source: GDR MiDi, Eur. Phys. J. E 14, 341 (2004); for frictionless grains P.-E. Peyneau and J.-N. Roux, Phys. Rev. E 78,
 011307 (2008), who find μ₀ ≈ 0.10 and exponents near 0.4 for spheres.
 """
 
@@ -20,27 +20,31 @@ from jaxgran.maps.schema import require_map
 from jaxgran.model.checks import InputError, require_number
 from jaxgran.model.status import Status
 
-LARGEST_INERTIAL_NUMBER, SMALLEST_PACKING_FRACTION = 0.3, 0.7  # of a dense flow
-FEWEST_POINTS, FEWEST_PACKING_FRACTIONS = 4, 3  # for the three parameters of a law
+LARGEST_INERTIAL_NUMBER = 0.3  # of a dense flow
+SMALLEST_PACKING_FRACTION = 0.7  # of a dense flow
+FEWEST_POINTS = 4  # for the three parameters of a law
+FEWEST_PACKING_FRACTIONS = 3  # among the points
 NEEDED = ("inertial_number", "inertial_number_stderr", "macroscopic_friction", "macroscopic_friction_stderr")
 """Variables of a map that a friction law needs."""
 
-_EXPONENTS = (0.05, 4.0)
-_ROUNDS = 30  # of the effective variance, at most
+_EXPONENTS = (0.05, 4.0)  # smallest and largest of a fit; an exponent at either end is not determined
+_MAX_ROUNDS = 30  # of the effective variance
 
 
 @dataclass(frozen=True)
 class PowerLaw:
     """A fitted law y = offset + coefficient · I^exponent.
 
-    ============  ======  ==========================================================
+    ============  ======  =============================================================
+    field         shape   meaning; all are dimensionless
+    ============  ======  =============================================================
     parameters    (3,)    offset, coefficient, exponent
-    covariance    (3, 3)  of the parameters, times χ² where that is above one;
-                          infinite where the points do not determine the exponent
-    chi_squared           reduced: per degree of freedom
-    points                number of points
+    covariance    (3, 3)  of the parameters, times the reduced χ² where that is above
+                          one; infinite where the points do not determine the exponent
+    chi_squared   ()      reduced: χ² per degree of freedom
+    points        ()      number of points
     span          (2,)    smallest and largest inertial number
-    ============  ======  ==========================================================
+    ============  ======  =============================================================
     """
 
     parameters: np.ndarray
@@ -56,7 +60,7 @@ class PowerLaw:
 
     @property
     def determined(self) -> bool:
-        """Whether the exponent is larger than its standard error, so that the parameters mean something."""
+        """Whether the exponent is larger than its standard error; if not, the parameters are meaningless."""
         return bool(self.standard_errors[2] < self.parameters[2])
 
     def __call__(self, inertial_number: np.ndarray) -> np.ndarray:
@@ -65,10 +69,15 @@ class PowerLaw:
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c of dense points: all of them, and those of each restitution.
+    """μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c, fitted to all dense points and to those of each restitution.
 
-    ``packing_fraction`` has the coefficient −k. ``by_restitution`` holds the laws of the restitutions with enough
-    points.
+    ================  ========  ==================================================
+    field             type      meaning
+    ================  ========  ==================================================
+    friction          PowerLaw  μ(I)
+    packing_fraction  PowerLaw  ν(I), with the coefficient −k
+    by_restitution    mapping   α → FrictionLaw, of each α with enough points
+    ================  ========  ==================================================
     """
 
     friction: PowerLaw
@@ -83,16 +92,17 @@ def friction_law(
 ) -> FrictionLaw:
     """Fit friction and packing fraction as power laws of the inertial number to the dense points of a map.
 
-    Least squares, in which the variance of a point is that of y plus that of I times the squared slope of the law: the
-    effective variance, found by repetition. Errors of μ and I count as independent.
+    The fit is by least squares with the effective variance: the variance of a point is that of y plus that of I times
+    the squared slope of the law. It is found by iteration. Errors of μ and I are taken as independent.
 
     =========================  ===============================  =====================================================
     data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
                                                                 `_stderr`, and `status`; the shortest of several time
                                                                 steps is fitted
-    largest_inertial_number                                     of a dense point
-    smallest_packing_fraction                                   of a dense point: nearly elastic flows have a small I
-                                                                because they are hot, although they are not dense
+    largest_inertial_number    ()                               of a dense point
+    smallest_packing_fraction  ()                               of a dense point; it excludes nearly elastic flows,
+                                                                which have a small I because they are hot, although
+                                                                they are not dense
     returns                    FrictionLaw
     raises                     ValueError                       fewer than four dense points with status ok, or at
                                                                 fewer than three packing fractions
@@ -122,7 +132,7 @@ def is_dense(
     largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
     smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
 ) -> xr.DataArray:
-    """Where a map has the points that :func:`friction_law` fits: dense, of status ok, and with errors."""
+    """Whether a point of a map is one that :func:`friction_law` fits: dense, of status ok, and with errors."""
     known = np.isfinite(data.macroscopic_friction)
     known &= (data.inertial_number_stderr > 0) & (data.macroscopic_friction_stderr > 0)
     dense = (data.inertial_number <= largest_inertial_number) & (data.packing_fraction >= smallest_packing_fraction)
@@ -144,12 +154,13 @@ def dense_points(
 
 
 def enough(points: xr.Dataset) -> bool:
-    """Whether dense points determine the three parameters of a law."""
+    """Whether there are enough dense points for the three parameters of a law."""
     fractions = len(np.unique(points.packing_fraction))
     return points.sizes["point"] >= FEWEST_POINTS and fractions >= FEWEST_PACKING_FRACTIONS
 
 
 def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
+    """The laws of friction and of packing fraction through dense points."""
     number, number_error = points.inertial_number.values, points.inertial_number_stderr.values
     friction, friction_error = points.macroscopic_friction.values, points.macroscopic_friction_stderr.values
     fraction = points.packing_fraction.values
@@ -160,9 +171,9 @@ def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
 
 
 def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float) -> PowerLaw:
-    """Return the law through points with errors in both coordinates, whose coefficient has a sign."""
+    """Return the law through points with errors in both coordinates; its coefficient has the given sign."""
     low, high = ([-np.inf, 0.0, _EXPONENTS[0]], [np.inf, np.inf, _EXPONENTS[1]])
-    scale = x.max()  # of the inertial number, so that coefficient and offset are of one size
+    scale = x.max()  # unit of the inertial number in the fit, so that coefficient and offset are of similar size
     parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error
 
     def law(number, offset, coefficient, exponent):
@@ -172,29 +183,31 @@ def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray,
         power = number**exponent
         return np.stack([np.ones_like(number), sign * power, sign * coefficient * power * np.log(number)], axis=-1)
 
-    found = True
-    for _ in range(_ROUNDS):
-        before, (_, coefficient, exponent) = parameters, parameters
+    converged = True
+    for _ in range(_MAX_ROUNDS):
+        previous, (_, coefficient, exponent) = parameters, parameters
         slope = coefficient * exponent * (x / scale) ** (exponent - 1)
         deviation = np.maximum(np.hypot(y_error, slope * x_error / scale), 1e-9)
         try:
             parameters, covariance = curve_fit(
-                law, x / scale, y, before, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes
+                law, x / scale, y, previous, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes
             )
-        except RuntimeError:  # it found no end, because the points do not determine the exponent
-            found = False
+        except RuntimeError:  # no convergence, because the points do not determine the exponent
+            converged = False
             break
-        if np.allclose(parameters, before, rtol=1e-6):
+        if np.allclose(parameters, previous, rtol=1e-6):
             break
     chi_squared = np.sum(((y - law(x / scale, *parameters)) / deviation) ** 2) / max(1, len(x) - 3)
     offset, coefficient, exponent = parameters
-    determined = found and coefficient > 0.0 and _EXPONENTS[0] * 1.01 < exponent < _EXPONENTS[1] * 0.99
+    determined = converged and coefficient > 0.0 and _EXPONENTS[0] * 1.01 < exponent < _EXPONENTS[1] * 0.99
     coefficient = sign * coefficient * scale**-exponent  # of the law of x, not of x / scale
-    to_x = np.diag([1.0, sign * scale**-exponent, 1.0])
-    to_x[1, 2] = -coefficient * np.log(scale)
+    jacobian = np.diag([1.0, sign * scale**-exponent, 1.0])  # of the parameters of the law of x
+    jacobian[1, 2] = -coefficient * np.log(scale)
     return PowerLaw(
         parameters=np.array([offset, coefficient, exponent]),
-        covariance=max(1.0, chi_squared) * to_x @ covariance @ to_x.T if determined else np.diag(np.full(3, np.inf)),
+        covariance=max(1.0, chi_squared) * jacobian @ covariance @ jacobian.T
+        if determined
+        else np.diag(np.full(3, np.inf)),
         chi_squared=float(chi_squared),
         points=len(x),
         span=(float(x.min()), float(x.max())),

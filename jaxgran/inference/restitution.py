@@ -1,14 +1,16 @@
 """The restitution of grains from their observed motion.
 
-A trajectory is cut into windows from each frame to the next. Every window is run from the frame it begins with, at a
-trial restitution α, and its end is compared with the next frame: the residuals are the differences of the velocities.
-A window has a few collisions, so the residuals are nearly linear in α, and their derivatives come with the run (forward
-mode, with contacts that move in time). α follows by Gauss-Newton steps with the weights of Cauchy's law: a grain that
-meets another one in the run and not in the observation, since the velocities it starts with are noisy, counts little.
-The noise is measured from the grains that do not collide, which are most of a short window.
+A trajectory is cut into windows, each from one frame to the next. Every window is run from its first frame at a trial
+restitution α, and its end is compared with the next frame. The residuals are the differences of the velocities. A
+window has few collisions, so the residuals are nearly linear in α. Their derivatives are computed with the run (forward
+mode, with contacts that move in time).
 
-Its standard error is that of the sum over windows, from the scatter of their contributions (the "sandwich" estimate),
-so that it holds whatever the law of the residuals.
+α follows from Gauss-Newton steps with Cauchy weights. The initial velocities are noisy, so a grain may collide in the
+run but not in the observation. Such a grain has a small weight. The noise is estimated from the grains that do not
+collide, which are the majority in a short window.
+
+The standard error is that of the sum over windows, from the scatter of their contributions (the "sandwich" estimate).
+It is therefore valid for any distribution of the residuals.
 
 Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), chapters 6 and 7.
 """
@@ -28,14 +30,16 @@ from jaxgran.model.flow import MAX_STEPS, ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
-TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)
-_STRIDE = 0.003  # mean grain diameters that a grain moves in a time step of ours, at the root mean square velocity
-_FEWEST_STEPS = 10  # of a window
-_LARGEST_STEP, _LEAST_STEP, _MOST_STEPS = 0.2, 1e-9, 50
-_SETTLED = 1e-2  # standard errors
-_CAUCHY = 2.385  # in noises: 95 % as efficient as least squares where the noise is Gaussian
-_LEAST_NOISE = 1e-4  # of the root mean square velocity: an exact trajectory has none
-_TOLERANCE = 1e-9
+TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the iteration
+_STRIDE = 0.003  # σ that a grain moves in a time step of the runs, at the root mean square velocity
+_FEWEST_STEPS = 10  # time steps of a window
+_LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
+_LEAST_STEP = 1e-9  # of α, at which the iteration ends in any case
+_MOST_STEPS = 50  # Gauss-Newton steps
+_SETTLED = 1e-2  # step in standard errors, at which the iteration ends
+_CAUCHY = 2.385  # width of Cauchy's law over the noise: 95 % as efficient as least squares for Gaussian noise
+_LEAST_NOISE = 1e-4  # over the root mean square velocity: an exact trajectory has no noise
+_TOLERANCE = 1e-9  # of the contact solve
 
 
 @dataclass(frozen=True)
@@ -46,12 +50,12 @@ class RestitutionFit:
     field        unit  meaning
     ===========  ====  ==================================================================================
     restitution  –     α
-    stderr       –     its standard error
+    stderr       –     standard error of α
     noise        σγ̇    standard deviation of the noise of a component of an observed velocity
-    windows      –     pairs of successive frames that were compared
-    collisions   –     collisions in them, in the runs
-    outliers     –     share of the components of velocity that are further off than 7 times the noise, as
-                       after collisions that a run and the observation do not have in common
+    windows      –     number of pairs of successive frames that were compared
+    collisions   –     number of collisions in the runs of these windows
+    outliers     –     share of the components of velocity with a residual above 7 times its noise, as after
+                       a collision that is only in the run or only in the observation
     ===========  ====  ==================================================================================
     """
 
@@ -66,14 +70,15 @@ class RestitutionFit:
 def fit_restitution(
     strain: Float[np.ndarray, " frames"], states: State, shear_rate: float = 1.0, timestep: float | None = None
 ) -> RestitutionFit:
-    """The restitution with which the observed grains collide, whatever time step they were made with, or none.
+    """The restitution with which the observed grains collide, for a simulation with any time step or an experiment.
 
     Args:
-      strain: strain of each frame, increasing. Between two frames a grain should collide once at most, on average.
-      states: the frames, with a leading (frames,) axis. Positions should be good to a few 1e-3 σ; the noise of the
+      strain: (frames,), strain of each frame, increasing. Between two frames a grain should collide at most once, on
+        average.
+      states: the frames, with a leading (frames,) axis. Positions should be accurate to a few 1e-3 σ. The noise of the
         velocities may be several per cent.
-      shear_rate: γ̇ of the observation, in the unit of its velocities.
-      timestep: dt of the runs, or None for one in which grains move 0.003 diameters.
+      shear_rate: γ̇ of the observation, in the time unit of its velocities.
+      timestep: dt of the runs, in the same time unit, or None for one in which grains move 0.003 diameters.
 
     Returns:
       The restitution with its standard error.
@@ -82,7 +87,7 @@ def fit_restitution(
       ValueError: the frames are fewer than two, out of order or not finite, or no grains collide between them.
       RuntimeError: the runs fail, or the restitution does not settle.
     """
-    strain, count = _judged(strain, states, shear_rate)
+    strain, count = _checked(strain, states, shear_rate)
     speed = float(np.sqrt(np.mean(np.square(states.velocities))))
     intervals = np.diff(strain) / shear_rate
     if timestep is None:
@@ -97,7 +102,7 @@ def fit_restitution(
     least_noise = _LEAST_NOISE * speed
 
     def compare(alpha: float) -> _Comparison:
-        residuals, slopes, collisions, status = _compared(flow, *windows, jnp.asarray(alpha, float))
+        residuals, slopes, collisions, status = _residuals(flow, *windows, jnp.asarray(alpha, float))
         worst = Status(int(np.max(status)))
         if worst > Status.deep_overlap:
             raise RuntimeError(
@@ -105,23 +110,27 @@ def fit_restitution(
             )
         return _Comparison(alpha, np.asarray(residuals), np.asarray(slopes), float(np.sum(collisions)))
 
-    at = min((compare(alpha) for alpha in TRIALS), key=lambda at: at.loss(least_noise))
+    current = min((compare(alpha) for alpha in TRIALS), key=lambda trial: trial.loss(least_noise))
     for _ in range(_MOST_STEPS):
-        step, error = at.step(least_noise)
-        at = compare(float(np.clip(at.restitution + step, 0, 1)))
+        step, error = current.step(least_noise)
+        current = compare(float(np.clip(current.restitution + step, 0, 1)))
         if abs(step) <= max(_SETTLED * error, _LEAST_STEP):
             break
     else:
-        raise RuntimeError(f"the restitution did not settle: it was last {at.restitution:.3g}.")
-    noise = at.noise(least_noise)
-    outliers = float(np.mean(np.abs(at.residuals) > 3 * _CAUCHY * noise))
+        raise RuntimeError(f"the restitution did not settle: it was last {current.restitution:.3g}.")
+    noise = current.noise(least_noise)  # of a residual: the difference of two noisy velocities
     return RestitutionFit(
-        at.restitution, at.step(least_noise)[1], noise / np.sqrt(2), len(steps), at.collisions, outliers
+        restitution=current.restitution,
+        stderr=current.step(least_noise)[1],
+        noise=noise / np.sqrt(2),
+        windows=len(steps),
+        collisions=current.collisions,
+        outliers=float(np.mean(np.abs(current.residuals) > 3 * _CAUCHY * noise)),
     )
 
 
-def _judged(strain: Any, states: Any, shear_rate: float) -> tuple[np.ndarray, int]:
-    """The strains as an array and the number of grains, of a trajectory that can be fitted."""
+def _checked(strain: Any, states: Any, shear_rate: float) -> tuple[np.ndarray, int]:
+    """The strains as an array and the number of grains; an InputError where the trajectory cannot be fitted."""
     require_number("shear_rate", shear_rate, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     strain, shape = np.asarray(strain, float), states.velocities.shape if isinstance(states, State) else ()
     if strain.ndim != 1 or len(strain) < 2 or len(shape) != 3 or shape[0] != len(strain):
@@ -137,18 +146,19 @@ def _judged(strain: Any, states: Any, shear_rate: float) -> tuple[np.ndarray, in
 
 
 @jax.jit
-def _compared(flow: ShearFlow, starts: State, ends: State, timesteps: Array, steps: Int[Array, " windows"], alpha):
-    """Residuals (windows, grains, 2) of the velocities at the end of each window, their derivatives with respect to
-    the restitution, the collisions of each window, and its status."""
+def _residuals(flow: ShearFlow, starts: State, ends: State, timesteps: Array, steps: Int[Array, " windows"], alpha):
+    """Residuals of the velocities at the end of each window and their derivatives by α, collisions and status.
+
+    Residuals and derivatives are (windows, grains, 2); collisions and status are (windows,).
+    """
 
     def window(given):
         start, end, timestep, count = given
 
         def run(alpha):
-            made, tally = advance(
-                replace(flow, restitution=alpha, timestep=timestep), start, count, moving_contacts=True
-            )
-            return made.velocities - end.velocities, (tally.collisions, tally.status)
+            trial = replace(flow, restitution=alpha, timestep=timestep)
+            final, tally = advance(trial, start, count, moving_contacts=True)
+            return final.velocities - end.velocities, (tally.collisions, tally.status)
 
         residual, slope, (collisions, status) = jax.jvp(run, (alpha,), (jnp.ones_like(alpha),), has_aux=True)
         return residual, slope, collisions, status
@@ -157,7 +167,15 @@ def _compared(flow: ShearFlow, starts: State, ends: State, timesteps: Array, ste
 
 
 class _Comparison(NamedTuple):
-    """Runs at one restitution beside the observation; residuals and slopes are (windows, grains, 2)."""
+    """Runs at one restitution compared with the observation.
+
+    ===========  =====================  ====  ====================================
+    restitution  ()                     –     α of the runs
+    residuals    (windows, grains, 2)   σγ̇    velocities of the runs less observed
+    slopes       (windows, grains, 2)   σγ̇    derivatives of the residuals by α
+    collisions   ()                     –     in all windows
+    ===========  =====================  ====  ====================================
+    """
 
     restitution: float
     residuals: np.ndarray
@@ -165,11 +183,11 @@ class _Comparison(NamedTuple):
     collisions: float
 
     def noise(self, least: float) -> float:
-        """Standard deviation of most of the residuals."""
+        """Standard deviation of the residuals without collisions, from their median absolute value."""
         return max(1.4826 * float(np.median(np.abs(self.residuals))), least)
 
     def loss(self, least_noise: float) -> float:
-        """Cauchy's negative log-likelihood, its width included: it compares restitutions."""
+        """Negative log-likelihood of Cauchy's law with its fitted width; the smallest is the best restitution."""
         noise = self.noise(least_noise)
         return float(np.sum(np.log(noise) + np.log1p((self.residuals / (_CAUCHY * noise)) ** 2)))
 
@@ -179,6 +197,6 @@ class _Comparison(NamedTuple):
         curvature = np.sum(weights * self.slopes**2)
         if not curvature > 0:
             raise InputError("states must have collisions between the frames, and no grains collide.")
-        pulls = np.sum(weights * self.slopes * self.residuals, axis=(1, 2))
-        step = np.clip(-np.sum(pulls) / curvature, -_LARGEST_STEP, _LARGEST_STEP)
-        return float(step), float(np.sqrt(np.sum(pulls**2)) / curvature)
+        gradients = np.sum(weights * self.slopes * self.residuals, axis=(1, 2))  # of the windows
+        step = np.clip(-np.sum(gradients) / curvature, -_LARGEST_STEP, _LARGEST_STEP)
+        return float(step), float(np.sqrt(np.sum(gradients**2)) / curvature)

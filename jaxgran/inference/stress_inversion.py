@@ -10,25 +10,37 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.inference.closure import Closure, broadcast, each, log_laws, of_type, require_closure, require_fraction
+from jaxgran.inference.closure import (
+    Closure,
+    broadcast,
+    elementwise,
+    log_laws,
+    require_closure,
+    require_fraction,
+    with_dtype,
+)
 from jaxgran.model.checks import require
 from jaxgran.theory.steady_shear import Scalar
 
-_GRID, _FINER = 33, 16  # restitutions at which a law is evaluated, and between two of them at which it is interpolated
-_REFINEMENTS = 10  # Gauss–Newton steps from the best of the grid
+_GRID = 33  # restitutions at which the laws are evaluated
+_FINER = 16  # steps of the interpolation between two of them
+_REFINEMENTS = 10  # Gauss–Newton steps from the best restitution of the grid
 
 
 class RestitutionEstimate(NamedTuple):
     """A restitution found from stresses.
 
-    ===========  ===========================================================================================
-    restitution  within the range of the closure
+    ===========  ===============================================================================================
+    field        meaning; each has the shape (*flows)
+    ===========  ===============================================================================================
+    restitution  α, within the range of the closure
     stderr       root mean square distance of α from the estimate, over the range, weighted by the likelihood
-                 exp(−χ²/2): the usual standard error at one sharp minimum, and honest at a flat or a second one
+                 exp(−χ²/2); for one sharp minimum it is the usual standard error, and it remains valid for a flat
+                 minimum or for two
     chi_squared  of pressure and friction about the closure, with one degree of freedom inside the range
-    determined   the standard error is smaller than that of a guess, the range over √12; where not, the stresses
-                 hardly depend on the restitution there, as in dense flow of α < 0.6
-    ===========  ===========================================================================================
+    determined   whether the standard error is smaller than that of a guess, the range over √12; if not, the
+                 stresses hardly depend on the restitution there, as in dense flow with α < 0.6
+    ===========  ===============================================================================================
     """
 
     restitution: Float[Array, "*flows"]
@@ -48,19 +60,20 @@ def restitution_from_stresses(
 ) -> RestitutionEstimate:
     """Estimate the restitution of a flow from its stresses alone.
 
-    Least squares of the logarithms of pressure and friction over α within the range of the closure, weighted by the
-    covariance of the measurement plus that of the closure there: the best of a grid, refined by Gauss–Newton.
+    α minimises the squared differences of the logarithms of pressure and friction, within the range of the closure. The
+    weights are the inverse of the covariance of the measurement plus that of the closure. The best α of a grid is
+    refined by Gauss–Newton steps.
 
     ===================  ===================  =====================================================================
-    closure              Closure
+    closure              Closure              as :func:`fit_closure` returns
     packing_fraction     (*flows)             0 < ν ≤ 0.83
     pressure             (*flows)             total, in units of m = σ = γ̇ = 1
     shear_stress         (*flows)             the same, positive
-    pressure_stderr      (*flows)             standard errors, in the same units
-    shear_stress_stderr  (*flows)
+    pressure_stderr      (*flows)             standard error, in the same units
+    shear_stress_stderr  (*flows)             standard error, in the same units
     correlation          (*flows)             of the two errors, −1 to 1; it is near 0.95 where both are averages of
-                                              one run, and then friction, their quotient, is known far better
-    returns              RestitutionEstimate  the shapes broadcast
+                                              one run, and then their quotient, the friction, is known far better
+    returns              RestitutionEstimate  of the common shape to which all arguments broadcast
     raises               InputError           a number is outside its range
     ===================  ===================  =====================================================================
     """
@@ -84,7 +97,7 @@ def restitution_from_stresses(
 
 @jax.jit
 def _estimates(closure: Closure, *numbers: Array) -> RestitutionEstimate:
-    return each(partial(estimate_restitution, closure), *numbers)
+    return elementwise(partial(estimate_restitution, closure), *numbers)
 
 
 def estimate_restitution(
@@ -96,11 +109,12 @@ def estimate_restitution(
     shear_stress_stderr: Array,
     correlation: Array,
 ) -> RestitutionEstimate:
-    closure = of_type(closure, nu.dtype)
-    first, second = pressure_stderr / pressure, shear_stress_stderr / shear_stress
-    common = correlation * first * second
-    noise = jnp.stack(  # of ln P and ln τ − ln P
-        [first**2, common - first**2, common - first**2, first**2 + second**2 - 2 * common]
+    """The estimate for one flow; all numbers are scalars."""
+    closure = with_dtype(closure, nu.dtype)
+    error_p, error_t = pressure_stderr / pressure, shear_stress_stderr / shear_stress  # of ln P and ln τ
+    common = correlation * error_p * error_t
+    noise = jnp.stack(  # covariance of ln P and ln τ − ln P
+        [error_p**2, common - error_p**2, common - error_p**2, error_p**2 + error_t**2 - 2 * common]
     ).reshape(2, 2)
     observed = jnp.log(jnp.stack([pressure, shear_stress / pressure]))
 
@@ -109,7 +123,7 @@ def estimate_restitution(
         return observed - logs[:2], noise + jnp.diag(variances[:2])
 
     def refined(_, carry):
-        """One step, and at its start χ² and the error of α that its curvature means."""
+        """One Gauss–Newton step; also χ² before the step, and the error of α from the curvature of χ²."""
         alpha = carry[0]
         (residual, covariance), (change, _) = jax.jvp(misfit, (alpha,), (jnp.ones_like(alpha),))
         weights = jnp.linalg.solve(covariance, jnp.stack([residual, -change], axis=1))
