@@ -1,4 +1,4 @@
 """What kinetic theory predicts for a sheared flow: stresses, temperature, collision rate.
 
-It imports nothing else of the package. Begin with `gaussian_moments`, the theory that fits best.
+It imports no other folder of the package. Begin with `gaussian_moments`, the most accurate theory here.
 """

@@ -1,9 +1,8 @@
 """Kinetic theory by the moments of an anisotropic Gaussian, for any size distribution.
 
-Each size class has a velocity distribution with a temperature tensor of its own. Collisions between classes balance
-the work of the shear, at any restitution and beyond linear order in the shear rate. Correlations of velocity between
-neighbours are neglected, so the theory fails near jamming and at small restitution in dense flow.
-Units: ``steady_shear``.
+Each size class has its own temperature tensor. Collisions between classes balance the work of the shear, at any
+restitution and beyond linear order in the shear rate. The theory neglects correlations between the velocities of
+neighbours. So it fails near jamming, and in dense flow at small restitution. Units: ``steady_shear``.
 """
 
 from functools import partial
@@ -18,7 +17,7 @@ from jaxgran.theory.navier_stokes import garzo_dufty
 from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats
 
 _ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic, so the error is below 1e-11
-_MAX_ITERATIONS = 40  # Newton takes 4 to 7
+_MAX_ITERATIONS = 40  # of Newton's method, which needs 4 to 7
 _LARGEST_STEP = 1.0  # of one Newton iteration, in the logarithm of a temperature
 
 
@@ -30,7 +29,7 @@ def gaussian_moments(
     polydispersity: Scalar = 0.26,
     size_classes: int = 4,
 ) -> SteadyShear:
-    """Steady shear of polydisperse discs whose velocities are Gaussian, with its own temperature tensor for each size.
+    """Steady shear of polydisperse discs with Gaussian velocities, and one temperature tensor for each size class.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -39,15 +38,15 @@ def gaussian_moments(
     packing_fraction  –     0 < ν < 1
     shear_rate        1/t   γ̇ > 0
     polydispersity    σ     0 ≤ Δ < 1: diameters uniform in σ ± Δ
-    size_classes      –     Gauss-Legendre points that stand for the law of
-                            diameters; static, a change recompiles
+    size_classes      –     number of Gauss-Legendre points that represent the
+                            law of diameters; static, a change recompiles
     returns                 SteadyShear, not finite at α = 1, where nothing
                             balances the shear
     ================  ====  =======================================================
 
-    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0, where the collision integral Q is
-    that of Enskog, the shear across the contact included. The balance is solved by Newton's method, and differentiated
-    by the implicit function theorem.
+    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0. Q is the collision integral of
+    Enskog, including the shear across the contact. The balance is solved by Newton's method. Its derivatives follow
+    from the implicit function theorem.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys. Rev. E 70, 061101
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
@@ -64,7 +63,7 @@ def mixture_moments(
     diameters: Float[Array, " classes"],
     masses: Float[Array, " classes"],
 ) -> SteadyShear:
-    """``gaussian_moments`` of a mixture of as many grains of each of some diameters and masses.
+    """``gaussian_moments`` of a mixture with the same number of grains in each class of diameter and mass.
 
     ================  =======  ====================================================
     name              unit     meaning
@@ -86,7 +85,7 @@ def mixture_moments(
 def _steady(
     alpha: Float[Array, ""], rate: Float[Array, ""], mixture: "_Mixture", guess: Float[Array, ""]
 ) -> SteadyShear:
-    """The balance of the moments of a mixture, from a guess of the logarithm of its temperature."""
+    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its temperature."""
 
     def imbalance(unknowns):
         temperatures = _temperatures(unknowns)
@@ -110,12 +109,14 @@ def _steady(
 
 
 class _Mixture(NamedTuple):
-    """A law of diameters as a few classes.
+    """A law of diameters represented by a few classes.
 
-    diameters         (classes,)
-    masses            (classes,)
-    number_densities  (classes,)          grains per unit area
-    encounters        (classes, classes)  number density of the partners times the contact diameter and χ
+    ================  ==================  ====  ==================================================================
+    diameters         (classes,)          σ     diameters of the grains
+    masses            (classes,)          m     masses of the grains
+    number_densities  (classes,)          1/σ²  grains per unit area
+    encounters        (classes, classes)  1/σ   number density of the second class times the contact diameter and χ
+    ================  ==================  ====  ==================================================================
     """
 
     diameters: Float[Array, " classes"]
@@ -129,33 +130,35 @@ class _Mixture(NamedTuple):
 
     @property
     def reduced_masses(self) -> Float[Array, "classes classes"]:
-        own, other = self.masses[:, None], self.masses[None, :]
-        return own * other / (own + other)
+        m_i, m_j = self.masses[:, None], self.masses[None, :]
+        return m_i * m_j / (m_i + m_j)
 
 
 def _mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes: int) -> _Mixture:
-    """The uniform law of diameters."""
+    """The uniform law of diameters in σ ± width."""
     nodes, weights = np.polynomial.legendre.leggauss(size_classes)
     diameters = 1 + width * jnp.asarray(nodes, nu.dtype)
     return _mixture_of(nu, diameters, diameters**2, jnp.asarray(weights / 2, nu.dtype))
 
 
 def _mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> _Mixture:
-    """Classes of grains with their diameters, masses and fractions of the number, (classes,) each."""
+    """Classes of grains from their diameters, masses and number fractions, (classes,) each."""
     mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
     densities = fractions * nu / (jnp.pi / 4 * mean_square)
-    own, other = diameters[:, None], diameters[None, :]
-    chi = 1 / (1 - nu) + 9 / 8 * own * other / (own + other) * nu * mean / mean_square / (1 - nu) ** 2
-    return _Mixture(diameters, masses, densities, densities[None, :] * (own + other) / 2 * chi)
+    d_i, d_j = diameters[:, None], diameters[None, :]
+    chi = 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square / (1 - nu) ** 2
+    return _Mixture(diameters, masses, densities, densities[None, :] * (d_i + d_j) / 2 * chi)
 
 
 class _Collisions(NamedTuple):
-    """What collisions do, per unit time at unit shear rate; components in the order xx, yy, xy.
+    """Effects of the collisions at unit shear rate; components in the order xx, yy, xy.
 
-    source       (3, classes)  rate of change of the temperature tensor of each class
-    stress       (3,)          momentum carried across contacts
-    dissipation  ()            energy lost per unit area
-    rate         ()            collisions per grain
+    ===========  ============  =====  =================================================
+    source       (3, classes)  mσ²γ̇³  rate of change of the temperature tensor of a class
+    stress       (3,)          mγ̇²    collisional stress
+    dissipation  ()            mγ̇³    energy lost per unit area and time
+    rate         ()            –      collisions per grain and unit strain
+    ===========  ============  =====  =================================================
     """
 
     source: Float[Array, "3 classes"]
@@ -167,15 +170,15 @@ class _Collisions(NamedTuple):
 def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: _Mixture) -> _Collisions:
     """Enskog collision integrals of Gaussian velocities.
 
-    For the normal n from grain i to grain j, the approach speed w = (v_i − v_j)·n is Gaussian, with the mean
-    −γ̇ d_ij n_x n_y and the variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w, so the
-    temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩, the
-    average being over w > 0. There ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
+    Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with the mean
+    −γ̇ d_ij n_x n_y and the variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w. So
+    the temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩.
+    The average is over w > 0. There ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
     """
     angle = (jnp.arange(_ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / _ANGLES)
     nx, ny = jnp.cos(angle)[None, :], jnp.sin(angle)[None, :]
     normals = jnp.stack([nx * nx, ny * ny, nx * ny])  # (3, 1, angles)
-    arc = 2 * jnp.pi / _ANGLES  # the two halves of the circle are equal
+    arc = 2 * jnp.pi / _ANGLES  # the two halves of the circle give equal integrals
 
     txx, tyy, txy = temperatures[:, :, None]
     push_x, push_y = txx * nx + txy * ny, txy * nx + tyy * ny  # T·n, (classes, angles)
@@ -194,12 +197,12 @@ def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""]
     per_area = mixture.number_densities[:, None] * mixture.encounters * arc
     transfer = per_area / 2 * impulse * mixture.contact_diameters  # half: each pair is summed twice
     lost = per_area / 4 * (1 - alpha**2) * mixture.reduced_masses
-    collided = per_area / jnp.sum(mixture.number_densities)
+    per_grain = per_area / jnp.sum(mixture.number_densities)
     return _Collisions(
         source=source,
         stress=jnp.sum(normals * jnp.sum(transfer[:, :, None] * second, axis=(0, 1))[None, None, :], axis=(1, 2)),
         dissipation=jnp.sum(lost[:, :, None] * third),
-        rate=jnp.sum(collided[:, :, None] * first),
+        rate=jnp.sum(per_grain[:, :, None] * first),
     )
 
 
@@ -222,19 +225,19 @@ def _moment_balance(temperatures: Float[Array, "3 classes"], collisions: _Collis
 
 
 def _temperatures(unknowns: Float[Array, "3 classes"]) -> Float[Array, "3 classes"]:
-    """Temperature tensors (xx, yy, xy), positive definite whatever the unknowns.
+    """Temperature tensors (xx, yy, xy), positive definite for any unknowns.
 
-    The unknowns are log T_xx, log T_yy and the inverse hyperbolic tangent of the correlation of the velocities.
+    The unknowns are ln T_xx, ln T_yy and artanh(T_xy/√(T_xx T_yy)).
     """
-    log_xx, log_yy, slant = unknowns
-    return jnp.stack([jnp.exp(log_xx), jnp.exp(log_yy), jnp.exp((log_xx + log_yy) / 2) * jnp.tanh(slant)])
+    log_xx, log_yy, artanh_xy = unknowns
+    return jnp.stack([jnp.exp(log_xx), jnp.exp(log_yy), jnp.exp((log_xx + log_yy) / 2) * jnp.tanh(artanh_xy)])
 
 
 def _newton(function, start):
     """Root of `function` by Newton's method with a bounded step.
 
-    It ends after the first step below the square root of the rounding unit, since a quadratic method then has rounding
-    for its error, and also on a step that is not a number.
+    It ends after the first step below the square root of the rounding unit: convergence is quadratic, so the remaining
+    error is rounding. It also ends on a step that is not a number.
     """
     tolerance = jnp.finfo(start.dtype).eps ** 0.5
 
@@ -254,7 +257,7 @@ def _newton(function, start):
 
 
 def _dense_linear_solve(linear, target):
-    """Solve `linear(x) = target` by forming the matrix; it is at most a few dozen wide."""
+    """Solve `linear(x) = target` by forming the matrix, which has at most a few dozen columns."""
     columns = jax.vmap(linear)(jnp.eye(target.size, dtype=target.dtype).reshape(-1, *target.shape))
     matrix = columns.reshape(target.size, target.size).T
     return jnp.linalg.solve(matrix, target.reshape(-1)).reshape(target.shape)

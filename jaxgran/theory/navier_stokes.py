@@ -1,7 +1,8 @@
 """Kinetic theories of one grain size at Navier-Stokes order.
 
-Jenkins and Richman is for nearly elastic grains, Garzó and Dufty for any restitution. Both neglect correlations of
-velocity between neighbours, so both fail near jamming and at small restitution in dense flow. Units: ``steady_shear``.
+The theory of Jenkins and Richman is for nearly elastic grains, that of Garzó and Dufty for any restitution. Both
+neglect correlations between the velocities of neighbours. So both fail near jamming, and in dense flow at small
+restitution. Units: ``steady_shear``.
 """
 
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: S
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
     chi = contact_value(nu)
     density = 4 / jnp.pi * nu
-    # with viscosity = k √T and dissipation = e T^{3/2}, the balance k √T γ̇² = e T^{3/2} gives T
+    # T follows from the balance of energy: viscosity √T γ̇² = loss T^{3/2}
     viscosity = 4 / jnp.pi * (jnp.sqrt(jnp.pi) / 8) * (1 / chi + 2 * nu + (1 + 8 / jnp.pi) * nu**2 * chi)
     loss = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
     temperature = viscosity / loss * rate**2
@@ -53,15 +54,15 @@ def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scala
     returns                 SteadyShear
     ================  ====  =======================================================
 
-    At α = 1 nothing balances the shear, and the temperature is infinite. In steady shear the restitution itself fixes
-    how large the gradient is, so this expansion in the gradient is several times too hot at small restitution in dilute
-    flow.
+    At α = 1 nothing balances the shear, and the temperature is infinite. In steady shear the restitution fixes the size
+    of the gradient, so the gradient is not small at small restitution. There, in dilute flow, the temperature of this
+    expansion in the gradient is several times too high.
 
     Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko, Phys. Rev. E 72,
     021306 (2005).
 
     Examples:
-      Bagnold's scaling: no other time scale than 1/γ̇, so stresses grow with its square.
+      Bagnold's scaling: 1/γ̇ is the only time scale, so stresses are proportional to γ̇².
 
       >>> slow, fast = garzo_dufty(0.9, 0.4), garzo_dufty(0.9, 0.4, shear_rate=2.0)
       >>> round(float(fast.pressure / slow.pressure), 6)
@@ -75,7 +76,7 @@ def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scala
     relaxation = 3 * chi / 8 * (7 / 3 - alpha) * (1 + alpha) * (1 + 7 * kurtosis / 16)
     kinetic = (1 - (1 + alpha) * (1 - 3 * alpha) * nu * chi / 4) / (relaxation - cooling / 2)
     bulk = 8 / jnp.pi * nu**2 * chi * (1 + alpha) * (1 - kurtosis / 16)
-    viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2  # in units of the dilute elastic one
+    viscosity = kinetic * (1 + (1 + alpha) * nu * chi / 2) + bulk / 2  # in units of the dilute elastic viscosity
     temperature = jnp.pi / (64 * nu**2) * viscosity / cooling * rate**2
     dilute_viscosity = jnp.sqrt(temperature / (4 * jnp.pi))
     return SteadyShear(

@@ -1,7 +1,8 @@
 """SteadyShear: what every theory here predicts, and the quantities that the theories share.
 
-Lengths are in mean diameters, masses in the mass of a grain of mean diameter; a grain of diameter d weighs d², unless
-its mass is given. Everything is differentiable and works on one flow; `jax.vmap` adds a leading `(replicas,)`.
+Lengths are in mean diameters, masses in the mass of a grain of mean diameter. A grain of diameter d has the mass d²,
+unless its mass is given. All functions can be differentiated. They treat one flow; `jax.vmap` adds a leading
+`(replicas,)`.
 """
 
 from dataclasses import dataclass
@@ -24,13 +25,13 @@ class SteadyShear:
     granular_temperature  m(σ/t)²  Σ m c²/(2N), c the peculiar velocity
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
-    collision_rate        –        collisions per grain per unit strain, a grain counting each of its collisions
-    dissipation           m/t³     energy lost per unit area and time; where the balance is solved it equals the
-                                   shear power, shear_stress × shear_rate
+    collision_rate        –        collisions per grain and unit strain; each grain counts all its collisions
+    dissipation           m/t³     energy lost per unit area and time; in steady shear it equals the power of the
+                                   shear, shear_stress × shear_rate
     ====================  =======  ===========================================================================
 
-    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the shear rate given:
-    at the default of 1, all numbers are in units of m = σ = γ̇ = 1.
+    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the given shear rate.
+    At the default shear rate of 1, all numbers are in units of m = σ = γ̇ = 1.
     """
 
     granular_temperature: Float[Array, "*replicas"]
@@ -61,11 +62,19 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
 
 
 def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
-    """Collisions per grain and time of discs of one size with Maxwellian velocities."""
+    """Collisions per grain and time of discs of one size with Maxwellian velocities.
+
+    ===========  ========  ==========================
+    density      1/σ²      grains per unit area
+    chi          –         contact value of the pairs
+    temperature  m(σ/t)²   granular temperature
+    returns      1/t       collision rate
+    ===========  ========  ==========================
+    """
     return 2 * jnp.sqrt(jnp.pi * temperature) * density * chi
 
 
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:
-    """The values as arrays of their common floating-point type."""
+    """The values as arrays of one common floating-point type."""
     dtype = jnp.result_type(float, *values)
     return [jnp.asarray(value, dtype) for value in values]
