@@ -356,7 +356,7 @@ def test_frames_of_several_numbers_of_grains_are_refused_in_one_sentence(tmp_pat
         for name, value in names.items()
     }
     path = foreign(tmp_path / "other.gsd", particles_N=lambda k: 20 - k, **changes)
-    assert_refused(path, "in frame 1 the number of grains is another")
+    assert_refused(path, "in frame 1 the number of grains differs from that of the first frame")
 
 
 def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
 """Files: trajectories, and files that are written whole or not at all.
 
-It imports `dynamics` and what is below, but neither `sampling` nor `analysis`. Begin with `trajectory`.
+It imports `dynamics` and the folders below it, but neither `sampling` nor `analysis`. Begin with `trajectory`.
 """

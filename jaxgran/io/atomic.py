@@ -1,12 +1,12 @@
-"""Files that are there whole or not at all, and arrays on disc that know whether they are damaged.
+"""Files that exist whole or not at all, and arrays on disc with a checksum.
 
-A file is written under a temporary name in the folder where it belongs, synced, and renamed to its place. A process
-that is killed leaves the old file or the new one, never half of one.
+A file is written under a temporary name in its final folder, synced, and renamed. A process that is killed leaves the
+old file or the new one, never half of one.
 
-Arrays are kept as HDF5 with the SHA-256 of the whole behind it, which other readers pass over. A file is put together
-and taken apart in memory: a full disc is then an ``OSError`` with a number, and the HDF5 library, which does not
-always survive it, never sees a damaged one. Dimensions have no names: naming them would take ten times as long as all
-the rest.
+Arrays are stored as HDF5, followed by the SHA-256 checksum of the HDF5 content. Other readers ignore the checksum. The
+content is assembled and read in memory. So a full disc raises an ``OSError`` with its number, and the HDF5 library,
+which does not always survive a damaged file, never reads one. Dimensions have no names: writing names would take ten
+times as long as everything else.
 """
 
 import hashlib
@@ -24,16 +24,16 @@ import numpy as np
 
 from jaxgran.model.checks import InputError, shown
 
-_DIGEST = hashlib.sha256().digest_size
-_LONGEST_NAME = 200  # bytes; file systems take 255, and the names of what stands beside a file are longer
+_DIGEST = hashlib.sha256().digest_size  # bytes
+_LONGEST_NAME = 200  # bytes; file systems accept 255, and the temporary files beside a file have longer names
 
 
 class Damaged(Exception):
-    """A file that cannot be read, or whose content is not what was written."""
+    """A file cannot be read, or its content is not what was written."""
 
 
 def require_place(path: Path, option: str, ending: str) -> None:
-    """Raise an InputError that says what is accepted, unless a file of that ending can be written to ``path``."""
+    """Raise an InputError that says what is accepted, unless a file with this ending can be written to ``path``."""
     if path.suffix != ending:
         raise InputError(f"{option} must be a file name that ends in {ending}, not {shown(str(path))}.")
     if len(os.fsencode(path.name)) > _LONGEST_NAME:
@@ -56,13 +56,13 @@ def require_place(path: Path, option: str, ending: str) -> None:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """The name of a temporary file beside ``path``, to be written, that takes its place if nothing goes wrong."""
+    """The name of a temporary file to write beside ``path``; after success it replaces ``path``."""
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
         _sync(temporary)
         os.replace(temporary, path)
-        if os.name == "posix":  # elsewhere a folder cannot be opened
+        if os.name == "posix":  # on other systems a folder cannot be opened
             _sync(path.parent)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -70,7 +70,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
-    """Write named arrays, and what JSON can hold about them, as an HDF5 file with a checksum of it all."""
+    """Write named arrays, and a JSON-compatible description of them, as an HDF5 file with a checksum."""
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         for name, array in arrays.items():
@@ -83,23 +83,24 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """What ``write_arrays`` wrote; raises ``Damaged`` where that is not what the file holds."""
+    """The arrays and the description that ``write_arrays`` wrote; raises ``Damaged`` for any other content."""
     try:
-        whole = path.read_bytes()
+        file_bytes = path.read_bytes()
     except OSError as error:
         raise Damaged(f"{path.name} cannot be read: {error}") from error
-    content = whole[:-_DIGEST]
-    if hashlib.sha256(content).digest() != whole[-_DIGEST:]:
+    content = file_bytes[:-_DIGEST]
+    if hashlib.sha256(content).digest() != file_bytes[-_DIGEST:]:
         raise Damaged(f"{path.name} is not what was written")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
             return arrays, json.loads(str(file.attrs["about"]))
-    except (OSError, KeyError, ValueError) as error:  # whole, and yet none of ours
+    except (OSError, KeyError, ValueError) as error:  # the checksum is right, but the file was not written here
         raise Damaged(f"{path.name} cannot be read: {error}") from error
 
 
 def _sync(path: Path) -> None:
+    """Wait until a file or a folder is on the disc."""
     handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
     try:
         os.fsync(handle)

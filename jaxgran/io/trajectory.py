@@ -1,7 +1,8 @@
-"""Trajectories: a flow frame by frame in a GSD file, which OVITO, freud and HOOMD-blue read, and which is read back.
+"""Trajectories: the frames of a flow in a GSD file, for OVITO, freud and HOOMD-blue, and for reading back.
 
-GSD keeps single precision, centres its box at the origin, and spans it by (L, 0) and (tilt·L, L): the lattice of the
-sheared cell. What single precision would lose stands beside it, so that a state comes back bit for bit.
+The box of GSD is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the sheared cell. The
+chunks of the GSD schema have single precision. The exact numbers are stored in further chunks, so a state is read back
+bit for bit.
 
 =============================  ==============  ======  =================================================================
 chunk                          shape           unit    meaning
@@ -9,15 +10,15 @@ chunk                          shape           unit    meaning
 configuration/step             (1,)            –       time steps since the first frame
 configuration/box              (6,)            σ, –    L, L, 0, tilt, 0, 0; two dimensions
 particles/position             (grains, 3)     σ       centres, in the box around the origin; z = 0
-particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; the laboratory's
-                                                       are c + γ̇ y x̂, up to the velocity of the origin
+particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; in the
+                                                       laboratory c + γ̇ y x̂, up to the velocity of the origin
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
-bonds/group                    (bonds, 2)      –       pairs of grains that push each other in the step to come
+bonds/group                    (bonds, 2)      –       pairs of grains that push each other in the next step
 log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
-log/particles/exact_radius     (grains,)       σ       radii; in the first frame alone, as the next
-log/particles/exact_mass       (grains,)       m       masses
+log/particles/exact_radius     (grains,)       σ       radii; in the first frame only
+log/particles/exact_mass       (grains,)       m       masses; in the first frame only
 log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
 log/jaxgran/strain             (1,)            –       strain since the first frame
 log/jaxgran/timestep           (1,)            1/γ̇     dt
@@ -45,7 +46,7 @@ from jaxgran.model.checks import InputError, shown
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-_SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd refuse
+_SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd reject
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
 _NEEDED = {"position": "positions", "velocity": "velocities"}
 _EXACT = "log/particles/exact_"
@@ -55,18 +56,18 @@ _READ = (
     *(f"{_EXACT}{name}" for name in ("position", "velocity", "radius", "mass")),
     *(f"log/jaxgran/{name}" for name in ("side", "tilt", *_NUMBERS)),
 )
-Chunks = dict[str, Any]  # arrays by name: what a file tells of a frame
+Chunks = dict[str, Any]  # the arrays of a frame by name
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """The states of a flow at the frames of a file, in the precision of the file, and the numbers of the flow.
+    """The states of a flow at the frames of a file, in the precision of the file, and the parameters of the flow.
 
     ================  =========  =====  ============================================================
     field             shape      unit   meaning
     ================  =========  =====  ============================================================
-    state             State      –      states with a leading (frames,) axis, contacts yet to act
+    state             State      –      states with a leading (frames,) axis, before the contacts act
     step              (frames,)  –      time steps since the first frame
     strain            (frames,)  –      strain since the first frame
     timestep          ()         1/γ̇    dt
@@ -75,8 +76,8 @@ class Trajectory:
     packing_fraction  ()         –      ν
     ================  =========  =====  ============================================================
 
-    All are arrays of numpy, which keep double precision where JAX is in single. Strain, time step, shear rate and
-    restitution are NaN where the file of another program does not tell them.
+    All are NumPy arrays. They keep double precision even if JAX uses single precision. Strain, time step, shear rate
+    and restitution are NaN where the file of another program does not contain them.
     """
 
     state: State
@@ -89,20 +90,20 @@ class Trajectory:
 
 
 def check_trajectory(path: Path) -> None:
-    """Raise a ValueError in one sentence where a trajectory could not be written to ``path``."""
+    """Raise a ValueError in one sentence if a trajectory cannot be written to ``path``."""
     require_place(path, "trajectory", ".gsd")
-    if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library opens no others
+    if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library opens no other names
         raise InputError(f"trajectory must be a file name in UTF-8, not {shown(str(path))}.")
 
 
 def start_trajectory(path: Path, seen: Snapshot) -> None:
-    """Write the first frame of a trajectory, in place of any file that is there."""
+    """Write the first frame of a trajectory; an existing file is replaced."""
     with replaced(path) as temporary:
         _write(temporary, "x", seen, 0)
 
 
 def append_frame(path: Path, seen: Snapshot, step: int) -> None:
-    """Add a frame to a trajectory that ``start_trajectory`` has begun.
+    """Add a frame to a trajectory that ``start_trajectory`` started.
 
     Args:
       path: GSD file.
@@ -113,7 +114,7 @@ def append_frame(path: Path, seen: Snapshot, step: int) -> None:
 
 
 def write_frame(path: Path, seen: Snapshot, step: int) -> None:
-    """Write a frame to a trajectory, which begins with that of step 0 and is whole after every one."""
+    """Write a frame to a trajectory; step 0 starts a new file. The file is complete after every frame."""
     if step == 0:
         start_trajectory(path, seen)
     else:
@@ -121,7 +122,7 @@ def write_frame(path: Path, seen: Snapshot, step: int) -> None:
 
 
 def _library() -> tuple[Any, Any]:
-    """The file layer and the HOOMD schema of the GSD library, loaded when a trajectory is first used."""
+    """The file layer and the HOOMD schema of the GSD library, imported at the first use of a trajectory."""
     return import_module("gsd.fl"), import_module("gsd.hoomd")
 
 
@@ -134,7 +135,7 @@ def _write(path: Path, mode: str, seen: Snapshot, step: int) -> None:
 
 
 def _frame(seen: Snapshot, step: int):
-    """What a frame holds, for the GSD library."""
+    """A snapshot as a frame of the GSD library."""
     _, hoomd = _library()
     state = jax.tree.map(np.asarray, seen.state)
     side, tilt = state.side.item(), state.tilt.item()
@@ -154,9 +155,9 @@ def _frame(seen: Snapshot, step: int):
     frame.bonds.types = ["contact"]
     frame.bonds.typeid = np.zeros(len(loaded), np.uint32)
     frame.bonds.group = np.stack([np.asarray(seen.contacts.i)[loaded], np.asarray(seen.contacts.j)[loaded]], axis=-1)
-    of_all_frames = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
-    of_grains = {"exact_position": state.positions, "exact_velocity": state.velocities, **of_all_frames}
-    of_flow = {
+    constants = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
+    grain_log = {"exact_position": state.positions, "exact_velocity": state.velocities, **constants}
+    flow_log = {
         "side": state.side,
         "tilt": state.tilt,
         "strain": step * timestep * shear_rate,
@@ -166,8 +167,8 @@ def _frame(seen: Snapshot, step: int):
     }
     frame.log = {
         "bonds/force": np.asarray(impulses[loaded] / timestep, np.float64),
-        **{f"particles/{name}": np.array(x) for name, x in of_grains.items()},  # copies, which can be written to
-        **{f"jaxgran/{name}": np.array([x]) for name, x in of_flow.items()},
+        **{f"particles/{name}": np.array(x) for name, x in grain_log.items()},  # writable copies
+        **{f"jaxgran/{name}": np.array([x]) for name, x in flow_log.items()},
     }
     return frame
 
@@ -177,19 +178,19 @@ def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grai
 
 
 def read_trajectory(path: str | os.PathLike) -> Trajectory:
-    """The trajectory in a GSD file, bit for bit that of the flow where jaxgran wrote it.
+    """The trajectory in a GSD file; a file that jaxgran wrote is read back bit for bit.
 
-    The file of another program is read too: it must hold a square two-dimensional cell, sheared or not, with positions
-    and velocities, which are taken for peculiar ones. Diameters and masses are one where it does not tell them.
+    A file of another program must hold a square two-dimensional cell, sheared or not, with positions and velocities.
+    The velocities are taken as peculiar. Diameters and masses are one if the file does not contain them.
 
     Args:
       path: GSD file.
 
     Returns:
-      The states of all frames and the numbers of the flow.
+      The states of all frames and the parameters of the flow.
 
     Raises:
-      ValueError: there is no such file, or it is no such trajectory; the sentence says why.
+      ValueError: there is no such file, or it is not such a trajectory; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {shown(path)}.")
@@ -200,7 +201,7 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
         frames = list(_frames(os.fspath(path)))
     except InputError as lack:
         raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {lack}.") from None
-    except Exception as error:  # a torn file may fail in any way
+    except Exception as error:  # a damaged file may raise any exception
         why = shown(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} is not a GSD file that can be read: {why}.") from None
     steps, numbers, states = zip(*frames, strict=True)
@@ -216,7 +217,7 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
 
 
 def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
-    """Step, numbers and state of every frame; an InputError in a few words where there is something it lacks."""
+    """Step, parameters and state of every frame; an InputError in a few words if something is missing."""
     fl, _ = _library()
     with fl.open(path, "r") as file:
         if file.schema != "hoomd":
@@ -225,7 +226,9 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
             raise InputError("it has no frames")
         first = _chunks(file, 0, {})
         if "particles/position" in first and file.find_matching_chunk_names("particles/velocity"):
-            first.setdefault("particles/velocity", np.zeros_like(first["particles/position"]))  # at rest in the first
+            first.setdefault(
+                "particles/velocity", np.zeros_like(first["particles/position"])
+            )  # GSD does not store zeros
         for k in range(file.nframes):
             frame = _chunks(file, k, first)
             lack = _lack(frame, first)
@@ -236,22 +239,22 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
 
 
 def _chunks(file: Any, frame: int, first: Chunks) -> Chunks:
-    """What a file tells of a frame, which is what it tells of the first where it does not say otherwise."""
-    here = {name: file.read_chunk(frame=frame, name=name) for name in _READ if file.chunk_exists(frame, name)}
-    return {**first, **here}
+    """The chunks of a frame; chunks that the frame does not contain are those of the first frame."""
+    chunks = {name: file.read_chunk(frame=frame, name=name) for name in _READ if file.chunk_exists(frame, name)}
+    return {**first, **chunks}
 
 
 def _lack(frame: Chunks, first: Chunks) -> str:
-    """What a frame lacks to be a State, in words; empty if nothing."""
+    """What a frame lacks to be a State, in words; empty if it lacks nothing."""
     grains, box = _grains(frame), frame.get("configuration/box", np.ones(6))
     known = {name: x for name, x in frame.items() if name.startswith("particles/") and name != "particles/N"}
     conditions = (
         (grains > 0, "there are no grains"),
-        (grains == _grains(first), "the number of grains is another"),
+        (grains == _grains(first), "the number of grains differs from that of the first frame"),
         (frame.get("configuration/dimensions", [3])[0] == 2, "the cell has three dimensions"),
         (box[0] == box[1] and box[0] > 0, "the cell is not a square"),
         *((f"particles/{name}" in frame, f"there are no {words}") for name, words in _NEEDED.items()),
-        (all(len(x) == grains for x in known.values()), "some number is not told of every grain"),
+        (all(len(x) == grains for x in known.values()), "some array does not have one entry for each grain"),
         (all(np.isfinite(x).all() for x in (box, *known.values())), "some number is not finite"),
         *((np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive") for x in ("diameter", "mass")),
     )
@@ -259,11 +262,12 @@ def _lack(frame: Chunks, first: Chunks) -> str:
 
 
 def _grains(frame: Chunks) -> int:
+    """Number of grains."""
     return int(frame.get("particles/N", [0])[0])
 
 
 def _state(frame: Chunks) -> State:
-    """The state of a frame: the exact one if it is there, else what the chunks of any program tell."""
+    """The state of a frame: from the exact chunks if they are there, else from the chunks of the GSD schema."""
     grains = _grains(frame)
     if f"{_EXACT}position" in frame:
         radii, masses, positions, velocities = (
@@ -271,13 +275,13 @@ def _state(frame: Chunks) -> State:
         )
         side, tilt = (frame[f"log/jaxgran/{name}"][0] for name in ("side", "tilt"))
         if not len(radii) == len(masses) == len(positions) == len(velocities) == grains:
-            raise ValueError("its exact numbers are not those of its grains")
+            raise ValueError("its exact arrays do not have one entry for each grain")
     else:
         ones = np.ones(grains, np.float32)
         radii, masses = frame.get("particles/diameter", ones) / 2, frame.get("particles/mass", ones)
         side, tilt = frame["configuration/box"][0], np.asarray(remap_tilt(jnp.asarray(frame["configuration/box"][3])))
-        corner = jnp.asarray(frame["particles/position"][:, :2] + side / 2)
-        positions = np.asarray(wrap(corner, jnp.asarray(side), jnp.asarray(tilt)))
+        from_corner = jnp.asarray(frame["particles/position"][:, :2] + side / 2)
+        positions = np.asarray(wrap(from_corner, jnp.asarray(side), jnp.asarray(tilt)))
         velocities = frame["particles/velocity"][:, :2]
     parts: dict[str, Any] = {"positions": positions, "velocities": velocities, "side": side, "tilt": tilt}
     return State(Grains(radii, masses), **parts)
