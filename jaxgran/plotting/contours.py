@@ -1,7 +1,7 @@
-"""Contours over the plane of 1 − α and ν: interpolation, levels, labels that keep clear, and the excess on top.
+"""Contours in the plane of 1 − α and ν: interpolation, levels, labels that do not overlap, and the excess on top.
 
-A quantity is interpolated bilinearly between the grid points of a map. A cell with a corner that has no value is
-hatched.
+A quantity is interpolated bilinearly between the grid points of a map. A cell is hatched if one of its corners has no
+value.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from matplotlib.ticker import StrMethodFormatter
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
 
 EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
-"""Contour values of the excess of the force ratio over one, those of Figure 2."""
+"""Contour values of the excess of the force ratio over one, as in Figure 2."""
 
 _EXCESS_COLOUR = "#00803c"
-_LINEAR_BELOW = 0.01  # excess under which its contour variable turns from logarithmic to linear
-_APART = 28.0  # points between the middles of two labels, a little more than the length of one
+_LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
+_LABEL_DISTANCE = 28.0  # points between the middles of two labels, slightly more than the length of a label
 _SUBDIVISIONS = 12  # steps of the bilinear interpolation between neighbouring grid points
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
@@ -38,14 +38,14 @@ _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "
 
 
 def refined_axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 − α and ν at the places of an interpolated field."""
+    """Return 1 − α and ν at the points of an interpolated field."""
     axes = 1.0 - data.restitution.values, data.packing_fraction.values
     x, y = (_refinement(len(axis)) @ axis for axis in axes)
     return x, y
 
 
 def interpolated(field: np.ndarray) -> np.ma.MaskedArray:
-    """Return the bilinear refinement of a field, masked where a missing point would contribute."""
+    """Return a field interpolated bilinearly to a finer grid, masked where a missing point would contribute."""
     rows, columns = (_refinement(count) for count in field.shape)
     missing = ~np.isfinite(field)
     values = rows @ np.where(missing, 0.0, field) @ columns.T
@@ -59,7 +59,7 @@ def _refinement(count: int) -> np.ndarray:
 
 
 def contour_variable(excess: np.ndarray) -> np.ndarray:
-    """Return asinh(excess/0.01): monotone, nearly log(excess) where it matters, defined below zero."""
+    """Return asinh(excess/0.01): monotone, nearly logarithmic above 0.01, and defined below zero."""
     return np.arcsinh(excess / _LINEAR_BELOW)
 
 
@@ -76,7 +76,7 @@ def excess_value(level: float) -> float:
 def draw_level(
     axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, value: float, **style: Any
 ) -> QuadContourSet | None:
-    """Draw the contour of a field at a value and return it; None where the field does not cross the value."""
+    """Draw the contour of a field at a value and return it; None if the field does not cross the value."""
     if not (field.count() and field.min() < value < field.max()):
         return None
     drawn = axes.contour(x, y, field, [value], **style)
@@ -84,9 +84,9 @@ def draw_level(
 
 
 def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:
-    """Hatch what has no interpolated value, and draw the measured points as dots and the missing ones as crosses.
+    """Hatch the area without interpolated values, and draw measured points as dots and missing ones as crosses.
 
-    Points whose status is not `ok` have rings.
+    Points whose status is not `ok` get a ring.
     """
     x, y = 1.0 - data.restitution.values, data.packing_fraction.values
     if np.ma.is_masked(field):
@@ -103,7 +103,7 @@ def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured:
 
 
 def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, entries: Iterable[Artist] = ()) -> None:
-    """Explain above the axes the symbols that occur in a plane, other entries between the dot and the ring."""
+    """Explain above the axes the symbols that occur in a plane. Further entries stand between the dot and the ring."""
     dot, cross = Line2D([], [], **_DOT, label="measured"), Line2D([], [], **_CROSS, label="no value")
     handles = [dot] * bool(measured.any()) + list(entries)
     handles += [ring_key()] * bool(suspect(data).any()) + [cross] * (not measured.all())
@@ -127,18 +127,19 @@ def label_contours(
     obstacles: Iterable[QuadContourSet] = (),
     room: float = 0.0,
 ) -> None:
-    """Write on each contour its text, where it is farthest from the other lines, the labels, the ends and the frame.
+    """Write a label on each contour, where it is farthest from other lines, labels, ends of lines and the frame.
 
-    The layout must be fixed, so that distances on the page are known. A contour that has less room than `room` points
-    at its best place stays without its label.
+    The layout must be fixed, so that distances on the page are known. A contour with less clearance than `room` points
+    at its best place gets no label.
     """
-    to_page, pixels = axes.transData, axes.figure.dpi / 72.0  # of a point
+    to_page, pixels = axes.transData, axes.figure.dpi / 72.0  # pixels of a typographic point
     paths = [to_page.transform_path(drawn.get_paths()[0]) for _, drawn in lines]
     blocked = [_thinned(to_page.transform_path(path)) for drawn in obstacles for path in drawn.get_paths()]
     labelled: list[np.ndarray] = []
     for k, (text, drawn) in enumerate(lines):
         others = [_thinned(path) for path in paths[:k] + paths[k + 1 :]] + [path for path in blocked if len(path)]
-        place, clearance = _open_place(paths[k], others, labelled, _APART * pixels, np.array(axes.bbox.extents))
+        frame = np.array(axes.bbox.extents)
+        place, clearance = _label_place(paths[k], others, labelled, _LABEL_DISTANCE * pixels, frame)
         if clearance < room * pixels:
             continue
         labelled.append(place)
@@ -155,17 +156,17 @@ def label_contours(
 
 
 def _thinned(path: MplPath) -> np.ndarray:
-    """Return at most 400 vertices of a path, evenly taken."""
+    """Return at most 400 vertices of a path, at equal intervals."""
     return np.asarray(path.vertices)[:: 1 + len(path) // 400]
 
 
-def _open_place(
-    path: MplPath, others: Sequence[np.ndarray], labelled: Sequence[np.ndarray], apart: float, frame: np.ndarray
+def _label_place(
+    path: MplPath, others: Sequence[np.ndarray], labelled: Sequence[np.ndarray], distance: float, frame: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the vertex of a path, in pixels, that keeps the largest clearance, and that clearance.
+    """Return the vertex of a path with the largest clearance, and that clearance, both in pixels.
 
-    A label lies along its curve, so the ends of the curve and the frame are to be twice as far as other curves. Places
-    that are less than `apart` from a label count only where there is no other.
+    A label lies along its curve, so the ends of the curve and the frame must be twice as far away as other curves.
+    Places closer than `distance` to another label are used only if there is no other place.
     """
     places = _thinned(path)
     starts = np.flatnonzero(path.codes == MplPath.MOVETO)
@@ -174,7 +175,7 @@ def _open_place(
     clearances = [to_frame / 2, _distance(places, ends) / 2, *(_distance(places, other) for other in others)]
     clearance = np.minimum.reduce(clearances)
     for label in labelled:
-        clearance[np.linalg.norm(places - label, axis=1) < apart] *= 1e-3
+        clearance[np.linalg.norm(places - label, axis=1) < distance] *= 1e-3
     best = np.argmax(clearance)
     return places[best], float(clearance[best])
 
@@ -188,7 +189,7 @@ def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, QuadContourSet]:
-    """Draw the contours of the excess of the force ratio over another field, wider for a larger excess."""
+    """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
     x, y = refined_axes(data)
     field = excess_field(data)
     styles = {level: excess_style("colors", "linewidths", level) for level in EXCESS_LEVELS}
@@ -197,7 +198,7 @@ def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, QuadContourSet]:
 
 
 def excess_style(colour: str, width: str, level: float) -> dict[str, Any]:
-    """Return the style of the contour of an excess, for an artist that calls colour and width by these names."""
+    """Return the style of the contour of an excess; `colour` and `width` are the names that an artist gives to them."""
     return {colour: _EXCESS_COLOUR, width: 0.8 + 0.5 * EXCESS_LEVELS.index(level), "alpha": 0.75, "zorder": 2.5}
 
 

@@ -1,6 +1,6 @@
 """What all figures share: the order of a map, the marks of its points, captions and files.
 
-Figures are built without any global plotting state, so they need no display.
+Figures use no global plotting state, so they need no display.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ from matplotlib.lines import Line2D
 
 from jaxgran.model.checks import InputError, shown
 
-LONGEST_NAME = 200  # bytes; file systems take 255, and the names of figures are longer
-LABEL_SIZE, TICK_SIZE, SMALL_SIZE = 9.0, 8.0, 7.0  # fonts, in points
+LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+LABEL_SIZE = 9.0  # points, font of the labels of axes
+TICK_SIZE = 8.0  # points, font of the numbers at the ticks
+SMALL_SIZE = 7.0  # points, font of legends and captions
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
@@ -48,7 +50,7 @@ _RING: dict[str, Any] = {
 def ordered(data: xr.Dataset, *names: str) -> xr.Dataset:
     """Return force ratio, status and the named variables, with errors, as ([timestep,] packing_fraction, restitution).
 
-    All axes ascend. Variables that the map does not have are left out.
+    The values of all axes increase. Variables that the map does not have are left out.
     """
     values = ("force_ratio", *names)
     kept = [name for name in (*values, *(f"{name}_stderr" for name in values), "status") if name in data]
@@ -57,7 +59,7 @@ def ordered(data: xr.Dataset, *names: str) -> xr.Dataset:
 
 
 def finest(data: xr.Dataset) -> xr.Dataset:
-    """Return the shortest time step of an ordered map, as its attribute `timestep`."""
+    """Return an ordered map at its shortest time step, which becomes its attribute `timestep`."""
     if "timestep" not in data.coords:
         return data
     data = data.isel(timestep=0) if "timestep" in data.dims else data
@@ -70,7 +72,7 @@ def is_plane(data: xr.Dataset) -> bool:
 
 
 def require_plane(data: xr.Dataset) -> None:
-    """Raise a ValueError where a map is no plane."""
+    """Raise a ValueError if a map is not a plane."""
     if not is_plane(data):
         raise InputError(
             "contours need at least two restitutions and two packing fractions, "
@@ -79,12 +81,12 @@ def require_plane(data: xr.Dataset) -> None:
 
 
 def suspect(data: xr.Dataset) -> np.ndarray:
-    """Return where a point has a value, and a status that is not `ok`."""
+    """Return whether a point has a value and a status that is not `ok`."""
     return np.isfinite(data.force_ratio.values) & (_status_names(data) != "ok")
 
 
 def _status_names(data: xr.Dataset) -> np.ndarray:
-    """Return the name of every point's status, as text in the shape of the map."""
+    """Return the name of the status of every point, in the shape of the map."""
     if "status" not in data:
         return np.full(data.force_ratio.shape, "ok", dtype=object)
     attrs = data.status.attrs
@@ -98,7 +100,7 @@ def _status_names(data: xr.Dataset) -> np.ndarray:
 
 
 def curve_styles(count: int) -> list[dict[str, Any]]:
-    """Return a colour, marker and line style for each curve; the colours also differ in grey."""
+    """Return a colour, marker and line style for each curve; the colours also differ in a grey print."""
     ramp = colormaps["viridis"](np.linspace(0.0, 0.82, count))
     return [
         {
@@ -113,7 +115,7 @@ def curve_styles(count: int) -> list[dict[str, Any]]:
 def draw_points(
     axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, style: dict[str, Any], **errors: Any
 ) -> None:
-    """Draw a curve with its error bars; a point of bad status is an open symbol in a ring."""
+    """Draw a curve with its error bars; a point whose status is not `ok` is an open symbol in a ring."""
     axes.errorbar(x, y, **style, **errors, markersize=4, linewidth=1.1, elinewidth=0.8, capsize=2)
     axes.plot(
         x[bad],
@@ -140,7 +142,7 @@ def curve_key(style: dict[str, Any], label: str) -> Line2D:
 
 
 def ring_key() -> Line2D:
-    """Return the legend entry of the ring of bad status."""
+    """Return the legend entry of the ring around points whose status is not `ok`."""
     return Line2D([], [], **_RING, label="status not ok")
 
 
@@ -160,7 +162,7 @@ def add_curve_legend(figure: Figure, data: xr.Dataset, handles: Sequence[Line2D]
 
 
 def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside upper left") -> None:
-    """Explain the ring above the axes, where a status is not `ok`."""
+    """Explain the ring in a legend above the axes, if any status is not `ok`."""
     if suspect(data).any():
         figure.legend(handles=[ring_key()], loc=place, fontsize=SMALL_SIZE, frameon=False)
 
@@ -171,7 +173,15 @@ def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside uppe
 def force_lines(
     starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray, widths: np.ndarray, **style: Any
 ) -> LineCollection:
-    """Return lines from centre to centre, (pairs, 2), with widths in points, and their images by lattice vectors."""
+    """Return lines from centre to centre, and their images.
+
+    ========  ==============  ======  ==================================================
+    starts    (pairs, 2)      σ       one end of each line
+    branches  (pairs, 2)      σ       vector from there to the other end
+    shifts    (images, 2)     σ       lattice vectors of the images, the cell included
+    widths    (pairs,)        points  widths of the lines
+    ========  ==============  ======  ==================================================
+    """
     segments = np.stack([starts, starts + branches], axis=1)
     images = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
     return LineCollection(list(images), linewidths=np.tile(widths, len(shifts)), **style)
@@ -181,7 +191,7 @@ def force_lines(
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows where it is the last line of a cell, though no global plotting state exists."""
+    """A figure that a notebook shows if it is the last line of a cell, without any global plotting state."""
 
     def _repr_png_(self) -> bytes:
         memory = BytesIO()
@@ -190,28 +200,28 @@ class ShownFigure(Figure):
 
 
 def empty_figure(width: float, height: float) -> Figure:
-    """Return a figure of a size in inches that draws without a display."""
+    """Return a figure of the given size in inches that needs no display."""
     figure = ShownFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def scientific(value: float) -> str:
-    """Return a number as mathematical text, such as 3 × 10⁻⁴."""
+    """Return a number as mathematical text, for example 3 × 10⁻⁴."""
     mantissa, exponent = f"{value:.2e}".split("e")
     power = rf"10^{{{int(exponent)}}}"
     return power if float(mantissa) == 1.0 else rf"{float(mantissa):g}\times {power}"
 
 
 def status_note(data: xr.Dataset) -> str:
-    """Return how many points carry each status that is not `ok`."""
+    """Return a line that counts the points of each status that is not `ok`; empty if there are none."""
     counts = Counter(name for name in _status_names(data).flat if name != "ok")
     words = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
     return textwrap.fill(f"Status not ok: {words}", width=75) if counts else ""
 
 
 def missing_note(measured: np.ndarray, how_drawn: str = "") -> str:
-    """Return how many points have no value."""
+    """Return a line that counts the points without a value; empty if there are none."""
     missing = int((~measured).sum())
     return f"{missing} of {measured.size} points without a value{how_drawn}" if missing else ""
 
@@ -223,7 +233,7 @@ def padded(values: np.ndarray) -> tuple[float, float]:
 
 
 def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequence[str]) -> None:
-    """Set the tick style, write the caption lines under the axes and say so where nothing was measured."""
+    """Set the tick style and write the caption under the axes; write "no measured values" where there are none."""
     for axes in figure.axes:
         axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=TICK_SIZE)
         if not measured.any():
@@ -235,7 +245,7 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
 
 
 def _run_description(attrs: dict) -> str:
-    """Return the parameters without which a force ratio means nothing, in one line; several time steps have an axis."""
+    """Return in one line the parameters on which a force ratio depends; several time steps are shown by an axis."""
     parts = [f"$N={attrs['grains']}$"] if "grains" in attrs else []
     if attrs.get("seeds") is not None:
         parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
@@ -249,7 +259,7 @@ def _run_description(attrs: dict) -> str:
 
 
 def writable_stem(stem: Path | str) -> Path:
-    """Return folder and beginning of the names of figures, or raise an InputError where none can be written."""
+    """Return folder and beginning of the names of figures; raise an InputError if no file can be written there."""
     if not isinstance(stem, (str, os.PathLike)):
         raise InputError(f"stem must be folder and beginning of the file names, not {shown(stem)}.")
     stem = Path(stem)
@@ -263,7 +273,7 @@ def writable_stem(stem: Path | str) -> Path:
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG under a temporary name beside its place, then move it there."""
+    """Write a figure as PNG under a temporary name in the same folder, then rename it."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         figure.savefig(temporary, format="png", dpi=200)

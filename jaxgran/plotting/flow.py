@@ -1,7 +1,8 @@
-"""Pictures of a flow at an instant: grains in their sheared cell by speed or pressure, and the forces between them.
+"""Pictures of a flow: grains in their sheared cell, coloured by speed or pressure, and the forces between them.
 
-Lines join the centres of grains that push each other, as wide as the force is large: black where most of it acts
-within clusters of three or more grains, red, and much lighter in grey, where two grains collide that touch nobody else.
+Lines join the centres of grains that push each other. Their width is proportional to the force, within limits. A line
+is black if most of its force acts within clusters of three or more grains. It is red, and much lighter in a grey print,
+if the two grains collide without touching others.
 """
 
 from collections.abc import Iterable, Sequence
@@ -37,8 +38,10 @@ COLOURS = {
 _CLUSTER: dict[str, Any] = {"color": "#1a1a1a", "capstyle": "round"}
 BINARY_COLOUR = "#e0552f"
 _BINARY: dict[str, Any] = {"color": BINARY_COLOUR, "capstyle": "round"}
-_WIDEST, _THINNEST = 5.0, 0.35  # points
-_FASTEST, _STRONGEST = 0.98, 0.95  # shares of the grains and of the forces that colours and widths tell apart
+_WIDEST = 5.0  # points, line of the largest force
+_THINNEST = 0.35  # points, line of the smallest force
+_COLOUR_SHARE = 0.98  # of the grains below the deepest colour
+_WIDTH_SHARE = 0.95  # of the forces below the widest line
 _LEGEND: dict[str, Any] = {
     "fontsize": SMALL_SIZE,
     "frameon": False,
@@ -46,29 +49,29 @@ _LEGEND: dict[str, Any] = {
     "handlelength": 1.8,
     "columnspacing": 1.4,
 }
-_LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+_LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]  # the cell and its eight neighbours
 
 
 class Scene(NamedTuple):
-    """What a picture shows of a flow; the cell lies around the origin.
+    """What a picture shows of a flow; the cell is centred at the origin.
 
     =================  ===========  =====  =======================================================
     field              shape        unit   meaning
     =================  ===========  =====  =======================================================
-    centres            (grains, 2)  σ      of the grains, within the cell
-    radii              (grains,)    σ      of the grains
-    speed              (grains,)    σγ̇     |c|, peculiar
-    pressure           (grains,)    mγ̇²    Σ F r/2πr² of the contacts of each grain
-    starts             (pairs, 2)   σ      centre of one grain of each pair that pushes
-    branches           (pairs, 2)   σ      from there to the centre of the other one
+    centres            (grains, 2)  σ      positions of the grains, within the cell
+    radii              (grains,)    σ      radii of the grains
+    speed              (grains,)    σγ̇     |c|, the peculiar speed
+    pressure           (grains,)    mγ̇²    Σ F r/2πr² over the contacts of each grain
+    starts             (pairs, 2)   σ      centre of one grain of each loaded pair
+    branches           (pairs, 2)   σ      from there to the centre of the other grain
     force              (pairs,)     mσγ̇²   mean over the times of the window
     clustered          (pairs,)     –      whether most of it acts within clusters of three or more
-    side, tilt         ()           σ, –   of the cell
+    side, tilt         ()           σ, –   side and tilt of the cell
     restitution        ()           –      α
     packing_fraction   ()           –      ν
     timestep           ()           1/γ̇    dt
-    times              ()           –      snapshots in the window
-    window             ()           –      strain that passes in it, less whole numbers between two snapshots
+    times              ()           –      number of snapshots in the window
+    window             ()           –      strain of the window; whole numbers between snapshots are not counted
     =================  ===========  =====  =======================================================
     """
 
@@ -90,7 +93,10 @@ class Scene(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """What the deepest colour and the widest line of a picture stand for; larger values look the same."""
+    """The values of the deepest colour and the widest line of a picture; larger values look the same.
+
+    ``colour`` is a speed in σγ̇ or a pressure in mγ̇², ``force`` a force in mσγ̇².
+    """
 
     colour: float
     force: float
@@ -102,15 +108,15 @@ def flow_figure(
     """A picture of a flow: its grains and the forces between them.
 
     Args:
-      seen: one snapshot, whose forces are those of one time step; or a series with a (times,) axis, over which the
-        forces are averaged, and whose middle one is drawn. Few grains collide in a short time step: a series with a
-        snapshot for each of a hundred steps (``snapshot_series``) shows the collisions of that time.
-      colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain on its own area.
-      strain: since the start, to be named in the title.
-      scale: what the deepest colour and the widest line stand for, or None to choose by what there is.
+      seen: one snapshot, with the forces of one time step; or a series with a (times,) axis. The forces of a series are
+        averaged, and the grains of its middle snapshot are drawn. Few grains collide in a short time step. A series
+        with a snapshot of each of a hundred steps (``snapshot_series``) shows all collisions of that time.
+      colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain over its own area.
+      strain: strain since the start for the title, or None to leave it out.
+      scale: values of the deepest colour and the widest line, or None to choose them from the data.
 
     Raises:
-      ValueError: ``seen`` is no such snapshot, it is not finite, or there is no such colour.
+      ValueError: ``seen`` is not such a snapshot or not finite, or the colour is unknown.
     """
     scene = scene_of(seen)
     require_colour(colour)
@@ -120,13 +126,13 @@ def flow_figure(
 
 
 def require_colour(colour: Any) -> None:
-    """Raise an InputError unless grains can be coloured by this."""
+    """Raise an InputError unless the colour is "speed" or "pressure"."""
     if colour not in get_args(Colour):
         raise InputError(f"colour must be speed or pressure, not {shown(colour)}.")
 
 
 def scene_of(seen: Snapshot) -> Scene:
-    """What a picture shows of a snapshot, or of a series of them."""
+    """The scene of a snapshot, or of a series of snapshots."""
     if not isinstance(seen, Snapshot) or np.ndim(seen.state.side) > 1:
         raise InputError(f"seen must be a Snapshot of one flow or a series of them, not {shown(type(seen).__name__)}.")
     frames, pairs = series(seen), pair_forces(seen)
@@ -162,14 +168,15 @@ def scene_of(seen: Snapshot) -> Scene:
 
 
 def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
-    """A scale for several pictures that are to be compared."""
+    """One scale for several pictures, so that they can be compared."""
     scenes = list(scenes)
     values = np.concatenate([getattr(scene, colour) for scene in scenes])
     forces = np.concatenate([scene.force for scene in scenes])
-    return Scale(_upper(values[values > 0], _FASTEST), _upper(forces, _STRONGEST))
+    return Scale(_quantile(values[values > 0], _COLOUR_SHARE), _quantile(forces, _WIDTH_SHARE))
 
 
-def _upper(values: np.ndarray, share: float) -> float:
+def _quantile(values: np.ndarray, share: float) -> float:
+    """The value below which a share of the values lies, or one if there are no values."""
     return float(np.quantile(values, share)) if values.size else 1.0
 
 
@@ -177,16 +184,18 @@ def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain:
     """Draw a scene with its title, colour bar and legend."""
     grains = draw_scene(axes, scene, colour, scale)
     axes.set_title(title_of(scene, strain), fontsize=LABEL_SIZE)
-    beside = axes.inset_axes((1.02, 0.25, 0.022, 0.7))
-    bar = axes.figure.colorbar(grains, cax=beside, extend="max")
+    bar_axes = axes.inset_axes((1.02, 0.25, 0.022, 0.7))
+    bar = axes.figure.colorbar(grains, cax=bar_axes, extend="max")
     bar.set_label(COLOUR_LABELS[colour], fontsize=TICK_SIZE)
     bar.ax.tick_params(labelsize=SMALL_SIZE)
     axes.legend(handles=force_key(scale), loc="upper left", bbox_to_anchor=(0.0, 0.0), **_LEGEND)
 
 
 def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> ScalarMappable:
-    """Draw grains, forces, the cell and a scale bar; what reaches over the edge of the cell is cut and comes in again
-    on the other side."""
+    """Draw grains, forces, the cell and a scale bar.
+
+    Parts that reach over an edge of the cell are cut and drawn at the opposite edge.
+    """
     corners = scene.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners[:, 0] += scene.tilt * corners[:, 1]
     cell = Polygon(corners, closed=True, facecolor="none", edgecolor="#404040", linewidth=0.9, zorder=4)
@@ -226,7 +235,7 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Scalar
 
 
 def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Grains and their images that reach into the cell: which grains they are, and where."""
+    """Grains and images that reach into the cell: indices of the grains (images,) and positions (images, 2) in σ."""
     shifts = np.array(_LATTICE, float)
     places = scene.centres[:, None] + scene.side * np.stack(
         [shifts[:, 0] + scene.tilt * shifts[:, 1], shifts[:, 1]], -1
@@ -240,7 +249,7 @@ def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _frame(axes: Axes, scene: Scene) -> None:
-    """Limits that hold the cell, no axes, and a scale bar."""
+    """Set limits around the cell, hide the axes and draw a scale bar."""
     half = scene.side / 2
     length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
     low = -half - 0.07 * scene.side
@@ -260,7 +269,7 @@ def _frame(axes: Axes, scene: Scene) -> None:
 
 
 def force_key(scale: Scale) -> Sequence[Line2D]:
-    """The legend of the lines, and the force of the widest ones."""
+    """The legend of the lines, with the force of the widest line."""
     widest = rf"$F\geq{scientific(float(f'{scale.force:.1e}'))}\,m\sigma\dot\gamma^2$"
     keys = (
         (_CLUSTER["color"], 2.5, "in clusters of 3 or more grains"),
@@ -271,7 +280,7 @@ def force_key(scale: Scale) -> Sequence[Line2D]:
 
 
 def title_of(scene: Scene, strain: float | None = None) -> str:
-    """Parameters of the flow, and over what time its forces are taken."""
+    """The title: parameters of the flow, and the time over which the forces are averaged."""
     parts = [
         rf"$\alpha={scene.restitution:g}$",
         rf"$\nu={scene.packing_fraction:.4g}$",

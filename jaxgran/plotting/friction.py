@@ -1,4 +1,4 @@
-"""The laws of dense flow against the points they are fitted to: friction and packing fraction by inertial number."""
+"""Friction and packing fraction against the inertial number, with the fitted laws of dense flow."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def friction_figure(data: xr.Dataset) -> Figure:
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) as in :func:`jaxgran.inference.friction_law.friction_law`
-    returns  Figure                          the points fitted are filled, the others open; the
+    returns  Figure                          fitted points are filled, other points are open; the
                                              parameters of the laws are in the legends
     raises   ValueError                      too few dense points
     ======== =============================== =====================================================
@@ -87,15 +87,15 @@ def friction_figure(data: xr.Dataset) -> Figure:
 
 
 def _draw_flows(axes: Axes, curve: xr.Dataset, name: str, style: dict[str, Any]) -> None:
-    """Draw the points of one restitution against the inertial number, those that no law is fitted to open."""
+    """Draw the points of one restitution against the inertial number; points that are not fitted are open."""
     number, stderr = curve.inertial_number.values, curve.inertial_number_stderr.values
     value = np.broadcast_to(curve[name].values, number.shape)
     errors = curve[f"{name}_stderr"].values if f"{name}_stderr" in curve else np.zeros_like(number)
     mark = {"color": style["color"], "marker": style["marker"], "linestyle": "none"}
     fitted = is_dense(curve).values
     for chosen, face in ((fitted, style["color"]), (~fitted, "white")):
-        at = {"xerr": stderr[chosen], "yerr": errors[chosen]}
-        draw_points(axes, number[chosen], value[chosen], suspect(curve)[chosen], mark | {"mfc": face}, **at)
+        bars = {"xerr": stderr[chosen], "yerr": errors[chosen]}
+        draw_points(axes, number[chosen], value[chosen], suspect(curve)[chosen], mark | {"mfc": face}, **bars)
 
 
 def _add_laws(
@@ -105,7 +105,7 @@ def _add_laws(
     part: Callable[[FrictionLaw], PowerLaw],
     names: str,
 ) -> None:
-    """Draw the law of each restitution and that of all points, with their parameters in a legend under the axes."""
+    """Draw the law of each restitution and the law of all points; their parameters are in a legend under the axes."""
     entries = {alpha: (f"{alpha:.4g}", style) for alpha, style in styles.items()}
     laws: dict[float | None, FrictionLaw] = {**law.by_restitution, None: law}
     handles = []
@@ -132,7 +132,7 @@ def _add_laws(
 
 
 def parameters_text(law: PowerLaw) -> str:
-    """Return offset, size of the coefficient and exponent of a law with their standard errors, and reduced χ²."""
+    """Return offset, absolute coefficient and exponent of a law with their standard errors, and the reduced χ²."""
     if not law.determined:
         return "not determined"
     values = law.parameters * [1.0, np.sign(law.parameters[1]), 1.0]
@@ -141,7 +141,7 @@ def parameters_text(law: PowerLaw) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Return a number and its standard error, to one digit of the error, or two where that begins with a one."""
+    """Return a number and its standard error with one digit of the error, or two digits if the first is a one."""
     magnitude = math.floor(math.log10(error)) if error > 0.0 else -3
     digits = max(0, -magnitude + (error < 2.0 * 10.0**magnitude))
     return f"{value:.{digits}f} ± {error:.{digits}f}"

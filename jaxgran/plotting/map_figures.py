@@ -15,15 +15,17 @@ from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, th
 
 
 def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
-    """Write every figure that a map has the data for, as PNG, and return the paths written.
+    """Write as PNG every figure for which a map has the data, and return the paths written.
 
-    Each file appears whole or not at all.
+    Each file is written whole or not at all.
 
+    ======================= ==================================================================
+    file                    written if the map has
     ======================= ==================================================================
     `{stem}_curves.png`     always
     `{stem}_contours.png`   at least two restitutions and two packing fractions
     `{stem}_timestep.png`   at least two time steps
-    `{stem}_theory.png`     a plane as for the contours, with what the theory predicts
+    `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
     `{stem}_clusters.png`   the shares of the clusters
     `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
     ======================= ==================================================================
@@ -32,7 +34,7 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
     stem     path          folder and beginning of the names; the folder must exist
     returns  list of Path  the files written, in the order above
-    raises   ValueError    this is no map, or no files can be written there
+    raises   ValueError    the data are not a map, or no files can be written there
     ======== ============= =====================================================================
     """
     require_map(data, *RATIO)

@@ -1,7 +1,7 @@
-"""Movies of a flow: pictures of its frames, one after the other, as GIF or MP4.
+"""Movies of a flow: its frames as GIF or MP4.
 
-Frames are kept as a flow is driven (``recorder``), and drawn when it has ended: only then is it known how fast the
-fastest grains are and how large the largest force is, for which colours and widths stand throughout.
+Frames are stored while a flow runs (``recorder``) and drawn after its end. Only then are the largest speed and the
+largest force known, which set the scale of colours and widths in all frames.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,17 +20,19 @@ from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import BINARY_COLOUR, COLOURS, Colour, Scene, common_scale, draw_picture, scene_of
 
-MOST_DRAWN = 500  # of a movie: they are held in memory while it is written
-_WIDTH, _HEIGHT, _DPI = 5.6, 4.4, 90
-_PLACE = (0.01, 0.07, 0.82, 0.83)  # of the axes in the figure
-_WIDEST = 0.755  # sides from the middle of the cell to the edge of the picture, at any tilt
-_PER_SECOND = 20
-_SHADES = (24, 24, 8, 8)  # of the palette of a GIF, in each of its ramps: few, as a file grows with them
-_Follow = Callable[[Sequence], Iterable]  # passes items on, and may tell how many are done
+MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
+_WIDTH = 5.6  # inches
+_HEIGHT = 4.4  # inches
+_DPI = 90  # pixels per inch
+_AXES_PLACE = (0.01, 0.07, 0.82, 0.83)  # left, bottom, width and height of the axes in the figure
+_HALF_WIDTH = 0.755  # of the picture in sides of the cell, enough at any tilt
+_FRAMES_PER_SECOND = 20
+_SHADES = (24, 24, 8, 8)  # colours of each ramp in the palette of a GIF; more colours make a larger file
+_Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how many are done
 
 
 class Frames:
-    """The frames of a movie, kept as they are recorded; a recording that begins anew begins here too."""
+    """The frames of a movie, kept as they are recorded; a recording that starts again at step 0 empties them."""
 
     def __init__(self):
         self._begin()
@@ -38,22 +40,23 @@ class Frames:
     def _begin(self) -> None:
         self.scenes: list[Scene] = []
         self.strains: list[float] = []
-        self._seen, self._of_every = 0, 1
+        self._recorded = 0  # frames
+        self._stride = 1  # recorded frames per frame kept
 
     def keep(self, seen: Snapshot, step: int) -> None:
-        """Keep a frame: what a ``Recorder`` hands on. Where they become too many, every other one is dropped."""
+        """Keep a frame, called by a ``Recorder``. If there are too many frames, every second one is dropped."""
         if step == 0:
             self._begin()
         if len(self.scenes) == MOST_DRAWN:
-            self.scenes, self.strains, self._of_every = self.scenes[::2], self.strains[::2], 2 * self._of_every
-        if self._seen % self._of_every == 0:
+            self.scenes, self.strains, self._stride = self.scenes[::2], self.strains[::2], 2 * self._stride
+        if self._recorded % self._stride == 0:
             self.scenes.append(scene_of(seen))
             self.strains.append(step * (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).item())
-        self._seen += 1
+        self._recorded += 1
 
 
 def check_movie(path: Path) -> None:
-    """Raise an InputError in one sentence where a movie could not be written to ``path``."""
+    """Raise an InputError in one sentence if a movie cannot be written to ``path``."""
     if path.suffix not in (".gif", ".mp4"):
         raise InputError(f"movie must be a file name that ends in .gif or .mp4, not {shown(str(path))}.")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
@@ -65,41 +68,41 @@ def write_movie(path: Path, frames: Frames, colour: Colour = "speed", follow: _F
     """Write a movie, whole or not at all.
 
     Args:
-      path: GIF or MP4 file. One that is there is replaced.
+      path: GIF or MP4 file. An existing file is replaced.
       frames: one or more frames of one flow.
       colour: "speed" or "pressure" of the grains.
-      follow: passes the frames on as they are drawn, and may show how many are done.
+      follow: passes the frames on as they are drawn, and may report how many are done.
     """
     figure = empty_figure(_WIDTH, _HEIGHT)
-    figure.set_layout_engine("none")  # so that nothing moves but the flow
+    figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
-    drawn = _drawn(figure, frames, colour, follow)
+    drawings = _drawings(figure, frames, colour, follow)
     with replaced(path) as temporary:
         if path.suffix == ".gif":
             palette = _palette(colour)
             nearest = _nearest(palette)
-            first, *others = [_picture(figure, palette, nearest) for _ in drawn]
-            first.save(temporary, save_all=True, append_images=others, duration=1000 // _PER_SECOND, loop=0)
+            first, *others = [_picture(figure, palette, nearest) for _ in drawings]
+            first.save(temporary, save_all=True, append_images=others, duration=1000 // _FRAMES_PER_SECOND, loop=0)
         else:
-            writer = FFMpegWriter(_PER_SECOND)
+            writer = FFMpegWriter(_FRAMES_PER_SECOND)
             with writer.saving(figure, str(temporary), _DPI):
-                for _ in drawn:
+                for _ in drawings:
                     writer.grab_frame()
 
 
-def _drawn(figure: Figure, frames: Frames, colour: Colour, follow: _Follow) -> Iterator[None]:
-    """Draw one frame after the other in the same figure."""
+def _drawings(figure: Figure, frames: Frames, colour: Colour, follow: _Follow) -> Iterator[None]:
+    """Draw the frames one after the other in the same figure; yields after each."""
     scale = common_scale(frames.scenes, colour)
     for scene, strain in follow(list(zip(frames.scenes, frames.strains, strict=True))):
         figure.clear()
-        axes = figure.add_axes(_PLACE)
+        axes = figure.add_axes(_AXES_PLACE)
         draw_picture(axes, scene, colour, scale, strain)
-        axes.set_xlim(-_WIDEST * scene.side, _WIDEST * scene.side)
+        axes.set_xlim(-_HALF_WIDTH * scene.side, _HALF_WIDTH * scene.side)
         yield
 
 
 def _picture(figure: Figure, palette: np.ndarray, nearest: np.ndarray) -> Image.Image:
-    """A figure as it is drawn, in the colours of a palette."""
+    """The figure as an image, in the colours of a palette."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     red, green, blue = np.moveaxis(np.asarray(canvas.buffer_rgba())[..., :3] >> 2, -1, 0)
@@ -109,7 +112,7 @@ def _picture(figure: Figure, palette: np.ndarray, nearest: np.ndarray) -> Image.
 
 
 def _palette(colour: Colour) -> np.ndarray:
-    """The colours (shades, 3) of grains, lines and text: the same in all frames, so that none is lost that is rare."""
+    """The colours (shades, 3) of grains, lines and text, fixed for all frames so that rare colours are kept."""
     ramps = (
         LinearSegmentedColormap.from_list("grey", ["white", "black"]),
         COLOURS[colour],
@@ -120,6 +123,6 @@ def _palette(colour: Colour) -> np.ndarray:
 
 
 def _nearest(palette: np.ndarray) -> np.ndarray:
-    """For each of 64 steps of red, green and blue, (64, 64, 64), the colour of the palette that is nearest."""
+    """The index of the nearest colour of the palette, for 64 levels each of red, green and blue, (64, 64, 64)."""
     red, green, blue = ((np.linspace(0, 255, 64)[:, None] - shade) ** 2 for shade in palette.T.astype(float))
     return np.argmin(red[:, None, None] + green[:, None] + blue, axis=-1).astype(np.uint8)

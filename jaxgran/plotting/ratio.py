@@ -1,9 +1,9 @@
-"""The figures of a ratio map: curves of the force ratio, contours of its excess over one, and its time steps.
+"""The figures of a ratio map: curves of the force ratio, contours of its excess over one, and the effect of dt.
 
 All are drawn from the dataset of :func:`jaxgran.ratio_map`. Curves and contours follow Figures 1 and 2 of Lois,
-Lemaître and Carlson, *Momentum transport in granular flows*, and show the shortest time step of a map that has
-several; the third figure shows what the time step does. The force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is
-⟨F⟩/⟨F_bc⟩ − 1. What else :func:`save_figures` writes is in :mod:`jaxgran.plotting.theory` and
+Lemaître and Carlson, *Momentum transport in granular flows*. They show the shortest time step of a map that has
+several. The third figure shows the effect of the time step. The force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is
+⟨F⟩/⟨F_bc⟩ − 1. :func:`save_figures` also writes the figures of :mod:`jaxgran.plotting.theory` and
 :mod:`jaxgran.plotting.friction`.
 """
 
@@ -57,8 +57,8 @@ from jaxgran.plotting.drawing import (
     suspect,
 )
 
-_MOST_TOGETHER = 8  # points whose curves share one panel of the time steps
-_LOG_SPAN = 2.5  # largest over smallest force ratio from which the axis is logarithmic
+_MOST_TOGETHER = 8  # curves in one panel of the figure against the time step
+_LOG_SPAN = 2.5  # largest over smallest force ratio at and above which the axis is logarithmic
 _RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 _BAND = "#e08214"
 
@@ -97,10 +97,10 @@ def ratio_curves(data: xr.Dataset) -> Figure:
 def ratio_contours(data: xr.Dataset) -> Figure:
     """Return the contours of the excess force ratio in the plane of 1 − α and ν (Figure 2).
 
-    The contoured variable is asinh(excess/0.01), logarithmic for an excess well above 0.01 and linear
-    below, where noise may make it negative. It is interpolated bilinearly between the grid points; a cell
-    with a missing corner is hatched. The band of a level holds the points whose excess differs from it
-    by at most the interpolated standard error.
+    The contoured variable is asinh(excess/0.01). It is logarithmic for an excess well above 0.01, and linear
+    below, where noise may make the excess negative. It is interpolated bilinearly between the grid points. A
+    cell with a missing corner is hatched. The band of a level contains the points whose excess differs from
+    the level by at most the interpolated standard error.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) as in :func:`ratio_curves`
@@ -139,7 +139,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
 def ratio_against_timestep(data: xr.Dataset) -> Figure:
     """Return the force ratio against the time step, a curve for each restitution and packing fraction.
 
-    Up to eight points share one panel. More have one for each packing fraction, with a force-ratio axis of its own.
+    Up to eight curves share one panel. With more, each packing fraction has a panel with its own force-ratio axis.
 
     ======== ========================================= =============================================
     data     (timestep, packing_fraction, restitution) as in :func:`ratio_curves`; `timestep` in
@@ -193,7 +193,7 @@ def _draw_curve(axes: Axes, curve: xr.Dataset, along: str, style: dict, label: s
 
 
 def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
-    """Make the force-ratio axis logarithmic, with plain numbers, where the values span enough."""
+    """Make the force-ratio axis logarithmic, with plain numbers, if the values have a large enough range."""
     values = ratio[np.isfinite(ratio) & (ratio > 0.0)]
     span = values.max() / values.min() if values.size else 1.0
     if span < _LOG_SPAN:
@@ -210,7 +210,7 @@ def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
 
 
 def _timestep_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.Dataset]]]], str]:
-    """Return the panels, each a name and its curves with their labels, and the title of the labels."""
+    """Return the panels and the title of the legend; a panel is a name and its curves with their labels."""
     alphas, nus = data.restitution.values, data.packing_fraction.values
     if len(alphas) * len(nus) <= _MOST_TOGETHER:
         curves = [
@@ -227,7 +227,7 @@ def _timestep_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, 
 
 
 def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
-    """Make the time-step axis logarithmic; where it has no two powers of ten, its ends are labelled."""
+    """Make the time-step axis logarithmic; if it contains fewer than two powers of ten, its ends are labelled."""
     axes.set_xscale("log")
     low, high = timesteps.min(), timesteps.max()
     margin = (high / low) ** 0.06
@@ -261,8 +261,8 @@ def _draw_bands(
     below, above = np.ma.maximum(middle - low, 1e-9), np.ma.maximum(high - middle, 1e-9)
     drawn = False
     for level in map(excess_value, levels):
-        away = level - middle
-        in_errors = np.ma.where(away > 0.0, away / above, away / below)
+        difference = level - middle
+        in_errors = np.ma.where(difference > 0.0, difference / above, difference / below)
         if np.ma.min(abs(in_errors), fill_value=np.inf) < 1.0:
             axes.contourf(x, y, in_errors, [-1.0, 1.0], colors=[_BAND], alpha=0.45, zorder=2)
             drawn = True
@@ -270,5 +270,6 @@ def _draw_bands(
 
 
 def _contour_note(absent: Sequence[float]) -> str:
+    """Return the caption line of the contours, with the levels that the map does not reach."""
     note = r"Contours of $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
     return note + (f"; not reached: {', '.join(f'{level:.2f}' for level in absent)}" if absent else "")

@@ -1,7 +1,7 @@
-"""What the force ratio means: where kinetic theory errs and why, and what clusters of grains carry.
+"""Figures that explain the force ratio: the errors of kinetic theory and their causes, and the share of clusters.
 
-The figures show the shortest time step of a map that has several. The excess is that of the force ratio over one,
-⟨F⟩/⟨F_bc⟩ − 1; in the plane of 1 − α and ν its contours lie over those of each figure.
+The figures show the shortest time step of a map that has several. The excess is ⟨F⟩/⟨F_bc⟩ − 1, that of the force ratio
+over one. In the plane of 1 − α and ν its contours are drawn on top of each figure.
 """
 
 from __future__ import annotations
@@ -64,16 +64,16 @@ ERROR_LEVELS = {
     "×5": np.log(5.0),
     "×10": np.log(10.0),
 }
-"""Contour values of the logarithm of a quotient, by the label of the quotient."""
+"""Contour values of the logarithm of a quotient, by their labels."""
 
 SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
-"""Contour values of the share of the clusters."""
+"""Contour values of the share of clusters."""
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
 _STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
 _NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
 _SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
-_LEAST_EXCESS = 1e-5  # where its logarithmic axis begins at the latest
+_LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 _CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
 _THEORY_NOTE = (
@@ -84,12 +84,12 @@ _THEORY_NOTE = (
 
 
 def has_theory(data: xr.Dataset) -> bool:
-    """Return whether a map has what :func:`theory_errors` draws."""
+    """Return whether a map has the variables that :func:`theory_errors` draws."""
     return not what_lacks(data, *RATIO, *_NEEDED)
 
 
 def has_clusters(data: xr.Dataset) -> bool:
-    """Return whether a map has what :func:`cluster_shares` draws."""
+    """Return whether a map has the variables that :func:`cluster_shares` draws."""
     return not what_lacks(data, *RATIO, *_SHARES)
 
 
@@ -100,13 +100,15 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     """Return the error of the theory in `pressure` or `shear_stress`, its two parts, and their standard errors.
 
     ========== ============================ ==========================================================
-    total      ln(theory/measured)          standard error: that of the measured stress
-    assumption ln(binary/measured)          that of the measured ratio of contact to binary stress
-    closure    ln(theory/binary)            those of the kinetic and the binary stress, added
+    name       value                        source of the standard error
+    ========== ============================ ==========================================================
+    total      ln(theory/measured)          measured stress
+    assumption ln(binary/measured)          measured ratio of contact to binary stress
+    closure    ln(theory/binary)            kinetic and binary stress; their errors are added
     ========== ============================ ==========================================================
 
-    Here binary is the measured kinetic stress plus that of the contacts if collisions were binary. The total is the sum
-    of the other two. All are NaN where a quotient is not positive or not known.
+    Binary is the measured kinetic stress plus the contact stress if all collisions were binary. The total is the sum of
+    the other two. All are NaN where a quotient is not positive or not known.
     """
     names = quantity, f"theory_{quantity}", f"kinetic_{quantity}", f"binary_{quantity}"
     measured, theory, kinetic, collisional = (data[name].values for name in names)
@@ -127,11 +129,12 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
 
 
 def theory_errors(data: xr.Dataset) -> Figure:
-    """Return the error of kinetic theory over the plane of 1 − α and ν, and what it is due to.
+    """Return the error of kinetic theory in the plane of 1 − α and ν, and its two parts.
 
-    Rows are pressure and shear stress; columns the total, the part of the binary assumption and that of the closure, as
-    in :func:`error_parts`. Contours in black have the error as their label, dashed where the theory is too low; dotted
-    is where the error is smaller than its standard error. Green contours are those of the excess of the force ratio.
+    The rows are pressure and shear stress. The columns are the total error, the part of the binary assumption and that
+    of the closure, as in :func:`error_parts`. Black contours have the error as their label; they are dashed where the
+    theory is too low. In dotted areas the error is smaller than its standard error. Green contours show the excess of
+    the force ratio.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) what :func:`error_parts` needs, `force_ratio` and
@@ -177,7 +180,10 @@ def theory_errors(data: xr.Dataset) -> Figure:
 def _draw_errors(
     axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray
 ) -> tuple[dict[str, QuadContourSet], bool]:
-    """Draw contours and faint shades of an error; return the lines by their labels, and whether noise hides a part."""
+    """Draw contours and faint shades of an error.
+
+    Return the lines by their labels, and whether the error is anywhere smaller than its standard error.
+    """
     x, y = refined_axes(data)
     field = interpolated(value)
     bounds = [-1e9, *ERROR_LEVELS.values(), 1e9]
@@ -205,9 +211,9 @@ def _draw_errors(
 def cluster_shares(data: xr.Dataset) -> Figure:
     """Return the share of the contact stress that clusters of three or more grains carry, against the excess.
 
-    Left the shares of pressure and shear stress against the excess of the force ratio, a curve per restitution and a
-    symbol per packing fraction; right, where the map is a plane, contours of the share of the pressure, with those of
-    the excess in green.
+    Left: shares of pressure and shear stress against the excess of the force ratio, with a curve per restitution and a
+    symbol per packing fraction. Right, if the map is a plane: contours of the share of the pressure, and in green those
+    of the excess.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) `cluster_pressure_share`, `cluster_shear_share`,
@@ -228,7 +234,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
         axes[name].set_ylabel(f"share of {quantity}", fontsize=LABEL_SIZE)
     axes["p"].tick_params(labelbottom=False)
     axes["s"].set_xlabel(_EXCESS_LABEL, fontsize=LABEL_SIZE)
-    left_out = int((measured & ~(_set_excess_scale(axes["p"], data))).sum())
+    left_out = int((measured & ~_set_excess_scale(axes["p"], data)).sum())
     lines, over = {}, {}
     if plane:
         lines, over = _draw_share_plane(axes["m"], data, measured)
@@ -268,7 +274,7 @@ def _draw_shares(axes: Axes, data: xr.Dataset, name: str) -> None:
 
 
 def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
-    """Limit the logarithmic axis of the excess to the measured ones, and return which points lie on it."""
+    """Set the range of the logarithmic axis of the excess from the data, and return which points lie on it."""
     excess, stderr = data.force_ratio.values - 1.0, np.nan_to_num(data.force_ratio_stderr.values)
     shown = excess >= _LEAST_EXCESS
     if shown.any():
@@ -279,7 +285,7 @@ def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
 def _draw_share_plane(
     axes: Axes, data: xr.Dataset, measured: np.ndarray
 ) -> tuple[dict[float, QuadContourSet], dict[float, QuadContourSet]]:
-    """Draw the share of the pressure over the plane; return its contours and those of the excess."""
+    """Draw the share of the pressure in the plane; return its contours and those of the excess."""
     x, y = refined_axes(data)
     field = interpolated(data.cluster_pressure_share.values)
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
@@ -295,7 +301,7 @@ def _draw_share_plane(
 
 
 def _add_share_legend(figure: Figure, data: xr.Dataset) -> None:
-    """Name the lines and the symbols of the shares beside their panels."""
+    """Explain the lines and the symbols of the shares beside their panels."""
     lines = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
     symbols = zip(data.packing_fraction.values, curve_styles(data.sizes["packing_fraction"]), strict=True)
     plain = {"linestyle": "none", "color": "0.3"}
