@@ -219,12 +219,12 @@ def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence
         return np.pad(np.asarray(bonds[: times - lag].multiply(bonds[lag:]).sum(axis=1)).ravel(), (0, lag)), pairs
 
     all_lags = np.append(0, lags)
-    both = np.stack([np.stack(joined(lag), axis=-1) for lag in all_lags.tolist()], axis=1)  # (times, lags, 2)
+    counts = np.stack([np.stack(joined(lag), axis=-1) for lag in all_lags.tolist()], axis=1)  # (times, lags, 2)
     in_series = (np.arange(times)[:, None] < times - all_lags)[:, :, None]  # times t for which t + lag is in the series
-    sums = {"both": both, "start": both[:, :1] * in_series}
+    sums = {"joined": counts, "start": counts[:, :1] * in_series}
 
     def estimate(s: Sums) -> Sums:
-        curves = ratio(s["both"], s["start"])
+        curves = ratio(s["joined"], s["start"])
         lifetimes = {name: _decay(all_lags, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}
         return {"curves": curves, **lifetimes}
 
@@ -255,18 +255,18 @@ def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
     contact_distances = radii[load.time, load.i] + radii[load.time, load.j]
     from_j = radii[load.time, load.j] / contact_distances * load.distances
     points = frames.state.positions[load.time, load.j] + from_j[:, None] * load.normals
-    both, pairs = np.zeros((2, times, len(edges) - 1))
+    products, pairs = np.zeros((2, times, len(edges) - 1))
     for t in range(times):
         here, force = points[load.time == t], load.force[load.time == t]
         a, b = np.triu_indices(len(here), 1)
         r = np.linalg.norm(minimum_image(here[a] - here[b], frames.state.side[t], frames.state.tilt[t]), axis=-1)
-        pairs[t], both[t] = np.histogram(r, edges)[0], np.histogram(r, edges, weights=force[a] * force[b])[0]
+        pairs[t], products[t] = np.histogram(r, edges)[0], np.histogram(r, edges, weights=force[a] * force[b])[0]
     single = np.stack([np.ones_like(load.force), load.force], axis=-1)
-    sums = {"both": both, "pairs": pairs, "single": by_time(times, load.time, single)}
+    sums = {"products": products, "pairs": pairs, "single": by_time(times, load.time, single)}
 
     def estimate(s: Sums) -> Sums:
         mean = ratio(s["single"][..., 1:], s["single"][..., :1])
-        return {"g": ratio(ratio(s["both"], s["pairs"]), mean**2) - 1}
+        return {"g": ratio(ratio(s["products"], s["pairs"]), mean**2) - 1}
 
     return Curve(centres(edges), *with_errors(estimate, sums)["g"])
 

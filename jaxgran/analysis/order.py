@@ -115,9 +115,9 @@ def profiles(seen: Snapshot, bins: int = 10) -> Profiles:
     sums = {name: histograms(times, time, height, edges, x.ravel()) for name, x in weights.items()}
     sums["area"] = state.side**2 / bins
     found = with_errors(lambda s: {"n": s["n"] / s["area"][..., None], "c": ratio(s["p"], s["m"])}, sums)
-    at = centres(edges)
-    laboratory = found["c"].value + shear_rate[0] * at
-    return Profiles(Curve(at, *found["n"]), Curve(at, *found["c"]), Curve(at, laboratory, found["c"].error))
+    heights = centres(edges)
+    laboratory = Curve(heights, found["c"].value + shear_rate[0] * heights, found["c"].error)
+    return Profiles(Curve(heights, *found["n"]), Curve(heights, *found["c"]), laboratory)
 
 
 def _without_rattlers(i: np.ndarray, j: np.ndarray, grains: int) -> tuple[int, int]:

@@ -226,9 +226,8 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
             raise InputError("it has no frames")
         first = _chunks(file, 0, {})
         if "particles/position" in first and file.find_matching_chunk_names("particles/velocity"):
-            first.setdefault(
-                "particles/velocity", np.zeros_like(first["particles/position"])
-            )  # GSD does not store zeros
+            at_rest = np.zeros_like(first["particles/position"])  # GSD does not store zeros
+            first.setdefault("particles/velocity", at_rest)
         for k in range(file.nframes):
             frame = _chunks(file, k, first)
             lack = _lack(frame, first)

@@ -253,8 +253,8 @@ def _frame(axes: Axes, scene: Scene) -> None:
     half = scene.side / 2
     length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
     low = -half - 0.07 * scene.side
-    wide = 1.01 * half * (1 + abs(scene.tilt))
-    axes.set(xlim=(-wide, wide), ylim=(low - 0.03 * scene.side, half * 1.01), aspect="equal")
+    half_width = 1.01 * half * (1 + abs(scene.tilt))
+    axes.set(xlim=(-half_width, half_width), ylim=(low - 0.03 * scene.side, half * 1.01), aspect="equal")
     axes.set_axis_off()
     start = -half * (1 + scene.tilt)
     axes.plot([start, start + length], [low, low], color="black", linewidth=1.6, solid_capstyle="butt")
