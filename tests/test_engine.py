@@ -11,6 +11,7 @@ import xarray as xr
 from synthetic import one_sentence
 
 import jaxgran as jg
+from jaxgran.dynamics import plain
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.maps.dataset import map_dataset
@@ -139,10 +140,15 @@ def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> N
 # What runs
 
 
-def test_the_named_engine_is_auto_to_the_bit_where_auto_takes_it(flowing, run) -> None:
+def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
     state, advance = flowing(0.7), jax.jit(jg.advance)
     assert_same_bits(advance(of("machine_code"), state, STEPS), advance(of(), state, STEPS))
-    assert_same_bits(advance(of("jax"), state, STEPS), run(of(), state, STEPS))
+
+
+def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
+    monkeypatch.setattr(plain, "advance", lambda *arguments: arguments)
+    for flow in (of("jax"), of(solver="jacobi"), of("jax", solver="jacobi")):
+        assert jg.advance(flow, flowing(0.7), STEPS) == (flow, flowing(0.7), STEPS, True, None, False)
 
 
 def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing, monkeypatch) -> None:
