@@ -5,28 +5,22 @@ iterations. The replicas of a batch are packings of one flow, prepared by the ma
 states through the same steps. Seconds are those that the processor spends, on one core, with compilation apart, so that
 other programs on the machine hardly matter.
 
-    python benchmarks/engine_cost.py            # about 4 minutes
-    python benchmarks/engine_cost.py --quick    # half a minute
+    python -m benchmarks engine_cost
+    python -m benchmarks engine_cost --quick
 """
 
-import argparse
-import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hardware import hardware
 from jax import lax
 from matplotlib.figure import Figure
 
 import jaxgran as jg
+from benchmarks.output import Output
 from jaxgran.model.control_flow import AXIS
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.steady_state import prepare_batch
@@ -38,17 +32,9 @@ TOLERANCE, EQUILIBRATION = 1e-4, 1.0  # strain
 TRIAL_STRAIN, LONGEST_STRAIN, SECONDS = 0.01, 1.0, 1.0  # of a first call; of the timed one, which takes so long
 
 
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--quick", action="store_true", help="one flow of 64 grains, batches of 1 and 4")
-    arguments.add_argument("--output", type=Path, default=Path(__file__).parent / "results")
-    chosen = arguments.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    run(chosen.quick, chosen.output)
-
-
-def run(quick: bool, output: Path) -> None:
+def run(output: Output) -> None:
     """Measure, print, and write ``engine_cost.json`` and ``engine_cost.png``."""
+    quick = output.quick
     grains, sizes = (64, QUICK_SIZES) if quick else (256, SIZES)
     flows, timesteps = (QUICK_FLOWS, QUICK_TIMESTEPS) if quick else (FLOWS, TIMESTEPS)
     prepared = {(flow, dt): states(*flow, dt, grains, max(sizes)) for dt in timesteps for flow in flows}
@@ -79,11 +65,8 @@ def run(quick: bool, output: Path) -> None:
                 )
                 line = "{way:22s}{size:7d}{compile_seconds:13.1f}{alpha:4.1f}{nu:5.2f}{dt:8.0e}{steps_per_second:15.0f}"
                 print(line.format(**points[-1]), flush=True)
-    output.mkdir(parents=True, exist_ok=True)
-    stem = output / ("engine_cost_quick" if quick else "engine_cost")
-    result = {"hardware": hardware(), "grains": grains, "tolerance": TOLERANCE, "points": points}
-    stem.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    draw(points).savefig(stem.with_suffix(".png"), dpi=150)
+    output.write_rows("engine_cost", {"grains": grains, "tolerance": TOLERANCE}, "points", points)
+    output.write_picture(draw(points), "engine_cost")
 
 
 def _in_turn(flow: jg.ShearFlow, states: jg.State, steps: jax.Array) -> tuple[jg.State, jg.Tally]:
@@ -147,7 +130,3 @@ def draw(points: list[dict]) -> Figure:
     panels[0].set_ylabel("replica-steps per second of one core")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize="small")
     return figure
-
-
-if __name__ == "__main__":
-    main()

@@ -164,6 +164,13 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "engine_cost",
+        "What does each engine cost, and the original design: JAX alone, in lockstep, by Jacobi iterations?",
+        (4, 1),
+        ("engine_cost.json", "engine_cost.png"),
+        one_core=True,
+    ),
+    Benchmark(
         "timestep_study",
         "What becomes of the force ratio as the time step vanishes?",
         (25, 1),
