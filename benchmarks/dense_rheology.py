@@ -1,7 +1,7 @@
 """The friction law of dense flows: macroscopic friction and packing fraction against the inertial number, with fits.
 
 python -m benchmarks dense_rheology            # 3 minutes on two cores
-python -m benchmarks dense_rheology --quick    # one restitution, 64 grains, one seed
+python -m benchmarks dense_rheology --quick    # two restitutions, 256 grains, half the strain
 """
 
 import jaxgran as jg
@@ -16,7 +16,7 @@ FULL = PRESETS["quick"] | {
     "grains": 400,
     "timestep": 5e-4,
 }
-QUICK = FULL | {"restitution": (0.2,), "grains": 64, "seeds": 1, "strain": 4.0}
+QUICK = FULL | {"restitution": (0.2, 0.5), "packing_fraction": (0.75, 0.77, 0.785, 0.795), "grains": 256, "strain": 4.0}
 
 
 def run(output: Output) -> None:

@@ -55,19 +55,19 @@ BENCHMARKS = (
     Benchmark(
         "paper",
         "Where in the plane of restitution and packing fraction are binary collisions all there is?",
-        (9, 0.3),
+        (9, 0.5),
         ("paper.nc", "paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_clusters.png"),
     ),
     Benchmark(
         "quick_map",
         "What does `jaxgran map` draw when it is given no option?",
-        (0.5, 0.3),
+        (0.5, 0.4),
         ("quick_curves.png",),
     ),
     Benchmark(
         "dense_rheology",
         "Do dense flows obey one friction law of the inertial number?",
-        (3, 0.5),
+        (3, 1),
         ("dense_rheology.png",),
     ),
     Benchmark(
