@@ -1,8 +1,8 @@
 """The sheared periodic cell (Lees–Edwards): a square of side L whose image rows slide along x.
 
-The lattice vectors are (L, 0) and (tilt·L, L), with the tilt in [−½, ½): shearing by a whole period gives the
-same lattice, so the tilt is only ever known up to an integer. Velocities are peculiar (SLLOD): the same for all
-images of a grain; the image's velocity jump enters through γ̇·y of the separation.
+The lattice vectors are (L, 0) and (tilt·L, L). Adding an integer to the tilt gives the same lattice, so the tilt is
+kept in [−½, ½). Velocities are peculiar (SLLOD): all images of a grain have the same one. The velocity jump between
+images enters through γ̇ Δy of the separation.
 """
 
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -
     """Side L of the square cell in which the discs have the given packing fraction.
 
     Examples:
-      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))  # four discs of diameter one, each in a square of its own
+      >>> float(cell_side(jnp.full(4, 0.5), jnp.pi / 4))  # four discs of diameter 1, each fills π/4 of a unit square
       2.0
     """
     return jnp.sqrt(jnp.pi * jnp.sum(radii**2) / packing_fraction)
@@ -33,7 +33,7 @@ def remap_tilt(tilt: Float[Array, ""]) -> Float[Array, ""]:
 def displacement(
     to: Float[Array, "*n 2"], origin: Float[Array, "*n 2"], side: Array, tilt: Array
 ) -> Float[Array, "*n 2"]:
-    """Minimum-image separation ``to − origin``; exact for separations shorter than half the side.
+    """Minimum-image separation ``to − origin``, exact if it is shorter than half the side.
 
     Examples:
       The image below a grain at the top of a cell of side 10 has slid by a quarter of the side:
@@ -49,16 +49,16 @@ def displacement(
 
 
 def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
-    """The images of the positions with x and y in [0, L)."""
+    """The images of the positions that have x and y in [0, L)."""
     rows = jnp.floor(positions[:, 1] / side)
-    rows = jnp.where(positions[:, 1] - rows * side >= side, rows + 1, rows)  # a tiny negative y plus L rounds to L
+    rows = jnp.where(positions[:, 1] - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
     x = positions[:, 0] - rows * tilt * side
     x = x - side * jnp.floor(x / side)
     return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(positions[:, 1] - rows * side, 0)], axis=-1)
 
 
 def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:
-    """The vectors with strain·y added to x."""
+    """The vectors after a simple shear: strain·y is added to x."""
     return jnp.stack([vectors[..., 0] + strain * vectors[..., 1], vectors[..., 1]], axis=-1)
 
 
@@ -69,19 +69,19 @@ def relative_velocity(
     separations: Float[Array, "pairs 2"],
     shear_rate: float | Array,
 ) -> Float[Array, "pairs 2"]:
-    """Relative velocity of grain i seen from (the image of) grain j in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
+    """Velocity of grain i relative to the nearest image of grain j, in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
     peculiar = velocities[i] - velocities[j]
     return jnp.stack([peculiar[:, 0] + shear_rate * separations[:, 1], peculiar[:, 1]], axis=-1)
 
 
 def minimum_image(separations: Float[np.ndarray, "n 2"], side: float, tilt: float) -> Float[np.ndarray, "n 2"]:
-    """``cell.displacement`` of separations in NumPy: exact where they are shorter than half the side."""
+    """The minimum image of separations in NumPy, exact if they are shorter than half the side; see ``displacement``."""
     rows = np.round(separations[:, 1] / side)
     x = separations[:, 0] - rows * tilt * side
     return np.stack([x - side * np.round(x / side), separations[:, 1] - rows * side], axis=-1)
 
 
 def centred(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "grains 2"]:
-    """The images of positions in [0, L) that lie in the sheared cell around the origin, the old centre of the cell."""
+    """The images of positions in [0, L) that lie in the sheared cell whose centre is the origin."""
     x, y = (positions - side / 2).T
     return np.stack([x - side * np.floor((x - tilt * y) / side + 0.5), y], axis=-1)

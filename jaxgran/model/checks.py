@@ -1,4 +1,4 @@
-"""What a user gives is judged here: an InputError says in one sentence what is accepted."""
+"""Checks of user input: an InputError says in one sentence what is accepted."""
 
 from reprlib import Repr
 from typing import Any
@@ -9,39 +9,42 @@ from jax.core import Tracer
 
 
 class InputError(ValueError):
-    """A mistake in what a user gave; the message is one sentence that says what is accepted."""
+    """A mistake in the user's input; the message is one sentence that says what is accepted."""
 
 
 def known(value: Any) -> np.ndarray | None:
-    """The value as an array, of numbers if it is a number or an array of them; None while it is traced."""
+    """The value as an array; None while JAX traces it.
+
+    What is neither a number nor an array of numbers becomes ``array(None)``, which no check accepts.
+    """
     if isinstance(value, Tracer):
         return None
     key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     number = isinstance(value, (bool, int, float, np.generic, np.ndarray, jax.Array)) and not key
-    number = number and not isinstance(value, np.ma.MaskedArray)  # whose values need not mean anything
+    number = number and not isinstance(value, np.ma.MaskedArray)  # masked values have no meaning
     return np.asarray(value if number else None)
 
 
 def two_digits(value: float, up: bool) -> str:
-    """A positive number as 1.2e-03, rounded to the side of a limit on which it is still accepted."""
+    """A positive limit as 1.2e-03, rounded up or down so that the printed number is itself accepted."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return f"{(np.ceil if up else np.floor)(value / unit) * unit:.1e}"
 
 
-_BRIEF = Repr()
-_BRIEF.maxother = _BRIEF.maxstring = 100
+_SHORT_REPR = Repr()
+_SHORT_REPR.maxother = _SHORT_REPR.maxstring = 100
 
 
 def shown(value: Any) -> str:
-    """A value as one short line, for a sentence."""
+    """A value as one short line, for an error message."""
     try:
-        return " ".join(_BRIEF.repr(value).split())
-    except ValueError:  # of a whole number with thousands of digits
+        return " ".join(_SHORT_REPR.repr(value).split())
+    except ValueError:  # Python refuses to print an integer of thousands of digits
         return f"this {type(value).__name__}"
 
 
 def require(name: str, value, accepts, words: str) -> None:
-    """Raise an InputError that says what is accepted, unless every known number of ``value`` is."""
+    """Raise an InputError with ``words`` unless all numbers of ``value`` are accepted; traced values pass."""
     numbers = known(value)
     if numbers is None:
         return
@@ -50,7 +53,7 @@ def require(name: str, value, accepts, words: str) -> None:
 
 
 def listed(values: Any) -> Any:
-    """A list of numbers as the array it stands for; anything else, to be judged, as it is."""
+    """A list or tuple of numbers as an array; any other value unchanged, for the check that follows."""
     numbers = isinstance(values, (list, tuple)) and all(
         isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
         for x in values
@@ -59,12 +62,12 @@ def listed(values: Any) -> Any:
 
 
 def require_number(name: str, value, accepts, words: str) -> None:
-    """The same for what must be a single number."""
+    """The check ``require`` for a single number."""
     require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
 
 
 def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
-    """Raise an InputError that says what is accepted, and why not more, unless the value is such a whole number."""
+    """Raise an InputError unless the value is a whole number in [least, most]; ``why`` explains the upper limit."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
         raise InputError(f"{name} must be a whole number of at least {least}, not {shown(value)}.")
     if value > most:
@@ -72,7 +75,7 @@ def require_whole(name: str, value: Any, least: int, most: int, why: str) -> Non
 
 
 def require_key(key: Any) -> None:
-    """Raise an InputError unless this is one random key of JAX."""
+    """Raise an InputError unless this is a single JAX random key."""
     typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
     raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
     if not typed and not raw:

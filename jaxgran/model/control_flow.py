@@ -1,8 +1,8 @@
 """Real control flow for a batch of replicas.
 
-Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select`` that pays both branches. Reduced over
-the named axis ``"replica"`` the predicate is one scalar for the whole batch, and control flow stays control
-flow. A function of the engine used on its own, or under ``lax.map``, has no such axis, and nothing changes.
+Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select``, which computes both branches. Reduced over the
+named axis ``"replica"``, the predicate is one scalar for the whole batch, and only one branch is computed. Outside a
+batch, and under ``lax.map``, there is no such axis: the functions below then return their argument unchanged.
 """
 
 from typing import TypeVar
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 def in_batch() -> bool:
-    """Whether the code being traced runs under ``vmap(axis_name="replica")``."""
+    """Whether the code that JAX traces runs under ``vmap(axis_name="replica")``."""
     try:
         lax.axis_index(AXIS)
     except NameError:
@@ -35,9 +35,9 @@ def largest_replica(value: jax.Array) -> jax.Array:
 
 
 def where_active(active: jax.Array, new: T, old: T) -> T:
-    """``new`` in replicas that are ``active`` and ``old`` elsewhere: a replica that has finished stays as it is.
+    """``new`` in active replicas and ``old`` in finished ones.
 
-    Outside a batch control flow never reaches an inactive replica, so ``new`` is returned as it is.
+    Outside a batch the loop of a finished replica has ended, so the result is always ``new``.
     """
     if not in_batch():
         return new

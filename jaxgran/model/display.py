@@ -1,7 +1,7 @@
-"""How objects show themselves: one line for ``repr``, a small table in HTML for a notebook.
+"""Text of an object: one line for ``repr``, a small HTML table for a notebook.
 
-An object lists what it shows as rows, and both forms are made of the same rows. Many values are shown by their number
-and their range, traced ones by their type: a batch of a thousand replicas takes no more room than one.
+Both forms use the same list of rows. An array of many values is shown by its shape and its range, so a batch of a
+thousand replicas needs no more space than one. A traced value is shown by its type.
 """
 
 from collections import Counter
@@ -13,12 +13,12 @@ import numpy as np
 
 from jaxgran.model.status import Status
 
-_LONGEST = 100  # letters of a value that is no number
-_CELL = "text-align: left; padding: 0.1em 0.8em"
+_LONGEST_REPR = 100  # characters of a value that is not a number
+_CELL_STYLE = "text-align: left; padding: 0.1em 0.8em"
 
 
 class Row(NamedTuple):
-    """What is shown of a property; "" is the unit of a number without dimension, None an error that is not known."""
+    """One property to show: unit "" for a dimensionless number, error None where it is not known."""
 
     name: str
     value: Any
@@ -27,16 +27,16 @@ class Row(NamedTuple):
 
 
 def text_of(title: str, rows: Sequence[Row]) -> str:
-    """One line: the title, and in brackets the rows as ``name=value``."""
+    """One line: the title, then the rows as ``name=value`` in brackets."""
     return f"{title}({', '.join(f'{row.name}={value_text(row.value, row.error)}' for row in rows)})"
 
 
 def html_of(title: str, rows: Sequence[Row], note: str = "") -> str:
-    """A table with a row for each property, and a note beneath it; whatever the values hold is escaped."""
+    """An HTML table with one row a property and a note below it; all text is escaped."""
     lines = [
-        f'<tr><th style="{_CELL}">{escape(row.name.replace("_", " "))}</th>'
-        f'<td style="{_CELL}">{escape(_plain_text(row))}</td>'
-        f'<td style="{_CELL}">{escape(row.unit)}</td></tr>'
+        f'<tr><th style="{_CELL_STYLE}">{escape(row.name.replace("_", " "))}</th>'
+        f'<td style="{_CELL_STYLE}">{escape(_plain_text(row))}</td>'
+        f'<td style="{_CELL_STYLE}">{escape(row.unit)}</td></tr>'
         for row in rows
     ]
     foot = f"<div>{escape(note)}</div>" if note else ""
@@ -44,11 +44,15 @@ def html_of(title: str, rows: Sequence[Row], note: str = "") -> str:
 
 
 def value_text(value: Any, error: Any = None) -> str:
-    """A value in a few letters: a number, with its error if it is known; the range of many numbers; else its repr."""
+    """A value as short text.
+
+    A single number is shown with its error, if known. Many numbers are shown by shape and range. Any other value is
+    shown by its ``repr``.
+    """
     numbers = _numbers(value)
     if numbers is None:
         words = " ".join(repr(value).split())
-        return words if len(words) <= _LONGEST else f"{words[:_LONGEST]}…"
+        return words if len(words) <= _LONGEST_REPR else f"{words[:_LONGEST_REPR]}…"
     if numbers.ndim == 0:
         return str(numbers[()]) if error is None else f"{numbers.item():.4g} ± {float(error):.2g}"
     shape = "×".join(map(str, numbers.shape))
@@ -66,18 +70,18 @@ def _plain_text(row: Row) -> str:
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """The value as an array if it is a number or an array of them; None where it is neither, or traced."""
+    """The value as an array of numbers; None if it is not numeric, or traced."""
     if isinstance(value, (bool, str, bytes)) or value is None:
         return None
     try:
         array = np.asarray(value)
-    except Exception:  # what JAX raises of a traced value, and NumPy of what is no array
+    except Exception:  # JAX raises for a traced value, NumPy for a value that is no array
         return None
     return array if array.dtype.kind in "iuf" else None
 
 
 def display_methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
-    """The methods ``__repr__`` and ``_repr_html_`` of a class, from a function that lists the rows of an object."""
+    """The methods ``__repr__`` and ``_repr_html_`` of a class, from the function that lists its rows."""
     return lambda self: text_of(title, rows(self)), lambda self: html_of(title, rows(self), _UNITS)
 
 
@@ -87,18 +91,18 @@ _UNITS = (
 
 
 def statuses(codes: np.ndarray) -> str:
-    """The name of a status, or how many there are of each."""
+    """The name of one status, or the names of many with their counts."""
     names = Counter(Status(int(code)).name for code in np.ravel(codes))
     return ", ".join(name if np.ndim(codes) == 0 else f"{name} ({count})" for name, count in names.most_common())
 
 
 def rounded(value: Any) -> Any:
-    """A number to six digits, as no more of a measured one is of interest; many numbers as they are."""
+    """A single measured number to six digits; an array unchanged."""
     return float(f"{float(value):.6g}") if np.ndim(value) == 0 else value
 
 
 def arrays(*leaves: Any) -> list[np.ndarray]:
-    """The leaves as arrays; none at all where one is traced or stands in the place of a number."""
+    """The leaves as arrays; an empty list if one of them is traced or not numeric."""
     found = [_numbers(leaf) for leaf in leaves]
     known = [x for x in found if x is not None]
     return known if len(known) == len(found) else []

@@ -16,15 +16,13 @@ Engine = Literal["auto", "machine_code", "jax", "thread_block"]
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83
-MIN_GRAINS, MAX_GRAINS = 16, 10**7  # more would need some 20 GB
-MAX_REPLICAS = 10**6  # of a map
-MAX_STEPS = 2**31 - 1  # of a sample: they are counted in an int32
-SHORTEST_TIMESTEP = 1e-8  # in 1/shear_rate: the longest block of a run has fewer steps than MAX_STEPS
-
+MIN_GRAINS = 16
+MAX_GRAINS = 10**7  # more need over 20 GB of memory
+MAX_REPLICAS = 10**6  # of one map
+MAX_STEPS = 2**31 - 1  # of one sample: an int32 counts the steps
+SHORTEST_TIMESTEP = 1e-8  # 1/γ̇; the longest block of a run then has fewer than MAX_STEPS steps
 
 _STATIC = {"static": True}
-
-
 _UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
 
 
@@ -36,30 +34,30 @@ def _rows(flow: "ShearFlow") -> list[Row]:
 class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
-    Units: length in mean grain diameters σ, mass in masses m of a grain of diameter σ. ``grains``,
-    ``activation``, ``solver`` and ``engine`` are static; all else is traced, so that a change recompiles nothing and a
-    batch of flows is one ``ShearFlow`` whose numbers carry a leading ``(replicas,)`` axis.
+    The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
+    ``grains``, ``activation``, ``solver`` and ``engine`` are static. All other fields are traced: changing them
+    recompiles nothing, and a batch of flows is one ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis.
 
     ================  =================  ===============================================================
     field             unit               meaning
     ================  =================  ===============================================================
     grains            –                  number of discs N, 16 to 1e7
-    restitution       –                  α in [0, 1], ratio of normal velocities after and before
-    packing_fraction  –                  ν in (0, 0.83], area of the grains over the area of the cell
+    restitution       –                  α in [0, 1], normal velocity after a collision over that before
+    packing_fraction  –                  ν in (0, 0.83], area of the grains over area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
-    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where time has any unit, see ``cooling``
-    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; unused with grains of one's own
+    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free, see ``cooling``
+    polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with ``own_grains``
     tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
-    max_iterations    –                  cap of one contact solve
-    activation        –                  "midpoint": contact if half a step of free flight overlaps;
-                                         "touching": contact if the grains overlap
+    max_iterations    –                  largest number of iterations of one contact solve
+    activation        –                  "midpoint": contact if the grains overlap after half a step of free flight;
+                                         "touching": contact if the grains overlap now
     relaxation        –                  ω in (0, 2) of the Jacobi methods
-    solver            –                  projected method of the contact solve in the engine jax, see
-                                         ``projected_methods``; the other engines have one of their own, which
-                                         stands for the default alone
-    engine            –                  what advances the flow, see ``dynamics.engine``; they differ in speed and
-                                         rounding, not in the law:
-                                         "auto": the fastest that can do what is asked;
+    solver            –                  projected method of the contact solve in the engine "jax", see
+                                         ``projected_methods``; the other engines have their own solver and run
+                                         only with the default here
+    engine            –                  program that advances the flow, see ``dynamics.engine``; engines differ in
+                                         speed and rounding, not in the contact law:
+                                         "auto": selected for the backend, precision and solver;
                                          "machine_code": on processors, in float64;
                                          "thread_block": on NVIDIA GPUs, up to 1024 grains;
                                          "jax": everywhere, every solver, derivatives; a map advances its batches
@@ -67,7 +65,7 @@ class ShearFlow:
     ================  =================  ===============================================================
 
     Raises:
-      InputError: (a ValueError) a number is outside its range; traced numbers are not judged.
+      InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
     """
 
     grains: int = field(metadata=_STATIC)
@@ -105,19 +103,18 @@ class ShearFlow:
 
     @property
     def activation_fraction(self) -> float:
-        """θ: the share of a step of free flight over which a pair must overlap to be a contact."""
+        """θ: fraction of a time step of free flight after which an overlapping pair is a contact."""
         return 0.5 if self.activation == "midpoint" else 0.0
 
 
-_TRACED, _FIXED = (
-    tuple(f.name for f in fields(ShearFlow) if bool(f.metadata.get("static")) is static) for static in (False, True)
-)
+_TRACED_FIELDS = tuple(f.name for f in fields(ShearFlow) if not f.metadata.get("static"))
+_STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("static"))
 
 
-def _unflatten(fixed: tuple, traced: Iterable) -> ShearFlow:
-    """A flow of any leaves, not judged: they may be derivatives, axes or placeholders."""
+def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
+    """A flow of any leaves, without checks: JAX also passes derivatives, axis numbers and placeholders."""
     flow = object.__new__(ShearFlow)
-    for name, value in zip(_FIXED + _TRACED, (*fixed, *traced), strict=True):
+    for name, value in zip(_STATIC_FIELDS + _TRACED_FIELDS, (*static, *traced), strict=True):
         object.__setattr__(flow, name, value)
     return flow
 
@@ -125,8 +122,8 @@ def _unflatten(fixed: tuple, traced: Iterable) -> ShearFlow:
 jax.tree_util.register_pytree_with_keys(
     ShearFlow,
     lambda flow: (
-        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED],
-        tuple(getattr(flow, name) for name in _FIXED),
+        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED_FIELDS],
+        tuple(getattr(flow, name) for name in _STATIC_FIELDS),
     ),
     _unflatten,
 )
@@ -147,7 +144,7 @@ _RANGES = {
 
 
 def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
-    """Raise an InputError unless a strain is at least a time step for each part, and no more than can be counted."""
+    """Raise an InputError unless the strain has at least one time step a part and at most ``MAX_STEPS`` in all."""
     require_sheared(flow)
     require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
@@ -158,14 +155,14 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
 
 
 def require_sheared(flow: ShearFlow) -> None:
-    """Raise an InputError where the flow is not sheared, for what counts in strain."""
+    """Raise an InputError if the shear rate is zero, for functions that measure time in strain."""
     words = "above 0 where strain is counted (for a flow without shear there is cooling)"
     require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
 
 
 def require_flow(flow: Any) -> None:
-    """Raise an InputError unless this is one ShearFlow, not a batch."""
+    """Raise an InputError unless this is a single ShearFlow, not a batch."""
     if not isinstance(flow, ShearFlow):
         raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
-    if any(np.ndim(getattr(flow, name)) for name in _TRACED):
+    if any(np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS):
         raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")

@@ -1,4 +1,4 @@
-"""Grains: radii and masses of the discs, the stratified sample of a size distribution, and discs of one's own."""
+"""Grains: radii and masses of the discs, from a size distribution or given by the user."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ from jaxgran.model.checks import InputError, listed, require, require_key, requi
 from jaxgran.model.flow import MAX_GRAINS
 
 _POSITIVE = "a list of positive numbers"
-_LARGEST = 1e30  # of a diameter or a mass: their sums are finite in float32
-_MEAN_DIAMETER = 1e-3  # by which the mean of given diameters may differ from the unit of length
+_LARGEST_VALUE = 1e30  # of a diameter or a mass; their sums stay finite in float32
+_MEAN_DIAMETER_TOLERANCE = 1e-3  # σ; allowed difference between the mean of given diameters and the unit of length
 
 
 @jax.tree_util.register_dataclass
@@ -38,8 +38,8 @@ class Grains:
 def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grains:
     """Discs with diameters uniform in 1 ± ``polydispersity`` and masses equal to the diameter squared.
 
-    The diameters are the quantile midpoints of the uniform law in random order, so that the mean is exactly one
-    and no sample is unlucky: independent draws of 1000 diameters would move the pressure by 1–2 %.
+    The diameters are the quantile midpoints of the uniform distribution, in random order. Their mean is exactly one,
+    and every replica has the same sizes. Independent draws of 1000 diameters would change the pressure by 1–2 %.
 
     Args:
       count: number of grains.
@@ -57,9 +57,9 @@ def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grain
 def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
     """Discs of any diameters and masses, for ``prepare``, ``heated`` and ``pack``.
 
-    Lengths are in mean diameters, so the diameters are divided by their mean. Masses stay as they are: what is given is
-    in the unit m of all stresses and temperatures, which the inertial number and Bagnold's coefficients take for the
-    mass of a grain. Half of a bidisperse packing hollow, and its small grains heavy:
+    Lengths are in mean diameters, so the diameters are divided by their mean. Masses are not rescaled. They are in the
+    unit m of all stresses and temperatures. The inertial number and Bagnold's coefficients take m as the mass of a mean
+    grain. In this bidisperse packing every second grain is hollow, and the solid grains of both sizes have mass m:
 
         diameters = np.repeat([1.0, 1.4], 128)
         grains = jg.own_grains(diameters, masses=np.where(np.arange(256) % 2, 0.1, 1.0))
@@ -67,16 +67,16 @@ def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
     =========  =========  ====  ===============================================================================
     argument   shape      unit  meaning
     =========  =========  ====  ===============================================================================
-    diameters  (grains,)  any   diameters, in any order: their places in the packing are random
-    masses     (grains,)  m     masses; None for the square of the diameters over their mean, as of equal discs
+    diameters  (grains,)  any   diameters, in any order: their positions in the packing are random
+    masses     (grains,)  m     masses; None for equal density: the squares of the diameters over their mean
     =========  =========  ====  ===============================================================================
 
     Raises:
-      InputError: they are not lists of as many positive numbers.
+      InputError: these are not two lists of positive numbers of the same length.
     """
     given = {"diameters": listed(diameters), **({} if masses is None else {"masses": listed(masses)})}
     for name, values in given.items():
-        require(name, values, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST), _POSITIVE)
+        require(name, values, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST_VALUE), _POSITIVE)
     sizes = jnp.asarray(given["diameters"], float)
     sizes = sizes / jnp.mean(sizes)
     weights = sizes**2 if masses is None else jnp.asarray(given["masses"], float)
@@ -86,7 +86,7 @@ def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
 
 
 def require_grains(grains: Any, count: int) -> None:
-    """Raise an InputError unless these are so many grains, in units of their mean diameter; traced ones may be any."""
+    """Raise an InputError unless these are ``count`` grains of mean diameter 1; traced values are not checked."""
     words = f"grains must be Grains with radii and masses of {count} discs, as the flow has, not"
     if not isinstance(grains, Grains):
         raise InputError(f"{words} {shown(grains)}.")
@@ -97,7 +97,7 @@ def require_grains(grains: Any, count: int) -> None:
         require(name, getattr(grains, name), lambda x: (x > 0) & np.isfinite(x), _POSITIVE)
     if not isinstance(grains.radii, Tracer):
         mean = 2 * float(np.mean(np.asarray(grains.radii)))
-        if abs(mean - 1) > _MEAN_DIAMETER:
+        if abs(mean - 1) > _MEAN_DIAMETER_TOLERANCE:
             raise InputError(
                 f"the mean diameter must be 1, the unit of length, not {mean:g}: own_grains divides by it."
             )

@@ -1,4 +1,4 @@
-"""State: a sheared packing at one instant, what judges it, and its energy and momentum."""
+"""State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
 from dataclasses import dataclass
 
@@ -43,7 +43,7 @@ class State:
     ==========  ===========  ====  =====================================================
     grains      Grains       –     radii and masses
     positions   (grains, 2)  σ     centres, wrapped into the cell
-    velocities  (grains, 2)  σγ̇    peculiar velocities c; the laboratory's are c + γ̇ y x̂
+    velocities  (grains, 2)  σ/t   peculiar velocities c; in the laboratory frame c + γ̇ y x̂
     side        ()           σ     side L of the cell
     tilt        ()           –     offset of the image row above, in L, in [−½, ½)
     ==========  ===========  ====  =====================================================
@@ -59,7 +59,7 @@ class State:
 
 
 def require_state(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError unless this is one flow, and one state of its grains."""
+    """Raise an InputError unless these are one flow and one state with its number of grains."""
     require_flow(flow)
     if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
         raise InputError(
@@ -69,17 +69,19 @@ def require_state(flow: ShearFlow, state: State) -> None:
 
 
 def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:
+    """Kinetic energy of the peculiar motion, Σ m c²/2."""
     return jnp.sum(grains.masses * jnp.sum(velocities**2, axis=-1)) / 2
 
 
 def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
-    """|Σ m c| over Σ m |c|, zero at rest."""
+    """Total momentum over the sum of the momenta of the grains, |Σ m c| / Σ m |c|; zero at rest."""
     momenta = grains.masses[:, None] * velocities
-    momenta = lax.stop_gradient(momenta)  # a measure of rounding; at rest a norm has no derivative
-    all_of_it = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
-    return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(all_of_it > 0, all_of_it, 1)
+    momenta = lax.stop_gradient(momenta)  # it measures rounding, and a norm has no derivative at rest
+    scale = jnp.sum(jnp.linalg.norm(momenta, axis=-1))
+    return jnp.linalg.norm(jnp.sum(momenta, axis=0)) / jnp.where(scale > 0, scale, 1)
 
 
 def status_if_finite(*values: Array) -> Int[Array, ""]:
+    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``."""
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
     return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""What can go wrong in a replica, in order of severity: the worst wins."""
+"""What can go wrong in a replica, in order of severity; the worst status is kept."""
 
 from enum import IntEnum
 
@@ -12,12 +12,12 @@ class Status(IntEnum):
     """
 
     ok = 0
-    iteration_limit = 1  # some solve ended above the tolerance
-    not_steady = 2  # stationarity was not established
+    iteration_limit = 1  # a contact solve ended above the tolerance
+    not_steady = 2  # the flow was not shown to be steady
     deep_overlap = 3  # two grains overlapped by more than 1e-2 mean diameters
     infeasible = 4  # no impulses satisfy the contact law: the packing is jammed
     capacity = 5  # more pairs or contacts than the buffers hold
     nonfinite = 6  # a position, velocity or impulse is not a finite number
 
 
-DEEP_OVERLAP = 1e-2
+DEEP_OVERLAP = 1e-2  # σ
