@@ -2,16 +2,18 @@
 
     import jaxgran as jg
     flow = jg.ShearFlow(grains=256, restitution=0.5, packing_fraction=0.76, timestep=1e-4)
-    state = jg.prepare(flow, jax.random.key(0))          # packed, heated, sheared to its steady state
+    state = jg.prepare(flow, jax.random.key(0))          # packed, heated and sheared to the steady state
     state, sample = jg.sample(flow, state, strain=5.0)
     sample.force_ratio, sample.errors()["force_ratio"]
 
-Axis contract: grains carry ``(grains, 2)``, near pairs ``(pairs,)``, contacts ``(contacts,)``. Every function of the
-engine is written for one replica; a batch adds a leading ``(replicas,)`` axis through ``jax.vmap`` with
-``axis_name="replica"`` or through ``jax.lax.map``. Units: mean grain diameter σ, mass m of a grain of that diameter,
-shear rate γ̇.
+Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pairs,)``, of contacts ``(contacts,)``.
+Every function of an engine is written for one replica. A batch adds a leading ``(replicas,)`` axis, with ``jax.vmap``
+and ``axis_name="replica"``, or with ``jax.lax.map``.
 
-Importing this package imports nothing heavy and changes no flag of JAX; names are loaded when they are first used.
+Units: mean grain diameter σ, mass m of a grain of that diameter, and the time unit t of the shear rate (t = 1/γ̇ at the
+default γ̇ = 1).
+
+Importing this package is quick and changes no flag of JAX. Names are loaded when they are first used.
 """
 
 from importlib.metadata import version

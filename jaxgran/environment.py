@@ -1,4 +1,4 @@
-"""What a run was made with: versions, commit, processor, cores, memory, devices and precision."""
+"""Software and hardware of a run: versions, commit, processor, cores, memory, devices and precision."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the checkout that this package runs from, empty where it is none."""
+    """The commit of the repository that this package runs from; empty outside a repository."""
     folder = Path(__file__).parents[1]
     if not (folder / ".git").exists():
         return ""
@@ -31,19 +31,19 @@ def system() -> str:
 
 
 def processor() -> str:
-    """The model of the processor, or "unknown" where the system does not tell."""
+    """The model of the processor, or "unknown"."""
     names = [line.split(":", 1)[1].strip() for line in processor_lines() if line.startswith("model name")]
     return names[0] if names else platform.processor() or "unknown"
 
 
 def processor_features() -> str:
-    """The line of the instruction sets of the processor; its name where the system keeps no such line."""
+    """The list of the processor's instruction sets; its name on systems without such a list."""
     features = (line for line in processor_lines() if line.startswith(("flags", "Features")))
     return next(features, platform.processor())
 
 
 def processor_lines() -> list[str]:
-    """What the system tells of its processors, line by line; nothing where it keeps no such file."""
+    """Lines of ``/proc/cpuinfo``; empty on systems without this file."""
     information = Path("/proc/cpuinfo")
     return information.read_text().splitlines() if information.is_file() else []
 
@@ -54,7 +54,7 @@ def usable_cores() -> int:
 
 
 def memory() -> str:
-    """The memory of the machine in GiB, or "unknown" where the system does not tell."""
+    """The memory of the machine in GiB, or "unknown"."""
     try:
         return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
     except (AttributeError, ValueError, OSError):
@@ -62,7 +62,7 @@ def memory() -> str:
 
 
 def devices() -> list[str]:
-    """Platform and kind of each device of JAX; RuntimeError where a driver does not answer."""
+    """Platform and kind of each JAX device; RuntimeError if a driver does not answer."""
     import jax
 
     return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]

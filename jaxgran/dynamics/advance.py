@@ -1,7 +1,7 @@
-"""The public advance of one replica, by the engine that ``engine`` selects.
+"""Advances one replica through time, with the engine that ``dynamics.engine`` selects.
 
-XLA calls the machine code through its foreign function interface, and the thread block as a kernel of Pallas, so
-``jit``, ``lax.map`` and ``vmap`` apply to them as to everything else.
+XLA calls the machine code through its foreign function interface. The thread block is a Pallas kernel. So ``jit``,
+``lax.map`` and ``vmap`` apply to all engines.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
-_Compiled = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
+_CompiledEngine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
 
 
 def advance(
@@ -33,53 +33,56 @@ def advance(
 ) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
 
-    The ``engine`` of the flow says what runs. With "auto" it is the fastest that can: on a processor or an NVIDIA GPU,
-    with the default solver and no more arguments than these three, a loop of compiled code that solves the same steps
-    to the same tolerance as the engine jax. On a processor it is typically 5 to 7 times faster. Nothing but rounding
-    and what the tolerance leaves open tells them apart.
+    The field ``engine`` of the flow selects the engine. "auto" selects a compiled one on a processor or an NVIDIA GPU,
+    if the solver is the default and only the first three arguments are given. It solves the same steps to the same
+    tolerance as the engine "jax". On a processor it is typically 5 to 7 times faster. The engines differ by rounding
+    and within the tolerance only.
 
-    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) go through it as it is; for those in reverse mode
-    (``jax.grad``, ``jax.vjp``) the number of ``events`` must be given. Reverse mode stores the state and the lists of
-    every event, about 0.7 kB for each grain, and finds its contacts and impulses again on the way back.
+    Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
+    (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
+    event, about 0.7 kB a grain. It computes contacts and impulses again in the backward pass.
 
     Args:
-      flow: parameters; all numbers of one replica.
+      flow: parameters of one replica.
       state: the flow at the beginning.
       steps: number of time steps, traced.
-      free_flight: whether steps without an approaching contact are jumped over. ``False`` visits every step;
-        the trajectory is the same.
-      events: None for as many evaluations as it takes, or the number of them, static, in a loop of fixed length: one
-        for each step that is visited, ``steps + 1`` at most, see ``count_events``. Where they do not suffice the
-        status is ``capacity``.
-      moving_contacts: whether derivatives include that a contact moves in time, see ``dynamics``. Values do not change.
+      free_flight: True jumps over steps without an approaching contact; False visits every step. The trajectory is the
+        same.
+      events: number of visited steps, static, for a loop of fixed length; ``steps + 1`` is always enough, and
+        ``count_events`` counts them. If they are too few, the status is ``capacity``. None visits as many as needed.
+      moving_contacts: whether derivatives include the shift of the contacts in time, see ``dynamics.plain``. Values do
+        not change.
 
     Returns:
-      The state after the last step, and the tally of the steps. A replica that is no longer finite stops with
-      the status ``nonfinite``; so does, on a GPU, one whose lists have no room, with ``capacity``.
+      The state after the last step, and the tally of the steps. A replica with a number that is not finite stops with
+      the status ``nonfinite``. On a GPU, a replica whose lists are full stops with ``capacity``.
 
     Raises:
-      InputError: the flow names an engine that cannot do what is asked.
+      InputError: the flow names an engine that cannot do this.
     """
     require_advance(flow, state, steps)
-    asked = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
-    engine = select_engine(flow, state, " and ".join(name for name, wanted in asked.items() if wanted))
+    options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
+    engine = select_engine(flow, state, " and ".join(name for name, given in options.items() if given))
     if engine == "jax":
         return plain_module.advance(flow, state, steps, free_flight, events, moving_contacts)
     return _advance(machine_code if engine == "machine_code" else thread_block, flow, state, steps)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _advance(by: _Compiled, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    return by(flow, state, steps)
+def _advance(engine: _CompiledEngine, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """The advance by a compiled engine; its derivatives are those of the engine "jax"."""
+    return engine(flow, state, steps)
 
 
 @_advance.defjvp
-def _advance_jvp(by: _Compiled, primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
+def _advance_jvp(
+    engine: _CompiledEngine, primals: tuple, tangents: tuple
+) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
     return jax.jvp(plain_module.advance, primals, tangents)
 
 
 def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica by the machine code."""
+    """Advance one replica with the machine code."""
     from jaxgran.dynamics.machine_code import ffi, loop
 
     ffi.register()
@@ -96,7 +99,7 @@ def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Ta
 
 
 def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica by the kernel of ``thread_block``, and plainly where this is compiled for another device."""
+    """Advance one replica with the GPU kernel of ``thread_block``, or with the engine "jax" on another device."""
     from jaxgran.dynamics.thread_block.kernel import advance
 
     return lax.platform_dependent(flow, state, steps, cuda=advance, default=plain_module.advance)

@@ -1,4 +1,4 @@
-"""Selects the engine that advances a flow, by the name that the flow gives or by backend, precision and solver.
+"""Selects the engine that advances a flow: by name, or for the backend, precision and solver.
 
 ================  ====================================  ============================================================
 engine            for                                   needs
@@ -6,11 +6,11 @@ engine            for                                   needs
 machine_code      processors                            float64, the default solver, no ``vmap`` with a named axis
 thread_block      NVIDIA GPUs                           at most 1024 grains, the default solver
 jax               everything else, and as reference     nothing: every backend, precision, solver and derivative
-auto              whatever is asked for                 nothing: the one of the backend where it can, or else jax
+auto              every flow                            nothing: the engine of the backend if possible, or else jax
 ================  ====================================  ============================================================
 
-All engines solve the same steps to the same tolerance. Derivatives, ``observe`` and steps without free flight are in
-the engine jax alone. With "auto" it takes them; an engine that is named and cannot do what is asked is refused.
+All engines solve the same steps to the same tolerance. Derivatives, ``observe`` and steps without free flight run in
+the engine "jax" only. "auto" selects it for them. A named engine that cannot do them raises an InputError.
 """
 
 import warnings
@@ -26,30 +26,30 @@ from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.model.flow import Engine, ShearFlow
 from jaxgran.model.state import State
 
-MOST_GRAINS = 1024  # of a thread block: the threads that it can have
-_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
-_OF_PLATFORM: dict[str, Engine] = {"cpu": "machine_code", "gpu": "thread_block"}
-_SOLVERS = {"machine_code": "gauss-seidel, barzilai-borwein where stiff", "thread_block": "barzilai-borwein"}
+MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
+_DEFAULT_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
+_ENGINE_OF_PLATFORM: dict[str, Engine] = {"cpu": "machine_code", "gpu": "thread_block"}
+_SOLVER_OF_ENGINE = {"machine_code": "gauss-seidel, barzilai-borwein where stiff", "thread_block": "barzilai-borwein"}
 
 
-def select_engine(flow: ShearFlow, state: State | None = None, besides: str = "") -> Engine:
+def select_engine(flow: ShearFlow, state: State | None = None, jax_only: str = "") -> Engine:
     """Selects the engine for the backend, precision and solver: ``machine_code``, ``thread_block`` or ``jax``.
 
     Args:
-      flow: what counts is its engine, its solver and its number of grains; it may be a batch.
-      state: what counts is its precision; None for the one that JAX makes numbers in.
-      besides: what is asked of the advance that the engine jax alone can do, in words; empty for nothing.
+      flow: gives the engine, the solver and the number of grains; it may be a batch.
+      state: gives the precision; None for JAX's default precision.
+      jax_only: name of an option that only the engine "jax" has, for the error message; "" if there is none.
 
     Raises:
-      InputError: the flow names an engine that cannot do what is asked.
+      InputError: the flow names an engine that cannot do this.
     """
     if flow.engine == "jax":
         return "jax"
     device = _device()
-    engine = _OF_PLATFORM.get(device.platform) if flow.engine == "auto" else flow.engine
+    engine = _ENGINE_OF_PLATFORM.get(device.platform) if flow.engine == "auto" else flow.engine
     if engine is None:
         return "jax"
-    obstacle = _obstacle(engine, flow, state, besides, device)
+    obstacle = _obstacle(engine, flow, state, jax_only, device)
     if obstacle is None and engine == "thread_block":
         obstacle = _kernel_obstacle(flow, state, device)
     if obstacle is None:
@@ -61,7 +61,7 @@ def select_engine(flow: ShearFlow, state: State | None = None, besides: str = ""
 
 
 def solver_in_use(engine: Engine, solver: str) -> str:
-    """What solves the contacts where an engine runs a flow with a solver; isolated pairs have a closed form.
+    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in all of them.
 
     Examples:
       >>> solver_in_use("jax", "jacobi")
@@ -69,20 +69,20 @@ def solver_in_use(engine: Engine, solver: str) -> str:
       >>> solver_in_use("machine_code", "barzilai-borwein")
       'gauss-seidel, barzilai-borwein where stiff'
     """
-    return _SOLVERS.get(engine, solver)
+    return _SOLVER_OF_ENGINE.get(engine, solver)
 
 
 def _obstacle(
-    engine: Engine, flow: ShearFlow, state: State | None, besides: str, device: Any
+    engine: Engine, flow: ShearFlow, state: State | None, jax_only: str, device: Any
 ) -> tuple[str, str] | None:
-    """Where an engine cannot do what is asked, and why, in words; None where it can, if its kernel runs."""
+    """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
     dtypes = _dtypes(state)
-    if _OF_PLATFORM.get(device.platform) != engine:
+    if _ENGINE_OF_PLATFORM.get(device.platform) != engine:
         made_for = "processors" if engine == "machine_code" else "NVIDIA GPUs"
         return f"on a {device.platform.upper()}", f"it is made for {made_for}"
-    if besides:
-        return f"with {besides}", "only the engine jax does that"
-    if flow.solver != _SOLVER:
+    if jax_only:
+        return f"with {jax_only}", "only the engine jax does that"
+    if flow.solver != _DEFAULT_SOLVER:
         return f"with the solver {flow.solver}", "it has a contact solve of its own"
     if len(dtypes) > 1:
         return "where the numbers of a state differ in precision", "it computes in one"
@@ -96,7 +96,7 @@ def _obstacle(
 
 
 def _kernel_obstacle(flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
-    """The same of the kernel for GPUs, which is tried; where none was asked for by name, a warning says so."""
+    """The obstacle that a trial of the GPU kernel finds; with the engine "auto", a warning reports it."""
     dtype = next(iter(_dtypes(state)))
     problem = _kernel_problem(flow.grains, dtype, device, jax.config.read("jax_enable_x64"))
     if not problem:
@@ -112,13 +112,13 @@ def _dtypes(state: State | None) -> set[jnp.dtype]:
 
 def _device() -> Any:
     """The device that JAX computes on by default."""
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # of ``jax.default_device``
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
     return jax.devices(device)[0] if device is None or isinstance(device, str) else device
 
 
 @cache
 def _kernel_problem(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> str:
-    """Why the kernel does not compile or keep the laws of contacts on a device, empty where it does: tried once."""
+    """Why the kernel does not compile on a device or breaks the contact law there; "" if it works. Tried once."""
 
     def trial() -> None:
         from jaxgran.dynamics.thread_block import kernel
@@ -127,9 +127,9 @@ def _kernel_problem(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> st
             kernel.trial(grains, dtype)
 
     try:
-        with ThreadPoolExecutor(1) as other:  # what is being traced here is not traced there
+        with ThreadPoolExecutor(1) as other:  # another thread: the trial must not become part of a trace
             other.submit(trial).result()
-    except Exception as error:  # of a compiler, a driver or a device: there is no saying which
+    except Exception as error:  # a compiler, a driver or a device may fail in any way
         return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
     return ""
 

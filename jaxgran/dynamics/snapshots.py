@@ -1,7 +1,7 @@
-"""Snapshots: flows at single instants with the contact forces that act then, for all that needs more than sums.
+"""Snapshots: flows at single instants, with the contact forces at that instant.
 
-A time step begins with the state of a snapshot: its contacts change the velocities at once, and the grains then fly
-freely for dt. So the contact forces are impulses over dt, and ``collided`` and ``flown`` are the two halves of a step.
+A time step begins with the state of a snapshot. Its contacts change the velocities at once (``collided``). The grains
+then fly freely for dt (``flown``). A contact force is the impulse over dt.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 
-_MOST_SNAPSHOTS = 10**9  # times grains
+_MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
 
 
 @jax.tree_util.register_dataclass
@@ -35,11 +35,11 @@ class Snapshot:
     ===========  ===========  ====  ===============================================================
     state        State        –     positions, and velocities before the contacts act
     contacts     Contacts     –     the contact network of the step
-    impulses     (contacts,)  mσγ̇   impulse p of each contact: grain i gains p n, grain j loses it
-    timestep     ()           1/γ̇   dt; the force of a contact is p/dt
+    impulses     (contacts,)  mσ/t  impulse p of each contact: grain i gains p n, grain j loses p n
+    timestep     ()           t     dt; the force of a contact is p/dt
     shear_rate   ()           1/t   γ̇
     restitution  ()           –     α
-    status       ()           –     the worst status since the snapshot before, this solve included
+    status       ()           –     worst status since the last snapshot, with that of its own solve
     ===========  ===========  ====  ===============================================================
     """
 
@@ -53,7 +53,7 @@ class Snapshot:
 
 
 def snapshot(flow: ShearFlow, state: State) -> Snapshot:
-    """The snapshot of a flow as it is: its next contact network is solved, nothing moves."""
+    """The snapshot of a flow now: the contact network of the next step is solved, and nothing moves."""
     network = contacts_now(flow, state)
     solution = solve(
         network,
@@ -70,7 +70,7 @@ def snapshot(flow: ShearFlow, state: State) -> Snapshot:
 
 
 def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array) -> Snapshot:
-    """The snapshot of a flow whose contacts have been solved."""
+    """The snapshot of a flow, from its contacts and their solved impulses."""
     timestep, shear_rate, restitution = (
         jnp.asarray(x, state.side.dtype) for x in (flow.timestep, flow.shear_rate, flow.restitution)
     )
@@ -78,24 +78,24 @@ def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Arr
 
 
 def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:
-    """Shear a flow and take snapshots at equal distances of strain; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Shear a flow and take snapshots at equal intervals of strain; ``jit``, ``vmap`` and ``lax.map`` apply.
 
     Args:
-      flow: parameters, those of the state.
-      state: the flow at the beginning, best from ``prepare``.
-      strain: strain to shear in all, rounded to whole time steps. A change of it compiles nothing anew.
-      count: number of snapshots, static; the first follows a strain of ``strain / count``. With a strain of ``count``
-        time steps, every step is taken.
+      flow: parameters of the state.
+      state: the flow at the beginning, usually from ``prepare``.
+      strain: total strain, rounded to whole time steps. A new value does not recompile.
+      count: number of snapshots, static. The first is taken after a strain of ``strain / count``. With a strain of
+        ``count`` time steps, there is a snapshot of every step.
 
     Returns:
-      The state at the end, which is that of the last snapshot, and the snapshots with a leading (times,) axis.
+      The final state, which is that of the last snapshot, and the snapshots with a leading (times,) axis.
 
     Raises:
-      ValueError: the strain is not a positive number, shorter than a time step for each snapshot or longer than
-        2**31 - 1 of them.
+      InputError: (a ValueError) the strain is not a positive number, is shorter than one time step a snapshot, or is
+        longer than 2**31 - 1 time steps.
     """
     require_state(flow, state)
-    require_whole("count", count, 1, _MOST_SNAPSHOTS // flow.grains, "as memory is limited")
+    require_whole("count", count, 1, _MOST_GRAIN_SNAPSHOTS // flow.grains, "as memory is limited")
     require_strain(flow, strain, count)
     return _snapshot_series(flow, state, strain, count)
 
@@ -105,23 +105,23 @@ def _snapshot_series(flow: ShearFlow, state: State, strain: Array, count: int) -
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
 
-    def one(now: State, steps: Array) -> tuple[State, Snapshot]:
-        now, tally = advance(flow, now, steps)
-        seen = snapshot(flow, now)
-        return now, replace(seen, status=jnp.maximum(seen.status, tally.status))
+    def next_snapshot(state: State, steps: Array) -> tuple[State, Snapshot]:
+        state, tally = advance(flow, state, steps)
+        new = snapshot(flow, state)
+        return state, replace(new, status=jnp.maximum(new.status, tally.status))
 
-    return lax.scan(one, state, jnp.diff(edges).astype(jnp.int32))
+    return lax.scan(next_snapshot, state, jnp.diff(edges).astype(jnp.int32))
 
 
-def collided(seen: Snapshot) -> State:
-    """The state after the contacts of a snapshot have acted, before the flight."""
-    state = seen.state
-    gained = grain_impulses(seen.contacts, seen.impulses, state.grains.radii.size)
-    return replace(state, velocities=state.velocities + gained / state.grains.masses[:, None])
+def collided(snapshot: Snapshot) -> State:
+    """The state after the contacts of a snapshot have acted, before the free flight."""
+    state = snapshot.state
+    momenta = grain_impulses(snapshot.contacts, snapshot.impulses, state.grains.radii.size)
+    return replace(state, velocities=state.velocities + momenta / state.grains.masses[:, None])
 
 
 def flown(state: State, shear_rate: float | Array, time: float | Array) -> State:
-    """The state after free flight: every grain keeps its velocity in the laboratory, and the cell shears."""
+    """The state after free flight: grains keep their velocity in the laboratory frame, and the cell is sheared."""
     cx, cy = state.velocities[:, 0], state.velocities[:, 1]
     x, y = state.positions[:, 0], state.positions[:, 1]
     moved = jnp.stack([x + time * (cx + shear_rate * y), y + time * cy], axis=-1)
