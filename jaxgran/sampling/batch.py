@@ -1,11 +1,10 @@
-"""Batches of replicas: flows stacked into one, and what advances them together.
+"""Batches of replicas: flows stacked into one, and the functions that advance them.
 
-A batch carries a leading (replicas,) axis on everything. All that changes its states is a ``Drive``; what is wrapped
-around the plain one tells of its progress or keeps a journal.
+All arrays of a batch have a leading (replicas,) axis. Only a ``Drive`` changes its states. ``advance_batch`` is the
+plain one. Wrappers around it report progress, record frames or keep a journal.
 
-Where JAX sees several devices, of this host or of all those that ``jax.distributed`` has brought together, each of them
-takes its share of the replicas, with loops of its own: devices wait for each other at the end of a call only, and all
-hosts hold the results of all.
+JAX may see several devices, of this host or of all hosts that ``jax.distributed`` connects. Each device then advances
+its share of the replicas. Devices wait for each other only at the end of a call. All hosts get all results.
 """
 
 from collections.abc import Callable
@@ -23,14 +22,16 @@ from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import Engine, ShearFlow
 from jaxgran.model.state import State
 
-Report = Callable[[float], None]  # told the replica-steps done since the last call
-Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances a batch, each replica by its own steps
-Wrap = Callable[[Drive], Drive]  # adds to what a drive does, and changes no state
+Report = Callable[[float], None]  # called with the replica-steps done since the last call
+Drive = Callable[
+    [ShearFlow, State, Array], tuple[State, Tally]
+]  # advances each replica of a batch by its own number of steps
+Wrap = Callable[[Drive], Drive]  # adds reports or records to a drive; states stay the same
 _DEVICES = "devices"
 
 
 def stack(flows: list[ShearFlow]) -> ShearFlow:
-    """One ShearFlow of a batch: every number with a leading (replicas,) axis."""
+    """The flows as one batch: a ShearFlow whose numbers have a leading (replicas,) axis."""
 
     def joined(path, *values) -> Array:
         numbers = np.stack([np.asarray(value) for value in values])
@@ -42,58 +43,59 @@ def stack(flows: list[ShearFlow]) -> ShearFlow:
 
 
 def in_lockstep(engine: Engine = "auto") -> bool:
-    """Whether the replicas of a batch advance together: on an accelerator, and everywhere if the engine jax is named.
+    """Whether the replicas of a batch advance together: on an accelerator, and with ``engine="jax"`` on any device.
 
-    Then a batch waits for its slowest replica. On a processor that is what ``engine="jax"`` is asked for: the batch as
-    one array program. Where "auto" takes the engine jax there, replicas go one after another, which is faster.
+    The batch is then one array program and waits for its slowest replica. On a processor, "auto" advances one replica
+    after another, which is faster, also where it selects the engine "jax".
     """
     return engine == "jax" or jax.default_backend() != "cpu"
 
 
 def replicated(function: Callable, engine: Engine = "auto") -> Callable:
-    """The function of one replica for a batch: ``vmap`` with a named axis ``in_lockstep``, or else ``lax.map``.
+    """The function of one replica for a batch: with ``vmap`` and a named axis if ``in_lockstep``, or else ``lax.map``.
 
-    On several devices every one does so with its share of the replicas.
+    With several devices, each computes its share of the replicas.
     """
 
     def in_turn(*arguments):
         return lax.map(lambda one: function(*one), arguments)
 
-    together = jax.vmap(function, axis_name=AXIS) if in_lockstep(engine) else in_turn
-    return together if jax.device_count() == 1 else _shared_out(together)
+    batched = jax.vmap(function, axis_name=AXIS) if in_lockstep(engine) else in_turn
+    return batched if jax.device_count() == 1 else _on_all_devices(batched)
 
 
-def _shared_out(together: Callable) -> Callable:
-    """A function of a batch that hands every device an equal share, the last one in part copies of others."""
+def _on_all_devices(batched: Callable) -> Callable:
+    """The function of a batch with equal shares on all devices; copies of replicas fill the last share."""
     devices = jax.devices()
     mesh = Mesh(np.asarray(devices), (_DEVICES,))
 
-    def share(*arguments):
-        return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), together(*arguments))
+    def gathered(*arguments):
+        return jax.tree.map(lambda x: lax.all_gather(x, _DEVICES, tiled=True), batched(*arguments))
 
-    shares = jax.shard_map(
-        share, mesh=mesh, in_specs=PartitionSpec(_DEVICES), out_specs=PartitionSpec(), check_vma=False
+    sharded = jax.shard_map(
+        gathered, mesh=mesh, in_specs=PartitionSpec(_DEVICES), out_specs=PartitionSpec(), check_vma=False
     )
 
-    def shared_out(*arguments):
+    def on_all_devices(*arguments):
         count = len(jax.tree.leaves(arguments)[0])
         if count == 1:
-            return together(*arguments)
-        places = np.arange(-(-count // len(devices)) * len(devices)) % count
-        filled = jax.tree.map(lambda x: x[places], arguments)
-        return jax.tree.map(lambda x: x[:count], shares(*filled))
+            return batched(*arguments)
+        share = -(-count // len(devices))  # rounded up
+        chosen = np.arange(share * len(devices)) % count
+        filled = jax.tree.map(lambda x: x[chosen], arguments)
+        return jax.tree.map(lambda x: x[:count], sharded(*filled))
 
-    return shared_out
+    return on_all_devices
 
 
 @jax.jit
 def advance_batch(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
-    """Advance every replica of a batch by its own number of steps: the plain ``Drive`` of the protocol."""
+    """Advance every replica of a batch by its own number of steps: the plain ``Drive``."""
     return replicated(advance, flow.engine)(flow, state, steps)
 
 
 def reporting(drive: Drive, report: Report | None) -> Drive:
-    """A drive that tells how many replica-steps it has done."""
+    """The drive with a report of the replica-steps after each call; the drive itself without ``report``."""
     if report is None:
         return drive
 

@@ -1,9 +1,10 @@
-"""Free cooling: inelastic grains without shear, whose granular temperature falls in collisions.
+"""Free cooling: inelastic grains without shear, whose granular temperature falls by collisions.
 
-The engine is that of sheared flows at γ̇ = 0: the same contacts, solves and flights. Nothing sets a unit of time but the
-velocities: twice as fast grains with half the time step do the same, bit for bit, in half the time. A homogeneous gas
-follows Haff's law, T = T₀/(1 + t/τ)², or T = T₀ exp(−(1 − α²) C/2) in collisions per grain C (P. K. Haff, J. Fluid
-Mech. 134, 401, 1983), until shear modes and clusters grow in cells that are large enough for them.
+The engines are those of sheared flows at γ̇ = 0, with the same contacts, solves and flights. Only the velocities set the
+unit of time: doubled velocities with half the time step give the same motion, bit for bit, in half the time.
+
+A homogeneous gas follows Haff's law, T = T₀/(1 + t/τ)². In collisions per grain C it is T = T₀ exp(−(1 − α²) C/2)
+(P. K. Haff, J. Fluid Mech. 134, 401, 1983). It ends when shear modes and clusters grow, in cells that are large enough.
 """
 
 from dataclasses import dataclass
@@ -23,8 +24,8 @@ from jaxgran.model.checks import InputError, listed, require, two_digits
 from jaxgran.model.flow import MAX_STEPS, ShearFlow
 from jaxgran.model.state import State, require_state
 
-_CROSSING = 0.1  # of its diameter that a grain of thermal speed may cross in one step
-_ROUNDING_STEPS = 20  # roundings of a position that such a grain must cross in one, at the start
+_LARGEST_CROSSING = 0.1  # largest motion in one step of a grain of thermal speed, in its diameters
+_SMALLEST_CROSSING = 20  # smallest motion in one step of such a grain at the start, in roundings of a position
 
 
 @jax.tree_util.register_dataclass
@@ -35,10 +36,10 @@ class Cooling:
     ===========  ========  ======  ====================================================================
     field        shape     unit    meaning
     ===========  ========  ======  ====================================================================
-    times        (times,)  t       since the start, in whole time steps
+    times        (times,)  t       time since the start, in whole time steps
     temperature  (times,)  mσ²/t²  granular temperature Σ m c²/(2N) at these times
     collisions   (times,)  –       approaching contacts per grain since the start, each grain counting its own
-    tally        (times,)  –       sums over the steps since the time before, or since the start
+    tally        (times,)  –       sums over the steps since the previous time, or since the start
     ===========  ========  ======  ====================================================================
     """
 
@@ -49,32 +50,33 @@ class Cooling:
 
     @property
     def status(self) -> Int[Array, "*b"]:
-        """The worst status."""
+        """The worst status of all times."""
         return jnp.max(self.tally.status, axis=-1)
 
 
 def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Cooling]:
-    """Let a flow without shear go for a while, and record how it cools; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Advance a flow without shear and record how it cools; ``jit``, ``vmap`` and ``lax.map`` apply.
 
         flow = jg.ShearFlow(256, restitution=0.9, packing_fraction=0.3, timestep=1e-3, shear_rate=0.0)
         state = jg.heated(flow, jax.random.key(0), temperature=1.0)
         state, _ = jg.cooling(replace(flow, restitution=1.0), state, [10.0])  # a gas in equilibrium
         state, cooled = jg.cooling(flow, state, np.geomspace(0.1, 1000, 40))
 
-    The time step stays as it is while the grains slow down; it costs nothing, since steps without a contact are jumped
-    over. In float32 a step of slow grains is lost in rounding at last: use float64 for long coolings.
+    The time step is constant while the grains slow down. This costs little, since steps without a contact are jumped
+    over. In float32 the motion of slow grains in one step falls below the rounding of positions: use float64 for long
+    coolings.
 
     Args:
-      flow: parameters, those of the state, with ``shear_rate`` zero.
-      state: the flow at the beginning, best from ``heated`` and some collisions at restitution one.
-      times: (times,) increasing times since the beginning at which it is looked at, rounded to whole time steps.
+      flow: parameters of the state, with ``shear_rate`` zero.
+      state: the flow at the beginning, usually from ``heated`` and some collisions at restitution one.
+      times: (times,) increasing times of the record, in t since the beginning, rounded to whole time steps.
 
     Returns:
       The state at the last of the times, and the record.
 
     Raises:
-      ValueError: the flow is sheared, the times do not increase by a time step or more, or a grain of thermal speed
-        would cross more than a tenth of its diameter in a step.
+      InputError: (a ValueError) the flow is sheared, the times do not increase by a time step or more, a grain of
+        thermal speed would cross more than a tenth of its diameter in one step, or positions cannot resolve a step.
     """
     require_state(flow, state)
     require("shear_rate", flow.shear_rate, lambda x: x == 0, "0 in free cooling")
@@ -89,21 +91,22 @@ def _cooling(flow: ShearFlow, state: State, times: Float[Array, " times"]) -> tu
     edges = jnp.round(times / flow.timestep)
     steps = jnp.diff(edges, prepend=0).astype(jnp.int32)
 
-    def part(now: State, steps: Array) -> tuple[State, tuple[Array, Tally]]:
-        now, tally = advance(flow, now, steps)
-        return now, (_temperature(now), tally)
+    def interval(state: State, steps: Array) -> tuple[State, tuple[Array, Tally]]:
+        state, tally = advance(flow, state, steps)
+        return state, (_temperature(state), tally)
 
-    state, (temperature, tally) = lax.scan(part, state, steps)
+    state, (temperature, tally) = lax.scan(interval, state, steps)
     collisions = 2 * jnp.cumsum(tally.collisions) / flow.grains
     return state, Cooling((edges * flow.timestep).astype(dtype), temperature, collisions, tally)
 
 
 def _temperature(state: State) -> Float[Array, ""]:
+    """Granular temperature Σ m c²/(2N), in mσ²/t²."""
     return jnp.sum(state.grains.masses[:, None] * state.velocities**2) / (2 * state.grains.masses.size)
 
 
 def _require_times(flow: ShearFlow, times: Any) -> Array:
-    """The times as an array; an InputError unless they are positive and each is a step or more after the last."""
+    """The times as an array; InputError unless they are positive and increase by a time step or more."""
     if isinstance(times, Tracer):
         return times
     values = listed(times)
@@ -121,18 +124,19 @@ def _require_times(flow: ShearFlow, times: Any) -> Array:
 
 
 def _require_slow(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError if a grain of thermal speed moves too far or too little in one step."""
     if any(isinstance(x, Tracer) for x in (flow.timestep, *jax.tree.leaves(state))):
         return
     diameters, masses = 2 * np.asarray(state.grains.radii), np.asarray(state.grains.masses)
     speeds = np.sqrt(2 * float(_temperature(state)) / masses)
     rounding = float(np.finfo(state.positions.dtype).eps * np.max(np.asarray(state.side)))
-    if float(np.asarray(flow.timestep) * np.max(speeds)) < _ROUNDING_STEPS * rounding:
+    if float(np.asarray(flow.timestep) * np.max(speeds)) < _SMALLEST_CROSSING * rounding:
         raise InputError(
             f"timestep must be longer for positions in {state.positions.dtype}, or a step would be lost in their "
             'rounding: use a longer one, or float64 (jax.config.update("jax_enable_x64", True)).'
         )
     with np.errstate(divide="ignore"):
-        longest = _CROSSING * float(np.min(diameters / speeds))
+        longest = _LARGEST_CROSSING * float(np.min(diameters / speeds))
     if float(np.asarray(flow.timestep)) > longest:
         raise InputError(
             f"timestep must be at most {two_digits(longest, up=False)} at this temperature, or grains would cross more "

@@ -1,4 +1,4 @@
-"""Observables: the averages that follow from a tally, with their names and units."""
+"""Observables: the averages computed from a tally, with their names and units."""
 
 from typing import Any
 
@@ -58,20 +58,19 @@ TENSORS = ("contact_stress", "binary_stress", "kinetic_stress", "stress_ratio")
 
 
 def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) -> dict[str, Array]:
-    """All observables of a tally.
+    """All observables of a tally, by the names of ``OBSERVABLES``.
 
     Args:
       tally: sums with any leading axes.
-      area: area of the cell, σ².
+      area: area of the cell, in σ².
       grains: number of grains.
-      shear_rate: γ̇.
+      shear_rate: γ̇, in 1/t.
 
     Returns:
-      Arrays by the names of ``OBSERVABLES``: scalars with the leading axes of the tally, tensors with (2, 2) behind
-      them. Stress Σ^{ab} follows the sign of the paper: positive diagonal, and the shear stress is −Σ^{xy}.
-      A quotient of nothing by nothing (no contact was seen) is NaN.
+      Arrays with the leading axes of the tally; tensors have two more axes, (2, 2). The diagonal of a stress Σ^{ab} is
+      positive, and the shear stress is −Σ^{xy}, as in the paper. An average over no contacts is NaN.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):  # JAX never warns
+    with np.errstate(divide="ignore", invalid="ignore"):  # NumPy warns of these, JAX does not
         return _averages(tally, area, grains, shear_rate, _namespace(*vars(tally).values(), area, shear_rate))
 
 
@@ -81,7 +80,7 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
     contact, binary, kinetic = (
         moment / volume[..., None, None] for moment in (tally.contact_moment, tally.binary_moment, tally.kinetic_moment)
     )
-    clustered, pushed = tally.cluster_moment, tally.contact_moment
+    in_clusters, in_all = tally.cluster_moment, tally.contact_moment
     dt = _ratio(tally.duration, tally.steps)
     pressure = {name: (s[..., 0, 0] + s[..., 1, 1]) / 2 for name, s in _named(contact, binary, kinetic)}
     shear = {name: -s[..., 0, 1] for name, s in _named(contact, binary, kinetic)}
@@ -100,8 +99,8 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
         "granular_temperature": pressure["kinetic"] * area / grains,
         "bagnold_pressure": total_pressure / shear_rate**2,
         "bagnold_shear_stress": total_shear / shear_rate**2,
-        "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (clustered, pushed))),
-        "cluster_shear_share": _ratio(clustered[..., 0, 1], pushed[..., 0, 1]),
+        "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (in_clusters, in_all))),
+        "cluster_shear_share": _ratio(in_clusters[..., 0, 1], in_all[..., 0, 1]),
         "coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),
         "network_size": _ratio(tally.contacts, tally.solves),
         "macroscopic_friction": total_shear / total_pressure,
@@ -124,21 +123,21 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
 
 
 def _median_residual(counts: Array) -> Array:
-    """Median of counts by residual (..., bins), interpolated within its bin; zero where that is the lowest bin."""
+    """Median of a histogram of residuals (..., bins), interpolated in its bin; zero if that is the lowest bin."""
     xp = _namespace(counts)
-    below = xp.cumsum(counts, axis=-1)
-    half = below[..., -1:] / 2
-    bin = xp.argmax(below >= half, axis=-1, keepdims=True)
-    inside, upto = (xp.take_along_axis(x, bin, axis=-1)[..., 0] for x in (counts, below))
+    cumulative = xp.cumsum(counts, axis=-1)
+    half = cumulative[..., -1:] / 2
+    bin = xp.argmax(cumulative >= half, axis=-1, keepdims=True)
+    in_bin, up_to_bin = (xp.take_along_axis(x, bin, axis=-1)[..., 0] for x in (counts, cumulative))
     bin, half = bin[..., 0], half[..., 0]
-    share = 1 - (upto - half) / xp.where(inside > 0, inside, 1)
+    share = 1 - (up_to_bin - half) / xp.where(in_bin > 0, in_bin, 1)
     edges = xp.log10(xp.asarray(RESIDUAL_EDGES, counts.dtype))
     median = 10 ** (edges[bin] + share * (edges[bin + 1] - edges[bin]))
     return xp.where(half > 0, xp.where(bin == 0, 0, median), xp.nan)
 
 
 def _namespace(*values: Any) -> Any:
-    """JAX's functions for its arrays and NumPy's for all else, a hundred times faster on the few numbers of a point."""
+    """``jax.numpy`` for JAX arrays, or else NumPy, which is 100 times faster for the few numbers of a point."""
     return jnp if any(isinstance(x, jax.Array) for x in values) else np
 
 
@@ -146,7 +145,7 @@ def _named(contact: Array, binary: Array, kinetic: Array):
     return (("contact", contact), ("binary", binary), ("kinetic", kinetic))
 
 
-def _ratio(over: Array, under: Array) -> Array:
-    """A quotient that is NaN, without a warning, where nothing was counted."""
-    xp = _namespace(over, under)
-    return xp.where(under == 0, xp.nan, over / xp.where(under == 0, 1, under))
+def _ratio(numerator: Array, denominator: Array) -> Array:
+    """The quotient; NaN without a warning where the denominator is zero."""
+    xp = _namespace(numerator, denominator)
+    return xp.where(denominator == 0, xp.nan, numerator / xp.where(denominator == 0, 1, denominator))

@@ -1,8 +1,8 @@
-"""Overlap-free initial configurations at a packing fraction.
+"""Random packings without overlap at a given packing fraction.
 
-Random positions are relaxed by the overlap energy ½ Σ (overlap)² of slightly inflated discs with the FIRE method
-(Bitzek et al., Phys. Rev. Lett. 97, 170201, 2006). Below jamming (0.8386 for this size distribution) the energy falls
-to zero; as soon as the inflated discs overlap by less than the inflation, the true ones do not overlap at all.
+The discs are slightly inflated. FIRE (Bitzek et al., Phys. Rev. Lett. 97, 170201, 2006) minimises their overlap energy
+½ Σ (overlap)² from random positions. Below jamming (0.8386 for this size distribution) the energy falls to zero. When
+the inflated discs overlap by less than the inflation, the true discs do not overlap.
 """
 
 from typing import NamedTuple
@@ -30,22 +30,25 @@ from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains, polydisperse, require_grains
 from jaxgran.model.state import State
 
-INFLATION = 5e-4
-_NARROWEST_SKIN = 0.2  # σ, of the lists of near pairs
-_ATTEMPTS = 10
-_ITERATIONS = 20_000
-_SHORTEST_STEP, _LONGEST_STEP = 0.1, 0.5  # FIRE's time step; overlap stiffness and masses are one
+INFLATION = 5e-4  # of the diameters, relative
+_NARROWEST_SKIN = 0.2  # σ; skin of the lists of near pairs
+_ATTEMPTS = 10  # random starts
+_ITERATIONS = 20_000  # of FIRE, for each start
+_FIRST_STEP = 0.1  # time step of FIRE at each start; overlap stiffness and masses are one
+_LONGEST_STEP = 0.5  # the longest one that it grows to
 
 
 class _Fire(NamedTuple):
-    hood: PairLists
-    velocities: Array
-    step: Array
-    mixing: Array
-    downhill: Array
-    overlap: Array
-    iterations: Array
-    attempts: Array
+    """One iterate of FIRE."""
+
+    neighbours: PairLists
+    velocities: Array  # (grains, 2)
+    step: Array  # time step
+    mixing: Array  # share of the velocity that is turned along the forces
+    downhill: Array  # iterations since the forces last opposed the velocities
+    overlap: Array  # largest overlap of the inflated discs, σ
+    iterations: Array  # of this start
+    attempts: Array  # starts so far
 
 
 def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[State, Bool[Array, ""]]:
@@ -54,15 +57,15 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     Args:
       flow: number of grains, polydispersity and packing fraction.
       key: JAX random key.
-      grains: discs of one's own, in mean diameters (see ``own_grains``); None for those of ``polydisperse``.
+      grains: given discs, in mean diameters, see ``own_grains``; None for those of ``polydisperse``.
 
     Returns:
-      The state, with zero velocities and no tilt, and False where ten random starts all got stuck, which below
-      the largest accepted packing fraction 0.83 is not expected.
+      The state, with zero velocities and no tilt, and False if ten random starts all failed. This is not expected up to
+      the largest accepted packing fraction, 0.83.
 
     Raises:
-      InputError: (a ValueError) the grains are not as many as the flow's, not in mean diameters, or one is too large
-        for the cell.
+      InputError: (a ValueError) the number of grains is not that of the flow, their mean diameter is not 1, or a grain
+        is too large for the cell.
     """
     require_flow(flow)
     require_key(key)
@@ -76,35 +79,37 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     side = cell_side(grains.radii, flow.packing_fraction)
     inflated = Grains(grains.radii * (1 + INFLATION), grains.masses)
     allowed = INFLATION * 2 * jnp.min(grains.radii)
-    still = jnp.zeros((flow.grains, 2), side.dtype)
+    at_rest = jnp.zeros((flow.grains, 2), side.dtype)
 
     def start(attempt: Int[Array, ""]) -> _Fire:
-        places = jax.random.uniform(jax.random.fold_in(place_key, attempt), still.shape, side.dtype) * side
-        hood = pair_lists(places, inflated, side, jnp.zeros_like(side))
-        step, mixing = jnp.asarray(_SHORTEST_STEP, side.dtype), jnp.asarray(0.1, side.dtype)
-        return _Fire(hood, still, step, mixing, jnp.int32(0), jnp.full_like(side, jnp.inf), jnp.int32(0), attempt + 1)
+        positions = jax.random.uniform(jax.random.fold_in(place_key, attempt), at_rest.shape, side.dtype) * side
+        neighbours = pair_lists(positions, inflated, side, jnp.zeros_like(side))
+        step, mixing = jnp.asarray(_FIRST_STEP, side.dtype), jnp.asarray(0.1, side.dtype)
+        overlap = jnp.full_like(side, jnp.inf)
+        return _Fire(neighbours, at_rest, step, mixing, jnp.int32(0), overlap, jnp.int32(0), attempt + 1)
 
     def unfinished(now: _Fire):
         return ~(now.overlap < allowed) & (now.attempts <= _ATTEMPTS)
 
     def iterate(now: _Fire) -> _Fire:
-        go = unfinished(now)
-        stuck = go & (now.iterations >= _ITERATIONS)
+        active = unfinished(now)
+        stuck = active & (now.iterations >= _ITERATIONS)
         now = lax.cond(any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now)
-        return where_active(go, _fire_step(now, inflated, side, allowed), now)
+        return where_active(active, _fire_step(now, inflated, side, allowed), now)
 
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start(jnp.int32(0)))
-    positions, tilt = present(end.hood, side)
+    positions, tilt = present(end.neighbours, side)
     found = end.overlap < allowed
-    return State(grains, positions, still, side, tilt), found if generated else found & (widest_skin(grains, side) > 0)
+    fit = found if generated else found & (widest_skin(grains, side) > 0)
+    return State(grains, positions, at_rest, side, tilt), fit
 
 
 def require_room(flow: ShearFlow, grains: Grains) -> None:
-    """Raise an InputError unless these are the grains of the flow, and none is too large for the lists of near pairs.
+    """Raise an InputError unless the grains suit the flow and none is too large for the lists of near pairs.
 
-    Nearest images are unique where the cell is two largest diameters wide; and the search of more than 512 grains is
-    made for grains of similar size: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more in
-    looser flows. Traced numbers are not judged here: ``pack`` then says that no packing was found.
+    Nearest images are unique if the cell is two largest diameters wide. The search of more than 512 grains assumes
+    similar sizes: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more at smaller ν. Traced
+    numbers are not checked here: ``pack`` then returns that no packing was found.
     """
     require_grains(grains, flow.grains)
     if any(isinstance(x, Tracer) for x in (grains.radii, flow.packing_fraction)):
@@ -120,36 +125,43 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
         )
 
 
-def _overlap_forces(hood: PairLists, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
-    """Forces of the overlap energy, and the largest overlap (infinite while the list is incomplete)."""
-    pairs = hood.near
-    separations = separations_now(pairs, hood.frame)
+def _overlap_forces(neighbours: PairLists, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
+    """Forces of the overlap energy, and the largest overlap in σ, infinite if the list of pairs is incomplete."""
+    pairs = neighbours.near
+    separations = separations_now(pairs, neighbours.frame)
     distances = jnp.maximum(jnp.sqrt(jnp.sum(separations**2, axis=-1)), 1e-6)
     overlaps = jnp.maximum(pairs.reach - distances, 0)
-    push = separations * (overlaps / distances)[:, None]
+    forces = separations * (overlaps / distances)[:, None]
     largest = jnp.where(pairs.overflow, jnp.inf, jnp.max(overlaps))
-    return jnp.zeros_like(hood.positions).at[pairs.i].add(push).at[pairs.j].add(-push), largest
+    return jnp.zeros_like(neighbours.positions).at[pairs.i].add(forces).at[pairs.j].add(-forces), largest
 
 
 def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire:
-    """One step of FIRE: follow the forces with inertia, stop dead when they point backwards.
+    """One step of FIRE: the grains follow the forces with inertia, and stop when forces oppose velocities.
 
-    Where the overlap is allowed already nothing moves, so that the packing returned is the one that was measured.
+    If the overlap is already allowed, nothing moves: the returned packing is the one whose overlap was computed.
     """
-    frame = now.hood.frame
-    stale = ~(consumed_skin(frame, now.hood.near_frame, 2 * jnp.max(grains.radii)) <= now.hood.near.skin)
-    hood = lax.cond(any_replica(stale), lambda: refresh(now.hood, grains, side, stale), lambda: now.hood)
-    forces, overlap = _overlap_forces(hood, grains)
+    neighbours = now.neighbours
+    used_skin = consumed_skin(neighbours.frame, neighbours.near_frame, 2 * jnp.max(grains.radii))
+    stale = ~(used_skin <= neighbours.near.skin)
+    neighbours = lax.cond(
+        any_replica(stale), lambda: refresh(now.neighbours, grains, side, stale), lambda: now.neighbours
+    )
+    forces, overlap = _overlap_forces(neighbours, grains)
     forward = jnp.sum(forces * now.velocities) > 0
     aligned = jnp.linalg.norm(now.velocities) / jnp.maximum(jnp.linalg.norm(forces), 1e-30) * forces
     mixed = jnp.where(forward, (1 - now.mixing) * now.velocities + now.mixing * aligned, 0)
     downhill = jnp.where(forward, now.downhill + 1, 0)
-    faster = downhill > 5
-    step = jnp.where(forward, jnp.where(faster, jnp.minimum(now.step * 1.1, _LONGEST_STEP), now.step), now.step * 0.5)
+    accelerate = downhill > 5
+    step = jnp.where(
+        forward, jnp.where(accelerate, jnp.minimum(now.step * 1.1, _LONGEST_STEP), now.step), now.step * 0.5
+    )
     step = jnp.maximum(step, 1e-3)
-    mixing = jnp.where(forward, jnp.where(faster, now.mixing * 0.99, now.mixing), 0.1).astype(now.mixing.dtype)
+    mixing = jnp.where(forward, jnp.where(accelerate, now.mixing * 0.99, now.mixing), 0.1).astype(now.mixing.dtype)
     velocities = mixed + step * forces
     stride = jnp.where(overlap < allowed, 0, step)
-    moved = Frame(hood.frame.displacements + stride * velocities, hood.frame.strain)
-    hood = PairLists(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
-    return _Fire(hood, velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts)
+    moved = Frame(neighbours.frame.displacements + stride * velocities, neighbours.frame.strain)
+    neighbours = PairLists(
+        neighbours.outer, neighbours.near, moved, neighbours.near_frame, neighbours.positions, neighbours.tilt
+    )
+    return _Fire(neighbours, velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts)

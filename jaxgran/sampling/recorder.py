@@ -1,4 +1,4 @@
-"""Frames of a flow while it is driven: snapshots at equal distances of strain, handed on as they are taken."""
+"""Frames of a running flow: snapshots at equal intervals of strain, passed on when they are taken."""
 
 from collections.abc import Callable, Iterator
 from functools import partial, reduce
@@ -16,19 +16,19 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import Drive
 
-Keep = Callable[[Snapshot, int], None]  # given a frame and the time steps since the first one, which has none
+Keep = Callable[[Snapshot, int], None]  # called with a frame and the number of time steps since the first frame
 
 
 class Recorder:
-    """Takes frames of a replica while it is driven.
+    """Takes frames of a replica while a drive advances it.
 
-    A frame is taken at the start and after every so many time steps. Where a frame falls within what would have been
-    advanced at once, that is done in two parts, whose sum differs by rounding; and a flow of many collisions makes of
-    rounding another course of the same flow. Where all frames fall on the ends, every bit stays the same.
+    Frames are taken at the start and then at equal numbers of time steps. If a frame falls inside a call of the drive,
+    the call is made in two parts, and the sums differ by rounding. In a flow of many collisions, rounding leads to
+    another trajectory of the same flow. If all frames fall on the ends of calls, all results are the same bit for bit.
 
     Args:
       every: strain from frame to frame, rounded to whole time steps, at least one.
-      keep: what every frame is handed to.
+      keep: functions that are called with every frame.
     """
 
     def __init__(self, every: float, *keep: Keep):
@@ -36,7 +36,7 @@ class Recorder:
         self.frames = self.steps = 0
 
     def recording(self, drive: Drive) -> Drive:
-        """A drive of a batch of one that records; the frames begin anew with its first call."""
+        """A drive of a batch of one replica that records frames; the first call starts a new series."""
         self.frames = self.steps = 0
         return partial(self._driven, drive)
 
@@ -54,16 +54,16 @@ class Recorder:
         return state, reduce(add, tallies)
 
     def _record(self, flow: ShearFlow, state: State) -> None:
-        if not np.isfinite(np.asarray(state.velocities)).all():  # the status says so
+        if not np.isfinite(np.asarray(state.velocities)).all():  # the status reports it
             return
-        seen = _snapshot_of_one(flow, state)
+        frame = _snapshot_of_one(flow, state)
         for keep in self.keep:
-            keep(seen, self.steps)
+            keep(frame, self.steps)
         self.frames += 1
 
 
 def _parts(done: int, steps: int, every: int) -> Iterator[int]:
-    """The steps in parts that end where a multiple of ``every`` steps is done, and where all are; one part of none."""
+    """The steps in parts, each up to the next multiple of ``every`` or the end; one empty part for zero steps."""
     end = done + steps
     while True:
         part = min(every - done % every, end - done)

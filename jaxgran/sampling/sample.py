@@ -1,4 +1,4 @@
-"""Sample: what is measured of a flow over a strain, in blocks, so that every average has an error."""
+"""Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow from them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,12 +26,12 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, correlation_length, jackknife
 
-BLOCKS, MOST_BLOCKS = 32, 10**6
-ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # those that a relative error is asked for
-_ROUNDING_STEPS = 20  # a grain at shear velocity must move by that many roundings of a position in one step
+BLOCKS = 32
+MOST_BLOCKS = 10**6
+ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # a target for the relative error holds for these
+_SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
 
-
-_SHOWN = {
+_UNITS_OF_SHOWN = {
     "force_ratio": "",
     "pressure": "m/t²",
     "shear_stress": "m/t²",
@@ -46,16 +46,15 @@ def _rows(sample: "Sample") -> list[Row]:
     known = arrays(*vars(sample.tally).values(), sample.area, sample.shear_rate)
     if not known or np.ndim(sample.tally.contact_moment) < 3:
         return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
-    here = jax.tree.map(np.asarray, sample)
-    averages, one = here.averages, here.area.ndim == 0
-    errors = here.errors() if one else {}
-    sums = here._total
+    in_numpy = jax.tree.map(np.asarray, sample)
+    averages = in_numpy.averages
+    errors = in_numpy.errors() if in_numpy.area.ndim == 0 else {}
     return [
-        *[Row("replicas", count) for count in here.area.shape],
-        Row("grains", here.grains),
-        Row("strain", rounded(sums.duration * here.shear_rate)),
-        *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _SHOWN.items()),
-        Row("status", statuses(here.status)),
+        *[Row("replicas", count) for count in in_numpy.area.shape],
+        Row("grains", in_numpy.grains),
+        Row("strain", rounded(in_numpy._total.duration * in_numpy.shear_rate)),
+        *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _UNITS_OF_SHOWN.items()),
+        Row("status", statuses(in_numpy.status)),
     ]
 
 
@@ -71,12 +70,12 @@ class Sample:
     area        ()         σ²    area of the cell
     shear_rate  ()         1/t   γ̇
     grains      static     –     number of grains
-    own         (blocks,)  –     sums over the steps of what ``observe`` found
-                                 in each, a pytree; None without it
+    own         (blocks,)  –     sums over the steps of what ``observe`` returns,
+                                 a pytree; None without ``observe``
     ==========  =========  ====  ============================================
 
     The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
-    default γ̇ = 1); ``averages`` holds all of them by the names of ``observables.OBSERVABLES``.
+    default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``.
     """
 
     tally: Tally
@@ -89,12 +88,12 @@ class Sample:
 
     @property
     def averages(self) -> dict[str, Array]:
-        """All observables, averaged over the blocks."""
+        """All observables over all blocks, by name."""
         return averages(self._total, self.area, self.grains, self.shear_rate)
 
     @property
     def force_ratio(self) -> Float[Array, "*replicas"]:
-        """⟨F⟩/⟨F_bc⟩, the mean contact force over the mean force of binary collisions."""
+        """⟨F⟩/⟨F_bc⟩, mean contact force over mean force of binary collisions, dimensionless."""
         return self.averages["force_ratio"]
 
     @property
@@ -129,7 +128,7 @@ class Sample:
 
     @property
     def stress_ratio(self) -> Float[Array, "*replicas 2 2"]:
-        """Contact stress over binary stress, by component."""
+        """Contact stress over binary stress, by component, dimensionless."""
         return self.averages["stress_ratio"]
 
     @property
@@ -148,38 +147,42 @@ class Sample:
         return estimates([self])[1]
 
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
-        """Means over all time steps of what was observed in one replica, and their standard errors (see ``jackknife``).
+        """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.
 
         Args:
-          estimate: what to make of the means, a function of arrays: a ratio of two of them, say. The errors are those
-            of its result.
+          estimate: a function of the means, such as a ratio of two of them. The errors are those of its result, see
+            ``jackknife``.
 
         Returns:
-          Two pytrees of arrays, as the estimate returns them.
+          Values and errors, two pytrees of the form that ``estimate`` returns.
+
+        Raises:
+          InputError: the sample was made without ``observe``, or it holds a batch.
         """
         if self.own is None or jnp.ndim(self.area):
             raise InputError(
                 "what was observed is that of one replica, sampled with observe and indexed if in a batch."
             )
 
-        def one(sums: Any, steps: Array) -> Any:
+        def estimate_of_sums(sums: Any, steps: Array) -> Any:
             return estimate(jax.tree.map(lambda x: x / steps, sums))
 
-        def named(part: tuple[Any, Array]) -> dict[str, Array]:
-            found = jax.tree.leaves(jax.vmap(one)(*part))
-            return {str(k): leaf for k, leaf in enumerate(found)}
+        def leaves_by_number(parts: tuple[Any, Array]) -> dict[str, Array]:
+            leaves = jax.tree.leaves(jax.vmap(estimate_of_sums)(*parts))
+            return {str(k): leaf for k, leaf in enumerate(leaves)}
 
         sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.own, self.tally.steps))
         total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
-        structure = jax.tree.structure(jax.eval_shape(one, *total))
-        values, errors = jackknife(named, sums)
+        structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
+        values, errors = jackknife(leaves_by_number, sums)
         return structure.unflatten(values.values()), structure.unflatten(errors.values())
 
 
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
-    """Averages over all blocks of some replicas of one flow, and their standard errors by the jackknife.
+    """Averages over all blocks of several replicas of one flow, and their standard errors by the jackknife.
 
-    Extremes are no averages: the entry of each is the largest of all blocks, and its error their standard deviation.
+    For an extreme, such as the largest overlap, the value is the largest of all blocks. Its error is the standard
+    deviation over the blocks.
     """
     average, sums = _stacked(seeds)
     values, errors = jackknife(average, sums)
@@ -190,7 +193,7 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
 
 
 def relative_error(measured: Sample) -> float:
-    """The largest relative standard error among ``ERROR_OBSERVABLES`` of one replica; infinite where one is unknown."""
+    """The largest relative standard error of ``ERROR_OBSERVABLES`` of one replica; infinite if one is not known."""
     values, errors = estimates([measured])
     with np.errstate(invalid="ignore", divide="ignore"):
         worst = max(np.nan_to_num(errors[x] / abs(values[x]), nan=np.inf) for x in ERROR_OBSERVABLES)
@@ -198,10 +201,10 @@ def relative_error(measured: Sample) -> float:
 
 
 def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
-    """Strain that counts as one independent sample, for every average over some replicas of one flow that are alike.
+    """Strain of one independent sample, for every average over replicas of one flow with equal sampled strains.
 
-    The sampled strain of all replicas over this one is the effective sample size. A correlation shorter than a block
-    cannot be seen: the strain of a block is returned for it.
+    The sampled strain of all replicas over this strain is the effective sample size. A correlation shorter than a block
+    cannot be resolved: the result is then the strain of a block.
     """
     average, sums = _stacked(seeds)
     lengths = correlation_length(average, sums)
@@ -210,7 +213,7 @@ def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
 
 
 def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
-    """The averages as a function of sums, and the sums (seeds, blocks, ...) of some replicas of one flow."""
+    """The averages as a function of sums, and the sums (seeds, blocks, ...) of the replicas of one flow."""
     first = seeds[0]
     sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
     return partial(averages, area=first.area, grains=first.grains, shear_rate=first.shear_rate), sums
@@ -224,23 +227,25 @@ def sample(
     observe: Callable[[Snapshot], Any] | None = None,
     callback: Callable[[State, Sample], Any] | None = None,
 ) -> tuple[State, Sample]:
-    """Shear a flow and measure it; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Shear a flow and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
 
-    What ``observe`` returns is averaged over **every** time step, in the same pass (see ``observer``), since what
-    contacts do cannot be had from a few instants: at a short time step most instants of a collisional flow have no
-    contact that pushes. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and
-    velocities are seen once a flight, so they are averaged up to the strain of a flight, about 1e-3. The means of two
-    kinds of grains' temperature and of the contacts' fabric, as an example:
+    The result of ``observe`` is averaged over **every** time step, in the same run (see ``observer``). A few instants
+    do not suffice for contact forces: at a short time step, most instants of a collisional flow have no contact with a
+    force. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and velocities
+    are observed once a free flight; their averages are accurate up to the strain of a flight, about 1e-3.
 
-        def observe(seen):
-            kinetic = seen.state.grains.masses * jnp.sum(seen.state.velocities**2, axis=1) / 2
-            small, n = seen.state.grains.radii < 0.5, seen.contacts.normals
-            pushes = (seen.impulses > 0).astype(n.dtype)
+    This example averages the temperatures of small and large grains and the fabric tensor of the contacts:
+
+        def observe(snapshot):
+            grains, n = snapshot.state.grains, snapshot.contacts.normals
+            kinetic = grains.masses * jnp.sum(snapshot.state.velocities**2, axis=1) / 2
+            small = grains.radii < 0.5
+            loaded = (snapshot.impulses > 0).astype(n.dtype)
             return {
                 "small": jnp.sum(jnp.where(small, kinetic, 0)) / jnp.sum(small),
                 "large": jnp.sum(jnp.where(small, 0, kinetic)) / jnp.sum(~small),
-                "fabric": jnp.einsum("c,ca,cb->ab", pushes, n, n),
-                "contacts": jnp.sum(pushes),
+                "fabric": jnp.einsum("c,ca,cb->ab", loaded, n, n),
+                "contacts": jnp.sum(loaded),
             }
 
         state, measured = jg.sample(flow, state, 5.0, observe=observe)
@@ -248,24 +253,24 @@ def sample(
         fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
 
     Args:
-      flow: parameters, those of the state.
-      state: the flow at the beginning, best from ``prepare``.
-      strain: strain γ̇t to sample, rounded to whole time steps. A change of it compiles nothing anew.
-      blocks: number of equal parts that the tallies are kept for, static.
-      observe: what else to average, a function of a ``Snapshot`` that returns a pytree of arrays; looked at by the
-        engine jax, which on a processor takes 5 to 7 times as long as the machine code; static, so that a new
-        function compiles anew. The contacts of a snapshot are those of a step in which some approach, before they act,
-        in buffers of several sizes: sum over them. A step without has none, so a mean over steps counts zero for it.
-      callback: called after each block with the state and the sample so far; where it returns something true, the
-        sample ends there. A block is then compiled instead of all of them, and no transformation applies.
+      flow: parameters of the state.
+      state: the flow at the beginning, usually from ``prepare``.
+      strain: strain γ̇t to sample, rounded to whole time steps. A new value does not recompile.
+      blocks: number of equal parts of the strain, static; a tally is kept for each.
+      observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It runs in the engine "jax",
+        which takes 5 to 7 times as long as the machine code on a processor. It is static: a new function recompiles.
+        The contacts are those of a step with an approaching contact, before the impulses act. The size of their
+        buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
+      callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
+        One block is then compiled at a time, and JAX transformations do not apply.
 
     Returns:
-      The state at the end and the sample.
+      The final state and the sample.
 
     Raises:
-      ValueError: the flow is not sheared, the strain is not a positive number, shorter than a time step for each block
-        or longer than 2**31 - 1 of them, positions in float32 cannot resolve the time step, what is observed is no
-        sums over the contacts, or the flow names an engine that cannot do what is asked.
+      InputError: (a ValueError) the flow is not sheared; the strain is not a positive number, is shorter than one time
+        step a block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the
+        result of ``observe`` is not summed over contacts; or the flow names an engine that cannot do this.
     """
     require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
@@ -278,56 +283,58 @@ def sample(
         return _sample(flow, state, strain, blocks, observe)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, state, strain))):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
-    return _told_sample(flow, state, strain, blocks, observe, callback)
+    return _sample_with_callback(flow, state, strain, blocks, observe, callback)
 
 
 @partial(jax.jit, static_argnames=("blocks", "observe"))
 def _sample(
     flow: ShearFlow, state: State, strain: Array, blocks: int, observe: Callable[[Snapshot], Any] | None = None
 ) -> tuple[State, Sample]:
-    return _measured(flow, state, _steps_of_blocks(flow, strain, blocks), observe)
+    return _sample_blocks(flow, state, _steps_of_blocks(flow, strain, blocks), observe)
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
+    """Numbers of time steps of the blocks; they differ by one at most."""
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks)
     return jnp.diff(edges).astype(jnp.int32)
 
 
-def _measured(
+def _sample_blocks(
     flow: ShearFlow, state: State, steps: Int[Array, " blocks"], observe: Callable[[Snapshot], Any] | None
 ) -> tuple[State, Sample]:
-    """The sample of blocks of so many time steps."""
+    """The final state and the sample of blocks with the given numbers of time steps."""
     if observe is not None:
         select_engine(flow, state, "observe")
 
-    def block(now: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
+    def block(state: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
         if observe is None:
-            now, tally = advance(flow, now, steps)
-            return now, (tally, None)
-        now, tally, own = advance_observed(flow, now, steps, partial(_look, observe, flow))
-        return now, (tally, own)
+            state, tally = advance(flow, state, steps)
+            return state, (tally, None)
+        state, tally, user_sums = advance_observed(flow, state, steps, partial(_observe_snapshot, observe, flow))
+        return state, (tally, user_sums)
 
-    state, (tally, own) = lax.scan(block, state, steps)
-    return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains, own)
+    state, (tally, user_sums) = lax.scan(block, state, steps)
+    return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains, user_sums)
 
 
-def _look(
+def _observe_snapshot(
     observe: Callable[[Snapshot], Any], flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
 ) -> Any:
+    """The result of ``observe`` for the contacts and impulses of one step."""
     return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
 
 
-_one_block = jax.jit(_measured, static_argnames="observe")
+_sample_one_block = jax.jit(_sample_blocks, static_argnames="observe")
 
 
-def _told_sample(
+def _sample_with_callback(
     flow: ShearFlow, state: State, strain: float | Array, blocks: int, observe: Any, callback: Callable
 ) -> tuple[State, Sample]:
-    """The sample, block by block, each of which a callback is told of."""
+    """The sample, block by block, with a call of ``callback`` after each."""
     parts: list[Sample] = []
     for steps in np.asarray(_steps_of_blocks(flow, strain, blocks)):
-        state, part = _one_block(flow, state, jnp.asarray([steps]), observe)
+        state, part = _sample_one_block(flow, state, jnp.asarray([steps]), observe)
         parts.append(part)
         if callback(state, _joined(parts)):
             break
@@ -335,25 +342,25 @@ def _told_sample(
 
 
 def _joined(parts: list[Sample]) -> Sample:
-    """One sample of all blocks of some of one flow that follow each other."""
-    every = ((part.tally, part.own) for part in parts)
-    blocks = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *every)
-    return replace(parts[-1], tally=blocks[0], own=blocks[1])
+    """One sample from successive samples of the same flow."""
+    sums = ((part.tally, part.own) for part in parts)
+    tally, user_sums = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *sums)
+    return replace(parts[-1], tally=tally, own=user_sums)
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:
-    """Raise a ValueError where the positions are too coarse for the time step; nothing while values are traced.
+    """Raise an InputError if positions cannot resolve the time step; traced values are not checked.
 
-    In one step a grain at the velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is rounded to
-    2e-6 σ. Motion is added to displacements since the last build of the lists, which are far smaller, so a flow goes
-    wrong only where a step moves a pair by less than a rounding of its separation, 1e-7 σ; but the times that are
-    summed up drift by 1e-3, and every program that reads the positions of two states sees their rounding. So the limit
-    is that of the positions.
+    In one step a grain at velocity γ̇σ moves by γ̇ dt σ. In float32 a position in a cell of 20 σ is rounded to 2e-6 σ.
+
+    The engines add the motion to displacements since the last build of the lists, which are far smaller. So a flow is
+    wrong only if a step moves a pair by less than the rounding of its separation, 1e-7 σ. But summed times drift by
+    1e-3, and programs that compare the positions of two states see their rounding. So the limit is that of positions.
     """
     if any(isinstance(x, Tracer) for x in (flow.timestep, flow.shear_rate, state.side)):
         return
     rounding = np.finfo(state.positions.dtype).eps * float(np.max(state.side))
-    least = _ROUNDING_STEPS * rounding
+    least = _SMALLEST_MOTION * rounding
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(
             f"timestep must be at least {two_digits(least, up=True)} / shear_rate for positions in "

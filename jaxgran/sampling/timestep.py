@@ -1,15 +1,16 @@
-"""What a time step and a tolerance cost in accuracy, and the longest and loosest of them for a given error.
+"""Errors that a time step and a tolerance cause, and the longest step and loosest tolerance for a given error.
 
-In a step of dt a grain of thermal speed moves by x = dt √T/σ, and everything follows from that number:
+In one step dt a grain of thermal speed moves by x = dt √T/σ. The errors follow from x:
 
-- the deepest overlap of a sample is about K x diameters, K growing towards jamming, where grains are caught between
-  others, and larger with the touching rule, which meets a grain only after it has gone too far;
-- the stresses are off by at most about x over the mean gap between grains, (ν_J − ν)/2ν diameters: the share of its
-  free path that a grain goes in a step. With the midpoint rule they are far better than that where grains bounce.
+- The deepest overlap of a sample is about K x diameters. K grows towards jamming, where grains are caught between
+  others. It is larger with the touching rule, which finds a contact only after the grains overlap.
+- The relative error of the stresses is at most about x over the mean gap between grains, (ν_J − ν)/2ν diameters. This
+  ratio is the share of its free path that a grain moves in one step. With the midpoint rule the error is far smaller
+  for grains that bounce.
 
-Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives the grains, whatever
-their restitution. The numbers here bound what the charts of ``benchmarks/stability.py`` and
-``benchmarks/speed_vs_accuracy.py`` show for this size distribution; they choose a run, and are no results.
+Kinetic theory underestimates the temperature of dense flows: close to jamming the geometry drives the grains, for any
+restitution. The numbers here are bounds on what ``python -m benchmarks stability`` and ``python -m benchmarks
+speed_vs_accuracy`` find for this size distribution. They serve to choose a time step and are not results.
 """
 
 import jax.numpy as jnp
@@ -23,74 +24,76 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.theory.steady_shear import SteadyShear
 
-COARSE_TIMESTEP = 1e-3
-SHORTENING = 10**0.5  # factor between successive time steps
-_CROSSING = 0.1  # diameters that a grain of thermal speed may cross in one step
-_COARSE_CROSSING = 0.03  # the same for the coarse step, which is ours to choose
+COARSE_TIMESTEP = 1e-3  # 1/γ̇; time step until the flow is steady
+SHORTENING = 10**0.5  # largest factor between successive time steps
 JAMMING = 0.8386  # packing fraction where a random quench of diameters uniform in σ ± 0.26 jams
+_LARGEST_CROSSING = 0.1  # largest motion in one step of a grain of thermal speed, in its diameters
+_COARSE_CROSSING = 0.03  # the same limit for the coarse time step
+_SMALLEST_DISTANCE = 1e-3  # smallest distance to jamming that enters a bound, in packing fraction
 
 
 def expected_temperature(theory: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0) -> np.ndarray:
-    """Granular temperature of a flow in mσ²/t², from kinetic theory's and what the geometry of dense packings adds.
+    """Granular temperature of a flow in mσ²/t²: that of kinetic theory and a term from the geometry of dense packings.
 
-    It is within a factor of two of measured ones for 0 ≤ α ≤ 0.98 and 0.2 ≤ ν ≤ 0.83.
+    It is within a factor of two of simulations for 0 ≤ α ≤ 0.98 and 0.2 ≤ ν ≤ 0.83.
     """
-    return np.asarray(theory) + 0.02 * np.asarray(shear_rate) ** 2 / _room(packing_fraction) ** 1.2
+    return np.asarray(theory) + 0.02 * np.asarray(shear_rate) ** 2 / _distance_to_jamming(packing_fraction) ** 1.2
 
 
 def longest_timestep(temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation) -> np.ndarray:
-    """Longest time step, in t, at which a sample of strain 10 of some hundred grains has no deep overlap."""
-    overlap = 2.5 + 1.23 / np.sqrt(_room(packing_fraction)) + (3 if activation == "touching" else 0)
+    """Longest time step, in t, for which a sample of strain 10 and some hundred grains has no deep overlap."""
+    overlap = 2.5 + 1.23 / np.sqrt(_distance_to_jamming(packing_fraction)) + (3 if activation == "touching" else 0)
     return DEEP_OVERLAP / (overlap * np.sqrt(np.asarray(temperature)))
 
 
 def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray:
-    """Bound on the relative error that the time step makes in pressure and shear stress, from x = dt √T/σ.
+    """Bound on the relative error of pressure and shear stress from the time step, by the crossing x = dt √T/σ.
 
     Examples:
-      The same crossing costs more where the gaps are small:
+      The same crossing causes a larger error where the gaps are small:
 
       >>> [round(float(stress_error(1e-3, nu)), 3) for nu in (0.5, 0.7, 0.8)]
       [0.003, 0.01, 0.041]
     """
-    gap = np.minimum(_room(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5)
+    gap = np.minimum(_distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5)
     return np.asarray(crossing) / gap
 
 
 def automatic_timestep(
     temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation, target_error: float
 ) -> np.ndarray:
-    """Longest time step, in t, whose stress error stays within the target and that overlaps nowhere deeply."""
+    """Longest time step, in t, with a stress error within the target and no deep overlap."""
     crossing = target_error / stress_error(1.0, packing_fraction)
     accurate = crossing / np.sqrt(np.asarray(temperature))
     return np.minimum(accurate, longest_timestep(temperature, packing_fraction, activation))
 
 
 def automatic_tolerance(target_error: float) -> float:
-    """Loosest tolerance whose solves are off by no more than half the target in the stress.
+    """Loosest tolerance for which the stress error of a contact solve is at most half the target.
 
-    In the networks of flows the stress of one solve is off by up to 34 times its relative residual. Over a run these
-    errors mostly cancel, so this is on the safe side.
+    In contact networks of flows the relative stress error of one solve is up to 34 times its relative residual. Over a
+    run these errors mostly cancel, so this choice is on the safe side.
     """
     return float(np.clip(target_error / 70, 1e-10, 1e-2))
 
 
-def _room(packing_fraction: ArrayLike) -> np.ndarray:
-    """How far a packing fraction is from jamming."""
-    return np.maximum(JAMMING - np.asarray(packing_fraction), 1e-3)
+def _distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
+    """Difference between the packing fraction at jamming and this one."""
+    return np.maximum(JAMMING - np.asarray(packing_fraction), _SMALLEST_DISTANCE)
 
 
 def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> None:
-    """Raise a ValueError where a grain of thermal speed crosses more than a tenth of a diameter in one step.
+    """Raise an InputError if a grain of thermal speed crosses more than a tenth of a diameter in one step.
 
-    Of the default grains it is the mean diameter and the speed of a mean grain; of one's own, those of the grain that
-    is the fastest to cross its own diameter.
+    For the default grains this is the mean diameter and the thermal speed of a mean grain. For given grains it is the
+    grain that crosses its own diameter fastest.
     """
-    if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < 0.49 * SHORTEST_TIMESTEP):
+    shortest = 0.49 * SHORTEST_TIMESTEP  # a failed replica of a map is run again with half the time step
+    if np.any(np.asarray(flow.timestep) * np.asarray(flow.shear_rate) < shortest):
         raise InputError(
             f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear_rate, or the steps would be too many to count."
         )
-    longest = _CROSSING / _crossing_rate(theory, grains)
+    longest = _LARGEST_CROSSING / _crossing_rate(theory, grains)
     too_long = np.asarray(flow.timestep) > longest
     if np.any(too_long):
         worst = np.argmax(np.asarray(flow.timestep) / longest)
@@ -102,7 +105,7 @@ def check_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None =
 
 
 def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
-    """Diameters that a grain of thermal speed crosses in a unit of time."""
+    """Diameters that a grain of thermal speed crosses in a unit of time, in 1/t."""
     speed = np.sqrt(2 * np.asarray(theory.granular_temperature))
     return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
 
@@ -110,11 +113,15 @@ def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
 def bounded_coarse_timestep(
     flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
 ) -> Array:
+    """The coarse time step of each flow, in t: short enough for its thermal speed, and not shorter than its own step.
+
+    ``longest`` is in 1/γ̇.
+    """
     coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
     return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
 
 
 def timestep_ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:
-    """Time steps strictly between a coarse and a final one, (1,) each, in equal ratios of at most ``SHORTENING``."""
+    """Time steps between a coarse and a final one, (1,) each, without these; equal ratios of at most ``SHORTENING``."""
     steps = int(np.ceil(np.log(coarse / final) / np.log(SHORTENING) - 1e-9).item())
     return [(coarse * (final / coarse) ** (k / steps)).item() for k in range(1, steps)]
