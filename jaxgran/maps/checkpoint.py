@@ -1,16 +1,16 @@
-"""Checkpoint: a folder beside the output that holds what is done of a map until the map is finished.
+"""Checkpoint: a folder beside the output with the finished part of a map, kept until the map is complete.
 
 ==================  ================================================================================================
 file                content
 ==================  ================================================================================================
-``map.nc``          every parameter of the map, and the versions and precision that decide its bits
+``map.nc``          all parameters of the map, and the versions and precision that its results depend on
 ``done-*.nc``       the replicas of a finished batch
-``journal-*.nc``    a batch that is under way, see ``journal``
-``lock``            held by the process that writes here, and free as soon as that process has ended, however it did
+``journal-*.nc``    a batch that is running, see ``journal``
+``lock``            locked by the process that writes here; released when that process ends for any reason
 ==================  ================================================================================================
 
-Every file carries a checksum. A damaged one is dropped, and what it held is computed anew. The names of the batches
-tell the map and the replicas, so that what another map has left behind is never taken for a part of this one.
+Every file has a checksum. A damaged file is removed, and its replicas are computed again. The file name of a batch is a
+hash of the map and the replicas, so a file of another map is never taken for a part of this one.
 """
 
 import glob
@@ -35,23 +35,23 @@ from jaxgran.sampling.sample import Sample
 
 try:
     import fcntl
-except ImportError:  # where there are no such locks, two runs on one output are not told apart
+except ImportError:  # a system without such locks: a second run on one output is not detected
     fcntl = None
 
 _VERSIONS = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 
 class Checkpoint:
-    """What is done of a map, in memory and on disc.
+    """The finished part of a map, in memory and on disc.
 
     Args:
-      output: the dataset that the map will be written to; the folder stands beside it.
+      output: file of the map's dataset; the folder is beside it.
       settings: the map.
-      resume: whether to continue what an earlier run has left.
+      resume: whether to continue the unfinished map of an earlier run.
 
     Raises:
-      ValueError: another process writes to this output, or an unfinished map is there and ``resume`` is False or its
-        parameters or versions are others; the sentence names the difference.
+      InputError: (a ValueError) another process writes to this output. Or there is an unfinished map, and ``resume`` is
+        False or its parameters or versions differ; the message names the difference.
     """
 
     def __init__(self, output: Path, settings: MapSettings, resume: bool):
@@ -62,7 +62,7 @@ class Checkpoint:
         self._identity = _identity(settings)
         self._lock = _locked(self.folder, output)
         try:
-            self._tidy()
+            self._remove_leftovers()
             unfinished = (self.folder / "map.nc").exists() and self._batches()
             if unfinished and not resume:
                 raise InputError(
@@ -73,7 +73,7 @@ class Checkpoint:
                 self._require_same()
                 self._read()
             else:
-                for path in self._batches():  # of a map that is finished: only half of its folder was removed
+                for path in self._batches():  # of a finished map whose folder was removed only in part
                     path.unlink()
                 self._write_settings()
         except BaseException:
@@ -85,7 +85,7 @@ class Checkpoint:
         self.done |= replicas
         try:
             self._write(replicas)
-        except FileNotFoundError:  # somebody has removed the folder: all that is known is written again
+        except FileNotFoundError:  # the folder was removed by hand: all results are written again
             self._unlock()
             self._lock = _locked(self.folder, self._output)
             self._write_settings()
@@ -93,11 +93,11 @@ class Checkpoint:
         self.journal_path(list(replicas)).unlink(missing_ok=True)
 
     def journal_path(self, keys: Sequence[Key]) -> Path:
-        """Where the journal of a batch belongs."""
+        """The file for the journal of a batch."""
         return self.folder / f"journal-{self._name(keys)}.nc"
 
     def journals(self) -> list[list[Key]]:
-        """The batches that were under way, as far as they can be continued."""
+        """The interrupted batches that can be continued from their journals."""
         found: list[list[Key]] = []
         for path in sorted(self.folder.glob("journal-*.nc")):
             arrays = self._arrays(path)
@@ -105,37 +105,39 @@ class Checkpoint:
                 continue
             keys = [(point, seed) for point, seed in arrays["keys"].tolist()]
             known = {*self.done, *(key for batch in found for key in batch)}
-            if known & set(keys) or path != self.journal_path(
-                keys
-            ):  # finished in the moment before the end, or foreign
+            finished = bool(known & set(keys))  # its journal was about to be removed when the run ended
+            foreign = path != self.journal_path(keys)
+            if finished or foreign:
                 path.unlink(missing_ok=True)
             else:
                 found.append(keys)
         return found
 
     def close(self, finished: bool) -> None:
-        """Give the lock back; a finished map needs its checkpoint no more, nor does one that had hardly begun."""
-        if (finished or not self._batches()) and _is_at(self._lock, self.folder):
-            try:  # it vanishes in one moment, so that whoever comes next finds all of it or nothing
-                os.replace(self.folder, self._rubbish)
+        """Release the lock, and remove the folder if the map is finished or has no batch yet."""
+        if (finished or not self._batches()) and _is_lock_of(self.folder, self._lock):
+            try:  # renamed in one operation, so that the next run finds the whole folder or none
+                os.replace(self.folder, self._discarded)
             except OSError:
                 shutil.rmtree(self.folder, ignore_errors=True)
-            shutil.rmtree(self._rubbish, ignore_errors=True)
+            shutil.rmtree(self._discarded, ignore_errors=True)
         self._unlock()
 
     @property
-    def _rubbish(self) -> Path:
+    def _discarded(self) -> Path:
+        """Name of the folder while it is being removed."""
         return self.folder.with_name(f".{self.folder.name}")
 
-    def _tidy(self) -> None:
-        """Remove what a process has left that was killed while it wrote or removed something."""
-        shutil.rmtree(self._rubbish, ignore_errors=True)
+    def _remove_leftovers(self) -> None:
+        """Remove temporary files of a process that was killed while it wrote or removed files."""
+        shutil.rmtree(self._discarded, ignore_errors=True)
         unique = "[0-9a-f]" * 16
         beside = self._output.parent.glob(f".{glob.escape(self._output.stem)}-{unique}{self._output.suffix}")
         for path in [*beside, *self.folder.glob(f".*-{unique}.nc")]:
             path.unlink(missing_ok=True)
 
     def _batches(self) -> list[Path]:
+        """Files of finished and of running batches."""
         return [path for kind in ("done", "journal") for path in self.folder.glob(f"{kind}-*.nc")]
 
     def _unlock(self) -> None:
@@ -144,7 +146,7 @@ class Checkpoint:
             self._lock = None
 
     def _name(self, keys: Sequence[Key]) -> str:
-        """A name that no other batch has, of this map or another."""
+        """A name that is unique to a batch of a map: a hash of both."""
         text = json.dumps([self._identity, sorted(keys)], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -173,7 +175,7 @@ class Checkpoint:
                 self.done[point, seed] = Replica(sample, status, float(strain))
 
     def _arrays(self, path: Path) -> dict[str, np.ndarray] | None:
-        """The content of a file; a damaged one is dropped and remembered."""
+        """The content of a file; a damaged file is removed, its name noted, and the result is None."""
         try:
             return read_arrays(path)[0]
         except Damaged:
@@ -185,24 +187,24 @@ class Checkpoint:
         write_arrays(self.folder / "map.nc", {}, self._identity)
 
     def _require_same(self) -> None:
-        """Raise a ValueError that names the first difference between this map and the unfinished one."""
+        """Raise an InputError with the first difference between this map and the unfinished one."""
         try:
-            _, theirs = read_arrays(self.folder / "map.nc")
+            _, begun = read_arrays(self.folder / "map.nc")
         except Damaged:
-            if not self._has_ours():
+            if not self._has_batch_of_this_map():
                 raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
             self.damaged.append("map.nc")
             self._write_settings()
             return
         for name, value in self._identity.items():
-            if theirs.get(name) != value:
+            if begun.get(name) != value:
                 raise InputError(
-                    f"the unfinished map in {str(self.folder)!r} has {name} {theirs.get(name)!r} and not {value!r}: "
+                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r} and not {value!r}: "
                     "repeat it as it was begun, or remove the folder."
                 )
 
-    def _has_ours(self) -> bool:
-        """Whether the name of a batch tells that it is one of this map."""
+    def _has_batch_of_this_map(self) -> bool:
+        """Whether the name of a file shows that it is a batch of this map."""
         for path in self._batches():
             try:
                 keys = [(row[0], row[1]) for row in read_arrays(path)[0]["keys"].tolist()]
@@ -214,7 +216,7 @@ class Checkpoint:
 
 
 def _identity(settings: MapSettings) -> dict[str, object]:
-    """What decides the bits of the results, as JSON has it."""
+    """All that the results depend on, bit for bit, in types of JSON."""
     versions = {f"version of {name}": version(name) for name in _VERSIONS}
     identity = {**asdict(settings), **versions, "precision": _precision(), "device": jax.default_backend()}
     return json.loads(json.dumps(identity, default=lambda number: number.item()))
@@ -225,9 +227,9 @@ def _precision() -> str:
 
 
 def _locked(folder: Path, output: Path) -> int | None:
-    """A lock in a folder that is made if need be, which ends with this process; ValueError where another one holds it.
+    """Lock a folder, made if missing, until this process ends; InputError if another process has locked it.
 
-    Where the file system knows no locks, two runs on one output are not told apart.
+    On a file system without locks, a second run on one output is not detected.
     """
     while True:
         try:
@@ -240,7 +242,7 @@ def _locked(folder: Path, output: Path) -> int | None:
             return None
         try:
             handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-        except FileNotFoundError:  # whoever was here has finished in this moment and removed the folder
+        except FileNotFoundError:  # another process has just finished and removed the folder
             continue
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -251,13 +253,13 @@ def _locked(folder: Path, output: Path) -> int | None:
             ) from None
         except OSError:
             return handle
-        if _is_at(handle, folder):
+        if _is_lock_of(folder, handle):
             return handle
-        os.close(handle)  # as above
+        os.close(handle)  # the lock of a removed folder: try again
 
 
-def _is_at(lock: int | None, folder: Path) -> bool:
-    """Whether the lock is still that of the folder."""
+def _is_lock_of(folder: Path, lock: int | None) -> bool:
+    """Whether the lock is that of this folder, and not of one that was removed since."""
     try:
         return lock is None or os.path.samestat(os.fstat(lock), (folder / "lock").stat())
     except OSError:

@@ -1,6 +1,6 @@
-"""Tasks on the workers of a Dask cluster that is already running: one on this machine, or one that Slurm started.
+"""Tasks on the workers of a running Dask cluster, on this machine or started by Slurm.
 
-The cluster replaces workers that die and repeats their tasks, and gives a task up whose workers have died too often.
+The cluster replaces workers that die and repeats their tasks. It gives up a task whose workers have died too often.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -10,7 +10,7 @@ from jaxgran.maps.pool import Died
 from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
-_PATIENCE = "10s"  # to find the scheduler
+_PATIENCE = "10s"  # longest wait for an answer of the scheduler
 
 
 def run_on_cluster(
@@ -20,15 +20,15 @@ def run_on_cluster(
     configure: Callable[..., None],
     arguments: tuple,
 ) -> Generator[tuple[int, T | Died]]:
-    """Run a function on the arguments of every task on a cluster, and yield what is done as it is.
+    """Run a function on the arguments of every task on a cluster, and yield each result when it is there.
 
     Args:
-      address: of the scheduler, such as ``tcp://127.0.0.1:8786``.
-      function, tasks: as for ``pool.run_tasks``; the first tasks are the first to start.
-      configure, arguments: called on the worker before every task.
+      address: address of the scheduler, such as ``tcp://127.0.0.1:8786``.
+      function, tasks: as in ``pool.run_tasks``; the first tasks start first.
+      configure, arguments: a function and its arguments, called on the worker before every task.
 
     Raises:
-      ValueError: Dask is not installed, or nobody answers at the address.
+      InputError: (a ValueError) Dask is not installed, or no scheduler answers at the address.
     """
     try:
         from dask.distributed import Client, KilledWorker, as_completed

@@ -1,4 +1,4 @@
-"""The dataset of a ratio map: observables with errors on the grid, statuses, and every parameter of the run."""
+"""The dataset of a ratio map: observables with errors on the grid, statuses, and all parameters of the run."""
 
 import math
 import os
@@ -21,8 +21,8 @@ from jaxgran.sampling.sample import Sample, correlation_strains, estimates
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
-NOT_RUN = -1
-Key = tuple[int, int]  # point of the grid, in the order of the flows of its settings; seed
+NOT_RUN = -1  # status of a replica without a result
+Key = tuple[int, int]  # number of the point, in the order of ``MapSettings.flows``; seed
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
 _AXES = {
@@ -33,7 +33,7 @@ _AXES = {
 
 
 class Replica(NamedTuple):
-    """Result of one replica: its sample, its worst status, and the strain that was sheared before the sample."""
+    """Result of one replica: its sample, its worst status, and its strain before the sample."""
 
     sample: Sample
     status: int
@@ -43,33 +43,46 @@ class Replica(NamedTuple):
 def map_dataset(
     settings: MapSettings, results: Mapping[Key, Replica], run: Mapping[str, str | float | int]
 ) -> xr.Dataset:
-    """The dataset of the replicas that are done; points without any are NaN with the status ``not_run``.
+    """The dataset of the finished replicas; points without any are NaN with the status ``not_run``.
+
+    ============================  ====================  =============================================================
+    variable                      dimensions            meaning
+    ============================  ====================  =============================================================
+    NAME                          point                 average over all seeds, for each of ``OBSERVABLES``
+    NAME_stderr                   point                 its standard error
+    NAME_correlation_strain       point                 strain of one independent sample, for averages of scalars
+    NAME_by_seed                  (point, seed)         average of each seed
+    theory_NAME                   point                 prediction of kinetic theory, for the names in ``THEORY``
+    status, status_by_seed        point, (point, seed)  worst status
+    strain_by_seed                (point, seed)         sampled strain
+    timestep_by_seed              (point, seed)         time step of the sample
+    equilibration_strain_by_seed  (point, seed)         strain before the sample
+    ============================  ====================  =============================================================
+
+    A point is (packing_fraction, restitution), or (timestep, packing_fraction, restitution) if the settings have a list
+    of time steps. Tensors have the dimensions (axis_a, axis_b) last. Attributes of the variables give their units.
 
     Args:
       settings: the map.
-      results: replicas by point (in the order of the flows of the settings) and seed.
-      run: what else to store as attributes: command, wall time, speed.
-
-    Returns:
-      Observables, their standard errors and statuses on (packing_fraction, restitution), by seed with the dimension
-      ``seed`` behind these, and what kinetic theory predicts for those in ``THEORY``. Beside every average stands the
-      strain that counts as one independent sample of it. Where the time step of the settings is a list, ``timestep`` is
-      the first dimension of all.
+      results: replicas by point (in the order of ``settings.flows()``) and seed.
+      run: further attributes to store: command, wall time, speed.
     """
     point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
     count, seeds = math.prod(shape), settings.seeds
-    values = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
-    errors = {name: np.full((count, *_tail(name)), np.nan) for name in OBSERVABLES}
-    correlated = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
-    correlation = {name: np.full(count, np.nan) for name in correlated}
-    by_seed = {name: np.full((count, seeds, *_tail(name)), np.nan) for name in OBSERVABLES}
+    values = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
+    errors = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
+    scalar_averages = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
+    correlation = {name: np.full(count, np.nan) for name in scalar_averages}
+    by_seed = {name: np.full((count, seeds, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
     status = np.full((count, seeds), NOT_RUN, np.int8)
-    strain, sampled, used = np.full((3, count, seeds), np.nan)
+    equilibration = np.full((count, seeds), np.nan)
+    strain = np.full((count, seeds), np.nan)
+    timestep = np.full((count, seeds), np.nan)
     for (point, seed), replica in results.items():
-        status[point, seed], strain[point, seed] = replica.status, replica.strain
+        status[point, seed], equilibration[point, seed] = replica.status, replica.strain
         tally = replica.sample.tally
-        sampled[point, seed] = tally.duration.sum() * replica.sample.shear_rate
-        used[point, seed] = sampled[point, seed] / max(tally.steps.sum(), 1)
+        strain[point, seed] = tally.duration.sum() * replica.sample.shear_rate
+        timestep[point, seed] = strain[point, seed] / max(tally.steps.sum(), 1)
         for name, value in replica.sample.averages.items():
             by_seed[name][point, seed] = value
     for point in range(count):
@@ -80,7 +93,7 @@ def map_dataset(
             for name in OBSERVABLES:
                 values[name][point], errors[name][point] = value[name], error[name]
             independent = correlation_strains(samples)
-            for name in correlated:
+            for name in scalar_averages:
                 correlation[name][point] = independent[name]
 
     variables = {}
@@ -88,15 +101,15 @@ def map_dataset(
         tensor_dims = _TENSOR_AXES if name in TENSORS else ()
         dims = point_dims + tensor_dims
         attrs = {"long_name": long_name, "units": units}
-        variables[name] = (dims, values[name].reshape(*shape, *_tail(name)), attrs)
+        variables[name] = (dims, values[name].reshape(*shape, *_tensor_shape(name)), attrs)
         spread = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
         about = {"long_name": f"{spread} of {long_name}", "units": units}
-        variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tail(name)), about)
+        variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tensor_shape(name)), about)
         if name in correlation:
             about = {"long_name": f"strain of one independent sample of {long_name}", "units": "1"}
             variables[f"{name}_correlation_strain"] = (dims, correlation[name].reshape(shape), about)
         seed_dims = (*point_dims, "seed", *tensor_dims)
-        variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tail(name)), attrs)
+        variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tensor_shape(name)), attrs)
     predictions = _predictions(settings)
     for name in THEORY:
         long_name, units = OBSERVABLES[name]
@@ -115,12 +128,12 @@ def map_dataset(
     )
     variables["equilibration_strain_by_seed"] = (
         (*point_dims, "seed"),
-        strain.reshape(*shape, seeds),
+        equilibration.reshape(*shape, seeds),
         {"long_name": "strain sheared before the sample", "units": "1"},
     )
     variables["timestep_by_seed"] = (
         (*point_dims, "seed"),
-        used.reshape(*shape, seeds),
+        timestep.reshape(*shape, seeds),
         {
             "long_name": "time step of the sample, shorter than asked for where a replica was retried",
             "units": "1 / shear rate",
@@ -128,7 +141,7 @@ def map_dataset(
     )
     variables["strain_by_seed"] = (
         (*point_dims, "seed"),
-        sampled.reshape(*shape, seeds),
+        strain.reshape(*shape, seeds),
         {"long_name": "sampled strain", "units": "1"},
     )
     coordinates = {
@@ -141,7 +154,7 @@ def map_dataset(
 
 
 def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
-    """Kinetic theory's steady shear at every point; NaN where it has none, as at α = 1."""
+    """Prediction of kinetic theory at every point; NaN where it has no steady state, as at α = 1."""
     flows = stack(settings.flows())
     numbers = flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity
     theory = jax.vmap(gaussian_moments)(*numbers)
@@ -150,26 +163,27 @@ def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
 
 
-def _tail(name: str) -> tuple[int, ...]:
+def _tensor_shape(name: str) -> tuple[int, ...]:
+    """Shape of an observable at one point: (2, 2) for a tensor, () for a scalar."""
     return (2, 2) if name in TENSORS else ()
 
 
 def _worst(status: np.ndarray) -> np.ndarray:
-    """Worst status over the seeds of each point; not run where a seed is missing and no other is worse than ok."""
+    """Worst status over the seeds of each point; not run if a seed is missing and the others are ok."""
     worst = status.max(axis=1)
     return np.where((status.min(axis=1) == NOT_RUN) & (worst <= Status.ok), NOT_RUN, worst).astype(np.int8)
 
 
 def run_attributes(settings: MapSettings) -> dict[str, Any]:
-    """Every parameter of the run, in types that NetCDF can hold.
+    """All parameters of the run, in types that NetCDF can store.
 
-    ``engine`` and ``solver`` name what runs; ``engine_asked`` and ``solver_asked`` are those of the settings.
+    ``engine`` and ``solver`` are those that run. ``engine_asked`` and ``solver_asked`` are those of the settings.
     """
     parameters = asdict(settings)
     equilibrate, error = parameters.pop("equilibrate"), parameters.pop("error")
     if error is not None:
         parameters["error"] = error
-        del parameters["strain"]  # every seed has its own
+        del parameters["strain"]  # it differs between seeds: see ``strain_by_seed``
     flow = settings.flows()[0]
     engine = select_engine(flow)
     return {

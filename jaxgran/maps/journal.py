@@ -1,7 +1,8 @@
-"""Journal of a batch: the tallies of all that has been advanced, and the last state.
+"""Journal of a batch: the tallies of all calls of its drive, and the last state.
 
-What a batch does next depends on its tallies alone. So a batch that was cut off is done again from the start with the
-tallies from its journal, in no time, and goes on from the last state with the bits that it would have had.
+The next step of a batch depends on its tallies only. So an interrupted batch is repeated from the start with the
+tallies from its journal, which takes almost no time. It then continues from the last state, with the same results bit
+for bit as without the interruption.
 """
 
 import time
@@ -20,19 +21,22 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.sampling.batch import Drive
 
-SECONDS = 5.0  # between two writings of a journal
-_SHARE = 0.05  # of the time, at most, that large journals are written
-_LONGEST = 45.0  # seconds between two writings, however long they take
+SECONDS = 5.0  # shortest time between two writes of a journal
+_WRITING_SHARE = 0.05  # of the time: large journals are written less often
+_LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of large journals
 
 
 class Journal:
-    """A ``Drive`` that keeps a journal of another one, and repeats what the journal of an earlier run holds.
+    """A ``Drive`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
 
     Args:
-      path: file of the journal. Its folder may vanish; the journal is then not written, and nothing else suffers.
-      keys: what tells the replicas of the batch, in their order; the journal of others is not repeated.
-      drive: what advances the batch beyond the journal.
-      seconds: time between two writings, or None for ``SECONDS``, and longer where a writing takes long itself.
+      path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
+      keys: point and seed of each replica of the batch, in order.
+      drive: drive that advances the batch after the end of the journal.
+      seconds: time between two writes; None for ``SECONDS``, or longer if a write itself takes long.
+
+    Raises:
+      Damaged: the file is the journal of another batch, or cannot be read.
     """
 
     def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: Drive, seconds: float | None = None):
@@ -60,7 +64,7 @@ class Journal:
         return state, tally
 
     def _repeated(self, k: int, state: State) -> tuple[State, Tally]:
-        """The tally of a step of the journal, with the last state at its end and any state before."""
+        """Tally ``k`` of the journal; with the last tally comes the stored state, and before it the given one."""
         tally = tally_from_flat(self.tallies[k], state.positions.dtype)
         if k + 1 < len(self.tallies):
             return state, tally
@@ -71,10 +75,12 @@ class Journal:
         begun = time.monotonic()
         states = {f"state_{k}": leaf for k, leaf in enumerate(self.leaves)}
         series = {"steps": np.stack(self.steps), "tallies": np.stack(self.tallies)}
-        with suppress(FileNotFoundError):  # whoever collects the results will notice
+        with suppress(FileNotFoundError):  # the folder was removed; ``Checkpoint.add`` makes it again
             write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
         now = time.monotonic()
-        pause = max(SECONDS, min((now - begun) / _SHARE, _LONGEST)) if self.seconds is None else self.seconds
+        pause = (
+            max(SECONDS, min((now - begun) / _WRITING_SHARE, _LONGEST_PAUSE)) if self.seconds is None else self.seconds
+        )
         self.next = now + pause
 
     def _read(self) -> None:

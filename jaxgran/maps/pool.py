@@ -1,9 +1,9 @@
-"""Tasks on worker processes that may die: a dead worker is replaced, and its task repeated.
+"""Tasks on worker processes that may die: a dead worker is replaced, and its task is repeated.
 
-Every worker is a process of its own with one task at a time, so that it is known which task a death has hit. All that
-connects it with its parent is one pipe, which ends with either of them; there are no queues, threads or semaphores that
-a killed process could leave behind. A worker ends when the process that started it is gone, however that ended. Tasks
-must be idempotent.
+Every worker is a process with one task at a time, so the task of a dead worker is known. One pipe connects it with its
+parent, and closes when either of them ends. There are no queues or semaphores that a killed process could leave behind.
+A worker ends when the process that started it has ended for any reason. Tasks may run more than once and must then give
+the same result.
 """
 
 import os
@@ -18,17 +18,21 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
-ATTEMPTS = 3  # workers that a task may kill before it is given up
-_READY, _MESSAGE, _RESULT, _ERROR, _DEAD = "ready", "message", "result", "error", "dead"
+ATTEMPTS = 3  # workers that may die of a task before it is given up
+_READY = "ready"
+_MESSAGE = "message"
+_RESULT = "result"
+_ERROR = "error"
+_DEAD = "dead"
 T = TypeVar("T")
 
 
 class Died(Exception):
-    """The task has killed its worker ``ATTEMPTS`` times."""
+    """A task was given up, since its workers died ``ATTEMPTS`` times."""
 
 
 class _Worker:
-    """A process that is sent the arguments of one task after another."""
+    """A process that receives the arguments of one task after another."""
 
     def __init__(self, function: Callable, initialise: Callable[..., None], arguments: tuple):
         context = get_context("spawn")
@@ -36,16 +40,19 @@ class _Worker:
         self.task: int | None = None
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs, function, initialise, arguments), daemon=True)
-        with theirs, _no_interrupt():  # their end is closed here, so that the pipe ends with the worker
+        with (
+            theirs,
+            _no_interrupt(),
+        ):  # this copy of the worker's end is closed, so that the pipe closes with the worker
             self.process.start()
 
     def begin(self, task: int, arguments: tuple) -> None:
         self.task = task
-        with suppress(OSError):  # of a worker that has died in this moment
+        with suppress(OSError):  # the worker may have just died
             self.connection.send(arguments)
 
-    def says(self) -> tuple[str, Any]:
-        """What it says next, which is nothing where it has died, even in the middle of a word."""
+    def receive(self) -> tuple[str, Any]:
+        """Kind and content of the next message; ``_DEAD`` if the worker died, also in the middle of a message."""
         try:
             return self.connection.recv()
         except (EOFError, OSError):
@@ -64,51 +71,55 @@ def run_tasks(
     workers: int,
     initialise: Callable[..., None],
     arguments: tuple,
-    hear: Callable[[Any], None],
+    on_message: Callable[[Any], None],
 ) -> Generator[tuple[int, T | Died]]:
-    """Run a function on the arguments of every task, in the order of the tasks, and yield what is done as it is.
+    """Run a function on the arguments of every task, started in order, and yield each result when it is there.
 
     Args:
-      function: importable by a worker.
+      function: a function that a worker can import.
       tasks: arguments of each call.
-      workers: processes.
-      initialise, arguments: called once in every worker.
-      hear: told the messages that workers ``send``.
+      workers: number of processes.
+      initialise, arguments: a function and its arguments, called once in every worker.
+      on_message: called with every message of a worker, see ``send``.
 
     Yields:
-      The number of the task, and its result or ``Died``. An exception of a task is raised here.
+      The number of the task, and its result or ``Died``.
 
     Raises:
       ChildProcessError: workers die before they have a task.
+      Exception: that of a task, with the traceback of the worker as a note.
     """
-    waiting, deaths, stillborn, left = deque(range(len(tasks))), Counter(), 0, len(tasks)
-    crew: list[_Worker] = []
+    waiting = deque(range(len(tasks)))
+    unfinished = len(tasks)
+    deaths = Counter()  # of workers, by task
+    early_deaths = 0  # of workers in a row that never became ready
+    running: list[_Worker] = []
     try:
-        while left:
-            while len(crew) < min(workers, left):
-                crew.append(_Worker(function, initialise, arguments))
-            for worker in crew:
+        while unfinished:
+            while len(running) < min(workers, unfinished):
+                running.append(_Worker(function, initialise, arguments))
+            for worker in running:
                 if waiting and worker.ready and worker.task is None:
                     task = waiting.popleft()
                     worker.begin(task, tasks[task])
-            speaking = wait([worker.connection for worker in crew])
-            for worker in [one for one in crew if one.connection in speaking]:
-                kind, content = worker.says()
+            readable = wait([worker.connection for worker in running])
+            for worker in [one for one in running if one.connection in readable]:
+                kind, content = worker.receive()
                 task = worker.task
                 if kind == _MESSAGE:
-                    hear(content)
+                    on_message(content)
                 elif kind == _READY:
-                    worker.ready, stillborn = True, 0
+                    worker.ready, early_deaths = True, 0
                 elif kind == _ERROR:
                     raise content
                 elif kind == _RESULT and task is not None:
-                    worker.task, left = None, left - 1
+                    worker.task, unfinished = None, unfinished - 1
                     yield task, content
                 else:
-                    crew.remove(worker)
+                    running.remove(worker)
                     worker.end()
-                    stillborn += not worker.ready
-                    if stillborn == ATTEMPTS:
+                    early_deaths += not worker.ready
+                    if early_deaths == ATTEMPTS:
                         raise ChildProcessError(f"{ATTEMPTS} workers in a row died before they had a task")
                     if task is None:
                         continue
@@ -116,24 +127,24 @@ def run_tasks(
                     if deaths[task] < ATTEMPTS:
                         waiting.appendleft(task)
                     else:
-                        left -= 1
+                        unfinished -= 1
                         yield task, Died(f"a batch has killed its worker {ATTEMPTS} times")
     finally:
-        for worker in crew:
+        for worker in running:
             worker.end()
 
 
-_parent: Connection | None = None
+_parent: Connection | None = None  # of a worker: its end of the pipe
 
 
 def send(message: Any) -> None:
-    """Send a message from a worker to whoever runs the tasks."""
+    """Send a message from a worker to the process that runs the tasks; no effect outside a worker."""
     if _parent is not None:
         _parent.send((_MESSAGE, message))
 
 
 def _work(parent: Connection, function: Callable, initialise: Callable[..., None], arguments: tuple) -> None:
-    """The life of a worker: Ctrl-C is left to the parent, and nothing outlives it."""
+    """Main function of a worker: it ignores Ctrl-C, runs tasks, and ends with its parent."""
     global _parent
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -150,7 +161,7 @@ def _work(parent: Connection, function: Callable, initialise: Callable[..., None
 
 
 def _portable(error: Exception) -> Exception:
-    """The error with where it came from as a note, or what can be said of it where it cannot be pickled."""
+    """The error with its traceback as a note; a RuntimeError of its name and message if it cannot be pickled."""
     error.add_note(f"in a worker:\n{''.join(traceback.format_exception(error))}")
     try:
         return pickle.loads(pickle.dumps(error))
@@ -159,6 +170,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def _end_with_parent() -> None:
+    """Wait for the end of the parent process, then end this one."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -167,7 +179,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _no_interrupt() -> Iterator[None]:
-    """Hold Ctrl-C back while a process starts, which inherits this and does not die of it with a traceback."""
+    """Block Ctrl-C while a process starts. The process inherits the block, so Ctrl-C cannot end it with a traceback."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -1,4 +1,4 @@
-"""The presets of ``jaxgran map``: choices of a whole map by name, as arguments of ``ratio_map``."""
+"""The presets of ``jaxgran map``: the parameters of a whole map by name, as arguments of ``ratio_map``."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The file of a map: refused before the work where it could not be written, written whole, read, and compared."""
+"""The file of a map: its path is checked before the run; then it is written, read and compared."""
 
 import os
 from dataclasses import fields
@@ -20,7 +20,7 @@ PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
 
 
 def check_output(path: Path) -> None:
-    """Raise a ValueError in one sentence where a dataset could not be written to ``path``."""
+    """Raise an InputError if a dataset cannot be written to ``path``."""
     require_place(path, "output", ".nc")
     for file in (path.with_name(f"{path.stem}_{name}.png") for name in PICTURES):
         if os.path.isdir(file):
@@ -31,7 +31,7 @@ def check_output(path: Path) -> None:
 
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset as NetCDF under a temporary name beside its place, then move it there."""
+    """Write a dataset as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
     content = BytesIO()
     data.to_netcdf(content, engine="h5netcdf")
@@ -40,47 +40,47 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
 
 
 def read_dataset(path: Path) -> xr.Dataset:
-    """Read a dataset that ``write_dataset`` wrote; ValueError in one sentence where it is not one."""
+    """Read a dataset of ``write_dataset``; InputError if the file is not one."""
     if not os.path.isfile(path):
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
-        with h5py.File(path, "r") as file:  # h5netcdf complains a second time about what it could not open
+        with h5py.File(path, "r") as file:  # h5netcdf would print a second error for a file it cannot open
             file.attrs.get("_nc3_strict")
         data = xr.load_dataset(path, engine="h5netcdf")
-    except Exception as error:  # a torn file may fail in any way
+    except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
-    lack = what_lacks(data, *RATIO, "status")
-    if lack:
-        raise InputError(f"{shown(str(path))} is not a ratio map: {lack}.")
+    problem = what_lacks(data, *RATIO, "status")
+    if problem:
+        raise InputError(f"{shown(str(path))} is not a ratio map: {problem}.")
     return data
 
 
 def choices_of(data: xr.Dataset) -> dict[str, Any]:
-    """The choices of the map in a dataset, as arguments of ``MapSettings``; ValueError where it cannot tell them.
+    """The parameters of the map in a dataset, as arguments of ``MapSettings``; InputError if one is missing.
 
-    Engine and solver are those that were asked for. Files from before the engine had a name tell the solver only.
+    Engine and solver are those of the settings. Older files have no engine, and one name of a solver.
     """
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
-            told = next((name for name in (f"{field.name}_asked", field.name) if name in data.attrs), None)
+            attribute = next((name for name in (f"{field.name}_asked", field.name) if name in data.attrs), None)
             if field.name in data.dims:
                 chosen[field.name] = tuple(data[field.name].values.tolist())
-            elif told is not None:
-                chosen[field.name] = np.asarray(data.attrs[told]).tolist()
-            elif field.name not in ("strain", "error", "engine"):  # of strain and error one is there
+            elif attribute is not None:
+                chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
+            elif field.name not in ("strain", "error", "engine"):  # a file has either strain or error
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")
         }
     except KeyError as missing:
-        raise InputError(f"this dataset does not tell the {missing.args[0]} of its map.") from None
+        raise InputError(f"this dataset does not contain the {missing.args[0]} of its map.") from None
 
 
 def differences(data: xr.Dataset) -> list[str]:
-    """What of the versions, the device and the precision of a dataset is other than here, in words."""
+    """Differences between the versions, device and precision of a dataset and of this process, in words."""
     here = made_with()
     names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
     return [

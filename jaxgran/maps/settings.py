@@ -1,4 +1,4 @@
-"""MapSettings: everything that decides the numbers of a ratio map, validated before anything runs."""
+"""MapSettings: all parameters that the numbers of a ratio map depend on, checked before the run."""
 
 import math
 from collections.abc import Mapping
@@ -15,14 +15,14 @@ from jaxgran.sampling.batch import stack
 from jaxgran.sampling.steady_state import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
-_FEWEST_STEPS = 160  # five time steps in each block of a sample
-_LONGEST_EQUILIBRATION = 1e6  # strain
-_SHORT = 1e-6  # a time step that all flows accept
+_FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
+_LONGEST_EQUILIBRATION = 1e6  # strain before the sample
+_ACCEPTED_TIMESTEP = 1e-6  # 1/γ̇; all flows accept it
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Everything that decides the numbers of a map; see ``ratio_map`` for the meaning of each."""
+    """All parameters that the numbers of a map depend on; see ``ratio_map`` for their meaning."""
 
     restitution: tuple[float, ...]
     packing_fraction: tuple[float, ...]
@@ -64,7 +64,7 @@ class MapSettings:
         if not isinstance(self.timestep, tuple):
             require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
         require_number("tolerance", self.tolerance, lambda x: x > 0, "between 1e-12 and 0.1")
-        flows = stack(self._made_flows())
+        flows = stack(self._checked_flows())
         if self.engine != "auto":
             select_engine(flows)
         shortest, longest = min(self._timesteps), max(self._timesteps)
@@ -93,7 +93,7 @@ class MapSettings:
 
     @property
     def axes(self) -> dict[str, tuple[float, ...]]:
-        """Values of the dimensions of a map by name, the slowest first; the time step is one where it is a list."""
+        """Values of the dimensions of a map by name, outermost first; ``timestep`` is one of them if it is a list."""
         steps = {"timestep": self.timestep} if isinstance(self.timestep, tuple) else {}
         return {**steps, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
 
@@ -102,11 +102,11 @@ class MapSettings:
         return self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
 
     def flows(self) -> list[ShearFlow]:
-        """One flow a point, in the order of ``axes``."""
+        """One flow for each point, in the order of ``axes``: the last one changes fastest."""
         return list(_flows(self))
 
-    def _made_flows(self) -> list[ShearFlow]:
-        """The same, made anew; raises ValueError where a number is out of range."""
+    def _checked_flows(self) -> list[ShearFlow]:
+        """New flows for all points; InputError if a number is out of range."""
         return [
             ShearFlow(
                 grains=self.grains,
@@ -126,22 +126,24 @@ class MapSettings:
 
 @lru_cache(maxsize=4)
 def _flows(settings: MapSettings) -> tuple[ShearFlow, ...]:
-    """The flows of a map, made once for all its batches: thousands of points have hundreds of batches."""
-    return tuple(settings._made_flows())
+    """The flows of a map, kept for its batches: a map of thousands of points has hundreds of batches."""
+    return tuple(settings._checked_flows())
 
 
 def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str, Any], str]:
-    """The choices of a map with numbers in place of "auto", and what was chosen in words, empty if nothing was.
+    """The parameters of a map with numbers in place of "auto", and a sentence about these numbers, or "".
 
     Args:
-      choices: keyword arguments of ``MapSettings``, in which ``timestep`` and ``tolerance`` may be "auto".
-      target_error: relative error of pressure and shear stress to stay within.
+      choices: keyword arguments of ``MapSettings``; ``timestep`` and ``tolerance`` may be "auto".
+      target_error: largest accepted relative error of pressure and shear stress.
     """
     require_number("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
     chosen, words = dict(choices), []
     auto = {name for name in ("timestep", "tolerance") if isinstance(chosen.get(name), str) and chosen[name] == "auto"}
     if "timestep" in auto:
-        flows = stack(MapSettings(**{**chosen, "timestep": _SHORT, "tolerance": 1e-4, "strain": 1.0}).flows())
+        flows = stack(
+            MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4, "strain": 1.0}).flows()
+        )
         steps = automatic_timestep(_temperature(flows), flows.packing_fraction, flows.activation, target_error)
         least = int(np.argmin(steps))
         chosen["timestep"] = float(two_digits(steps[least], up=False))
@@ -153,10 +155,12 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
 
 
 def _temperature(flows: ShearFlow) -> np.ndarray:
+    """Expected granular temperature of each flow, in mσ²/t²."""
     theory = predicted(flows).granular_temperature
     return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
 
 
 def _point(flows: ShearFlow, k: int) -> str:
+    """Flow ``k`` of a batch in words."""
     alpha, nu = (float(np.asarray(x)[k]) for x in (flows.restitution, flows.packing_fraction))
     return f"restitution {alpha:g} and packing fraction {nu:g}"

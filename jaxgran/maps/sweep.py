@@ -1,9 +1,8 @@
 """The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as an xarray.Dataset.
 
-A list of time steps adds an axis to the grid. Every point and seed is a replica. Replicas of like cost form a batch;
-batches go through a queue, the most expensive first, so that no core waits for another. A replica's random numbers
-depend on its seed and its place in the grid alone, so results do not depend on the batches, their order or the number
-of workers.
+A list of time steps adds an axis to the grid. Every point and seed is a replica. Replicas of similar cost form a batch.
+The most expensive batches run first, so that no core waits long at the end. The random numbers of a replica depend on
+its seed and its point only. So results do not depend on the batches, their order or the number of workers.
 """
 
 import math
@@ -35,12 +34,13 @@ from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, in_lockst
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
-_LARGEST_CPU_BATCH = 4  # replicas that one core works off between two reports
-_SEARCH_BYTES = 48  # per pair of grains, working memory of a search that compares all pairs
-_GRAIN_BYTES = 2500  # lists, network and state of a replica: for each grain, filled up to a power of two
-_SHARE_OF_MEMORY = 0.5
+_LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
+_SEARCH_BYTES = 48  # memory for each pair of grains, in a search that compares all pairs
+_GRAIN_BYTES = 2500  # memory for each grain, of lists, network and state; the number is rounded up to a power of two
+_SHARE_OF_MEMORY = 0.5  # of a device, for one batch
+_DEFAULT_MEMORY = 8 * 2**30  # bytes of a device that does not report its memory
 _MOST_WORKERS = 1024
-_LIKE = 2  # replicas that advance in lockstep differ in cost by at most this factor
+_LARGEST_COST_RATIO = 2  # between replicas that advance in lockstep
 
 
 def ratio_map(
@@ -69,30 +69,30 @@ def ratio_map(
       packing_fraction: values of ν in (0, 0.83], sorted.
       grains: number of grains of a replica.
       seeds: replicas of each point.
-      timestep: dt of the sample in units of 1/γ̇; a sorted list of them adds a dimension to the map; "auto" for the
-        longest whose stresses are within the target error at every point.
+      timestep: dt of the sample in units of 1/γ̇. A sorted list adds a dimension to the map. "auto" is the longest one
+        with a stress error within ``target_error`` at every point.
       equilibrate: strain before the sample, or None to shear until the flow is steady.
       strain: sampled strain of each seed.
-      error: relative standard error of force ratio, pressure and shear stress to reach at every point: the strain of a
-        seed is doubled until its share of the error is reached, or the strain would exceed 256. None keeps the strain.
+      error: target for the relative standard error of force ratio, pressure and shear stress at every point. The strain
+        of a seed is doubled until its share of the error is reached, up to a strain of 256. None keeps ``strain``.
       tolerance: relative residual of a contact solve, or "auto".
-      target_error: relative error of pressure and shear stress that "auto" aims at.
+      target_error: relative error of pressure and shear stress for "auto".
       solver: projected method of the contact solve, see ``projected_methods``.
       activation: "midpoint" or "touching".
-      engine: what advances the flows, see ``ShearFlow``; "auto" for the fastest that can. "jax" advances the replicas
-        of a batch in lockstep by ``vmap``, on a processor too.
+      engine: program that advances the flows, see ``ShearFlow``. "auto" selects it for the backend, precision and
+        solver. "jax" advances the replicas of a batch in lockstep by ``vmap``, also on a processor.
       batch: replicas that run together, or "auto".
-      workers: processes; more than one only on a CPU, and then a script must guard its main part by
-        ``if __name__ == "__main__":``.
+      workers: number of processes; more than one only on a CPU. A script with more than one must have its main part
+        under ``if __name__ == "__main__":``.
       report: called with the replica-steps done since the last call.
 
     Returns:
-      The dataset described in ``map_dataset``: every observable on (packing_fraction, restitution), or on (timestep,
-      packing_fraction, restitution) where a list of time steps is given, with its standard error and its values by
-      seed, the status of each point, and every parameter as an attribute.
+      The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), or on
+      (timestep, packing_fraction, restitution) for a list of time steps, with standard errors and values by seed. It
+      also has the status of each point, and all parameters as attributes.
 
     Raises:
-      ValueError: a parameter is out of range; the sentence says what is accepted.
+      InputError: (a ValueError) a parameter is out of range; the message says what is accepted.
     """
     choices = {
         "restitution": restitution,
@@ -133,7 +133,7 @@ def ratio_map(
 
 
 def check_batches(batch: int | Literal["auto"], workers: int) -> None:
-    """Raise a ValueError in one sentence where replicas cannot be run in such batches by so many processes."""
+    """Raise an InputError if the size of a batch or the number of workers is not accepted."""
     for name, value in (("batch", batch), ("workers", workers)):
         whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
         if not whole and not (name == "batch" and isinstance(value, str) and value == "auto"):
@@ -155,27 +155,28 @@ def replicas(
     scheduler: str | None = None,
     record: Wrap | None = None,
 ) -> Generator[tuple[Key, Replica]]:
-    """Run every replica of a map and yield it, with its point and seed, as soon as its batch is done.
+    """Run every replica of a map and yield its key and result when its batch is done.
 
     Args:
       settings: the map.
-      batch: replicas that run together, or "auto": a few on a CPU, what the memory holds on an accelerator.
-      workers: processes; more than one only on a CPU. They end when the iterator is closed.
-      report: told the replica-steps done since the last call.
-      checkpoint: where to keep what is done; replicas that are done there are not run and not yielded again.
-      warn: told in one sentence what went wrong with a batch that is given up.
-      scheduler: address of a Dask cluster whose workers run the batches, in place of processes of this machine. A
-        journal is kept where they see the folder of the checkpoint; the report follows whole batches.
-      record: wraps the drive of every sample, not of what precedes it; heard in this process alone.
+      batch: replicas that run together, or "auto": a few on a CPU, as many as fit into memory on an accelerator.
+      workers: number of processes; more than one only on a CPU. They end when the iterator is closed.
+      report: called with the replica-steps done since the last call.
+      checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor yielded.
+      warn: called with one sentence about each batch that is given up.
+      scheduler: address of a Dask cluster, whose workers run the batches instead of processes of this machine. They
+        keep journals if they can access the folder of the checkpoint. ``report`` is then called after whole batches.
+      record: wraps the drive of every sample, but not that of its preparation. It has an effect only if the batches run
+        in this process.
     """
     tasks = _remaining(settings, batch, workers, checkpoint)
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
     configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
-    hear = report or (lambda _: None)
+    on_steps = report or (lambda _: None)
     if scheduler is not None:
         outcomes = run_on_cluster(scheduler, _run_task, calls, _configure, (configuration[0], None))
     elif workers > 1:
-        outcomes = run_tasks(_run_task, calls, workers, _configure, configuration, hear)
+        outcomes = run_tasks(_run_task, calls, workers, _configure, configuration, on_steps)
     else:
         outcomes = ((number, _run_task(*call, report, record)) for number, call in enumerate(calls))
     with closing(outcomes):
@@ -186,27 +187,27 @@ def replicas(
             if checkpoint is not None:
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
-                hear(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
+                on_steps(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
             yield from outcome
 
 
 def _plain(value: Any) -> Any:
-    """A number as it is in Python, a list or array of them as a tuple; what is neither is left for ``MapSettings``."""
+    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks all other values."""
     try:
         if isinstance(value, np.ma.MaskedArray) or (isinstance(value, Sequence) and len(value) > MAX_REPLICAS):
             return value
         array = np.asarray(value)
-    except (TypeError, ValueError):  # a key, or lists of several lengths
+    except (TypeError, ValueError):  # a random key, or lists of different lengths
         return value
     plain = array.astype(float).tolist() if array.ndim and array.dtype.kind in "iu" else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain
 
 
 def predicted_cost(flow: ShearFlow) -> float:
-    """Relative cost of a unit of strain of a flow, from measurements.
+    """Relative cost of a unit of strain of a flow, a fit to measured times.
 
-    Dense and dissipative flows form networks, at dt = 1e-3 as in the first factor. Steps without contact are jumped
-    over, so that ten times as many steps cost little more than twice as much.
+    Dense and dissipative flows form contact networks; the first factor is their cost at dt = 1e-3. Steps without a
+    contact are jumped over, so ten times as many steps cost little more than twice as much.
     """
     alpha, nu, dt = (float(x) for x in (flow.restitution, flow.packing_fraction, flow.timestep))
     return (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
@@ -215,17 +216,18 @@ def predicted_cost(flow: ShearFlow) -> float:
 def _remaining(
     settings: MapSettings, batch: int | Literal["auto"], workers: int, checkpoint: Checkpoint | None
 ) -> list[list[Key]]:
-    """The batches that are still to be run, those that are under way first."""
+    """The batches to run, the interrupted ones first."""
     if checkpoint is None:
         return _tasks(settings, batch, workers)
-    begun = checkpoint.journals()
-    return begun + _tasks(settings, batch, workers, {*checkpoint.done, *(key for task in begun for key in task)})
+    interrupted = checkpoint.journals()
+    excluded = {*checkpoint.done, *(key for task in interrupted for key in task)}
+    return interrupted + _tasks(settings, batch, workers, excluded)
 
 
 def _tasks(
     settings: MapSettings, batch: int | Literal["auto"], workers: int, without: Container[Key] = ()
 ) -> list[list[Key]]:
-    """The replicas in batches of like cost, the most expensive first."""
+    """The replicas in batches of similar cost, the most expensive first."""
     costs = [predicted_cost(flow) for flow in settings.flows()]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
     keys = [(point, seed) for point in order for seed in range(settings.seeds) if (point, seed) not in without]
@@ -234,26 +236,29 @@ def _tasks(
     tasks: list[list[Key]] = []
     for key in keys:
         full = not tasks or len(tasks[-1]) == size
-        if full or (lockstep and costs[key[0]] < costs[tasks[-1][0][0]] / _LIKE):
+        if full or (lockstep and costs[key[0]] < costs[tasks[-1][0][0]] / _LARGEST_COST_RATIO):
             tasks.append([])
         tasks[-1].append(key)
     return tasks
 
 
 def _batch_size(grains: int, count: int, workers: int) -> int:
+    """Number of replicas of a batch for "auto"."""
     devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
         largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
-        return next(size for size in range(largest, 0, -1) if count % size == 0)  # a smaller last one compiles again
-    memory = (device.memory_stats() or {}).get("bytes_limit", 8 * 2**30)
+        return next(
+            size for size in range(largest, 0, -1) if count % size == 0
+        )  # a smaller last batch would compile again
+    memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
     per_replica = _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _SEARCH_BYTES * min(grains, 512) ** 2
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
 
 
 def _configure(x64: bool, cache: str | None) -> None:
-    """Set up a worker with the precision of its parent.
+    """Set up a worker with the precision and the compilation cache of its parent.
 
-    XLA keeps its flags: with others, small matrix products would be summed in another order than in the parent.
+    The flags of XLA are not changed: other flags would sum small matrix products in another order than in the parent.
     """
     jax.config.update("jax_enable_x64", x64)
     if cache is not None:
@@ -261,9 +266,10 @@ def _configure(x64: bool, cache: str | None) -> None:
 
 
 def _points(settings: MapSettings, task: Sequence[Key]) -> str:
+    """The points of a batch in words, each once."""
     flows = settings.flows()
-    places = {(float(flows[p].restitution), float(flows[p].packing_fraction)): None for p, _ in task}
-    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g})" for alpha, nu in places)
+    points = dict.fromkeys((float(flows[p].restitution), float(flows[p].packing_fraction)) for p, _ in task)
+    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g})" for alpha, nu in points)
 
 
 def _run_task(
@@ -273,7 +279,7 @@ def _run_task(
     report: Report | None = None,
     record: Wrap | None = None,
 ) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of one batch; one that does not fit into the memory is halved."""
+    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
     drive = reporting(advance_batch, report or send)
     measured = _measured if record is None else partial(_measured, record=record)
     try:
@@ -286,7 +292,7 @@ def _run_task(
     except jax.errors.JaxRuntimeError as error:
         if "RESOURCE_EXHAUSTED" not in str(error) or len(task) == 1:
             raise
-        middle = len(task) // 2  # without a journal, which is that of the whole batch
+        middle = len(task) // 2  # the halves have no journal: it is that of the whole batch
         return [
             done for half in (task[:middle], task[middle:]) for done in _run_task(settings, half, None, report, record)
         ]
@@ -295,25 +301,29 @@ def _run_task(
 def _retried(
     settings: MapSettings, done: list[tuple[Key, Replica]], refined: Callable[..., list[tuple[Key, Replica]]]
 ) -> list[tuple[Key, Replica]]:
-    """The replicas of a batch, those that came to nothing once more from another start and with half the time steps."""
+    """The replicas of a batch. Failed ones are run again once, from another packing and with half the time steps.
+
+    The second result is kept if its status is better.
+    """
     failed = [key for key, replica in done if replica.status >= Status.infeasible]
-    again = dict(refined(settings, failed)) if failed else {}
-    return [(key, again[key] if key in again and again[key].status < one.status else one) for key, one in done]
+    second = dict(refined(settings, failed)) if failed else {}
+    return [(key, second[key] if key in second and second[key].status < first.status else first) for key, first in done]
 
 
 def _measured(
     settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1, record: Wrap | None = None
 ) -> list[tuple[Key, Replica]]:
+    """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
     keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
     if refinement > 1:
         keys = jax.vmap(jax.random.fold_in, (0, None))(keys, refinement)
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
-    prepared = batch.strain
+    strain_before = batch.strain
     error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
     batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)
     return [
-        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(prepared[k])))
+        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(strain_before[k])))
         for k, key in enumerate(task)
     ]

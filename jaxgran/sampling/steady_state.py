@@ -212,7 +212,7 @@ def _as_batch(flow: ShearFlow, grains: Grains | None) -> Grains | None:
 def _heated(
     flow: ShearFlow, keys: Array, temperature: Array, grains: Grains | None = None
 ) -> tuple[State, Bool[Array, " replicas"]]:
-    """Packings with Gaussian velocities of the given temperatures and no total momentum, and whether they exist."""
+    """Packings with Gaussian velocities of the given temperatures and no total momentum; False where none was found."""
 
     def one(flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None):
         pack_key, heat_key = jax.random.split(key)
