@@ -23,9 +23,7 @@ from jaxgran.model.flow import Engine, ShearFlow
 from jaxgran.model.state import State
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
-Drive = Callable[
-    [ShearFlow, State, Array], tuple[State, Tally]
-]  # advances each replica of a batch by its own number of steps
+Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
 Wrap = Callable[[Drive], Drive]  # adds reports or records to a drive; states stay the same
 _DEVICES = "devices"
 

@@ -160,9 +160,7 @@ class Sample:
           InputError: the sample was made without ``observe``, or it holds a batch.
         """
         if self.own is None or jnp.ndim(self.area):
-            raise InputError(
-                "what was observed is that of one replica, sampled with observe and indexed if in a batch."
-            )
+            raise InputError("observed() needs one replica, sampled with observe: index a batch first.")
 
         def estimate_of_sums(sums: Any, steps: Array) -> Any:
             return estimate(jax.tree.map(lambda x: x / steps, sums))
