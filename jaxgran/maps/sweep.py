@@ -247,9 +247,8 @@ def _batch_size(grains: int, count: int, workers: int) -> int:
     devices, device = jax.device_count(), jax.local_devices()[0]
     if device.platform == "cpu":
         largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
-        return next(
-            size for size in range(largest, 0, -1) if count % size == 0
-        )  # a smaller last batch would compile again
+        # equal batches: a smaller last one would compile again
+        return next(size for size in range(largest, 0, -1) if count % size == 0)
     memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
     per_replica = _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _SEARCH_BYTES * min(grains, 512) ** 2
     return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
