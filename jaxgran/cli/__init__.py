@@ -1,4 +1,4 @@
 """The command line: reads options, prints, and ends with an exit status.
 
-It may import everything, and nothing imports it. Begin with `app`, then the file named like the command.
+It may import all other folders, and none imports it. Begin with `app`, then the file named like the command.
 """

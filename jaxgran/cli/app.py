@@ -1,8 +1,4 @@
-"""Command line: ``jaxgran map``, ``plot``, ``run``, ``fit`` and ``info``; each has a module of its own.
-
-Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finished, but a point carries a bad status;
-130 interrupted.
-"""
+"""Command line: ``jaxgran map``, ``plot``, ``run``, ``fit`` and ``info``. ``terminal`` lists the exit statuses."""
 
 import os
 import sys
@@ -11,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-# XLA calls it an error, at length, that a program from the cache was compiled with tuning hints. This precedes JAX.
+# XLA logs a long error if a cached program was compiled with tuning hints. The variable must be set before JAX loads.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 from jaxgran.cli.arguments import examples
@@ -33,7 +29,7 @@ COMMANDS = {
     "plot": (plot_command, "Draw the figures of a map again.", PLOT_EXAMPLES),
     "run": (run_command, "Run one flow, average it, film it.", RUN_EXAMPLES),
     "fit": (fit_command, "Infer a restitution, or the law of a map.", FIT_EXAMPLES),
-    "info": (info_command, "Print what a report of a bug needs.", INFO_EXAMPLES),
+    "info": (info_command, "Print what a bug report needs.", INFO_EXAMPLES),
 }
 
 app = typer.Typer(
@@ -42,8 +38,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for name, (command, in_short, shown_commands) in COMMANDS.items():
-    app.command(name, short_help=in_short, epilog=examples(shown_commands))(command)
+for name, (command, short_help, command_examples) in COMMANDS.items():
+    app.command(name, short_help=short_help, epilog=examples(command_examples))(command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -62,7 +58,7 @@ def jaxgran(
 
 
 def main() -> None:
-    """Entry point: mistakes in the input end with one sentence and exit status 2."""
+    """Entry point: a mistake in the input ends with one sentence and exit status 2."""
     try:
         status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
     except InputError as mistake:
@@ -73,7 +69,7 @@ def main() -> None:
         status = INTERRUPTED
     except OSError as error:
         stop(f"stopped by the file system, {error.strerror or error}.", NO_FILE)
-    if status == INTERRUPTED:  # what typer makes of Ctrl-C
+    if status == INTERRUPTED:  # typer returns this status after Ctrl-C
         stop("interrupted.", INTERRUPTED)
     raise SystemExit(status)
 
@@ -81,4 +77,4 @@ def main() -> None:
 def _options() -> frozenset[str]:
     """The options of all commands."""
     commands = getattr(typer.main.get_command(app), "commands", {}).values()
-    return frozenset(option for command in commands for one in command.params for option in one.opts)
+    return frozenset(option for command in commands for parameter in command.params for option in parameter.opts)

@@ -1,4 +1,4 @@
-"""Options of the commands: lists of numbers, the word auto, choices that exclude each other; examples of a help."""
+"""Values of options: lists of numbers, "auto", options that exclude each other; and the examples of a help text."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -8,7 +8,7 @@ import typer
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.flow import MAX_REPLICAS
 
-FIRST_STRAIN = 4.0  # of samples that grow until their errors are small
+FIRST_STRAIN = 4.0  # of samples that are extended until their errors are small
 
 RelativeError = Annotated[
     float | None,
@@ -37,7 +37,7 @@ def number_list(text: str, name: str) -> tuple[float, ...]:
 
 
 def numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | str | None:
-    """One number, several, or the word auto, of an option that may be absent."""
+    """One number, several numbers, or "auto"; None if the option is not given."""
     if text is None or text == "auto":
         return text
     numbers = number_list(text, name)
@@ -45,7 +45,7 @@ def numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | 
 
 
 def batch_size(text: str) -> int | Literal["auto"]:
-    """The number of replicas that run together, or the word auto."""
+    """Number of replicas that run together, or "auto"."""
     if text == "auto":
         return "auto"
     if not text.isdecimal() or len(text) > 9 or int(text) < 1:
@@ -54,13 +54,13 @@ def batch_size(text: str) -> int | Literal["auto"]:
 
 
 def first_strain(strain: float | None, error: float | None) -> float | None:
-    """The strain to begin with: the one given, or a short one where an error is given in its place."""
+    """The sampled strain, or the first strain of a sample if a target for the error is given instead."""
     if strain is not None and error is not None:
         raise InputError("--strain and --error exclude each other: give one of them.")
     return strain if error is None else FIRST_STRAIN
 
 
 def examples(commands: Mapping[str, str]) -> str:
-    """The end of a help text: commands by what they do."""
+    """The end of a help text: example commands and what they do."""
     lines = [line for words, command in commands.items() for line in (f"  {words}:", f"    {command}")]
     return "\b\n" + "\n".join(["Examples:", *lines])

@@ -1,4 +1,4 @@
-"""The command ``fit``: the restitution of a trajectory, or a closure of a map."""
+"""The command ``fit``: the restitution of a trajectory, or a closure fitted to a map."""
 
 import math
 from pathlib import Path
@@ -11,7 +11,7 @@ from rich.table import Table
 from jaxgran.cli.terminal import BAD_STATUS, configured_jax, print_table, stop, with_error
 from jaxgran.model.checks import InputError, require_number, shown
 
-_FAR_FROM_A_LAW = 9.0  # χ² of stresses that belong to no restitution of a map
+_LARGEST_CHI_SQUARED = 9.0  # above it, no restitution of the map has these stresses
 
 FIT_EXAMPLES = {
     "The restitution of observed grains": "jaxgran fit flow.gsd",
@@ -33,7 +33,7 @@ def fit_command(
     shear_stress: Annotated[float | None, typer.Option(help="Its shear stress, in m γ̇².")] = None,
     relative_error: Annotated[float, typer.Option(help="Relative standard error of these stresses.")] = 0.0,
 ) -> None:
-    """Infer the restitution of a trajectory, or fit a closure to a map and infer it from stresses."""
+    """Infer the restitution of a trajectory, or fit a closure to a map and infer a restitution from stresses."""
     require_number("relative_error", relative_error, lambda x: (x >= 0) & (x <= 1), "between 0 and 1")
     configured_jax()
     stresses = {"packing_fraction": packing_fraction, "pressure": pressure, "shear_stress": shear_stress}
@@ -55,19 +55,20 @@ def _fit_trajectory(file: Path, timestep: float | None) -> None:
     from jaxgran.inference.restitution import fit_restitution
     from jaxgran.io.trajectory import read_trajectory
 
-    seen = read_trajectory(file)
-    if not math.isfinite(float(seen.shear_rate)):
+    trajectory = read_trajectory(file)
+    if not math.isfinite(float(trajectory.shear_rate)):
         raise InputError(
-            f"{shown(file.name)} tells no strain and shear rate of its frames: use fit_restitution in Python."
+            f"{shown(file.name)} has no strain and shear rate of its frames: use fit_restitution in Python."
         )
     try:
-        found = fit_restitution(seen.strain, seen.state, float(seen.shear_rate), timestep)
+        found = fit_restitution(trajectory.strain, trajectory.state, float(trajectory.shear_rate), timestep)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)
     table = Table(box=box.SIMPLE)
     table.add_column("restitution ± standard error")
     table.add_column(with_error(found.restitution, found.stderr))
-    table.add_row("recorded restitution", f"{float(seen.restitution):g}" if math.isfinite(seen.restitution) else "none")
+    recorded = f"{float(trajectory.restitution):g}" if math.isfinite(trajectory.restitution) else "none"
+    table.add_row("recorded restitution", recorded)
     table.add_row("noise of the velocities, σγ̇", f"{found.noise:.2g}")
     table.add_row("windows, collisions", f"{found.windows}, {found.collisions:g}")
     table.add_row("outliers", f"{100 * found.outliers:.2g} %")
@@ -98,7 +99,7 @@ def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: fl
         noise = (relative_error * pressure, relative_error * shear)
         found = restitution_from_stresses(closure, nu, pressure, shear, *noise)
         words = "" if bool(found.determined) else ", hardly determined: the stresses depend little on it there"
-        if float(found.chi_squared) > _FAR_FROM_A_LAW:
+        if float(found.chi_squared) > _LARGEST_CHI_SQUARED:
             words = ", the nearest in the map: none there has these stresses"
         print_table(table)
         print(f"restitution {with_error(float(found.restitution), float(found.stderr))}{words}")

@@ -1,4 +1,4 @@
-"""The command ``info``: what a report of a bug needs."""
+"""The command ``info``: versions and hardware for a bug report."""
 
 import os
 import platform
@@ -9,11 +9,11 @@ from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
 _PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "h5netcdf", "gsd", "matplotlib")
-_SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # beginnings of the names of variables that change runs
+_SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # first letters of environment variables that change runs
 
 
 def info_command() -> None:
-    """Print versions, processor, devices and folders: what a report of a bug needs."""
+    """Print versions, processor, devices and folders for a bug report."""
     jax = configured_jax()
     lines = {
         "jaxgran": environment.versions(["jaxgran"])["jaxgran"] + _commit(),
@@ -42,7 +42,7 @@ def _commit() -> str:
 def _devices() -> str:
     try:
         return ", ".join(environment.devices())
-    except RuntimeError as failure:  # a driver that does not answer is what the report is about
+    except RuntimeError as failure:  # the report is needed most if a driver does not answer
         return f"none: {' '.join(str(failure).split())}"
 
 

@@ -17,12 +17,12 @@ from jaxgran.model.flow import Activation, Engine, Solver
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
-    "A plane of your own, at a time step that suits it": "jaxgran map --restitution 0.1,0.5,0.9 "
+    "Another plane, at an automatic time step": "jaxgran map --restitution 0.1,0.5,0.9 "
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
-    "Until every point is good to 2 %, and on after an interruption": "jaxgran map --error 0.02 --resume",
+    "Until the errors are below 2 %, continued after an interruption": "jaxgran map --error 0.02 --resume",
 }
 PLOT_EXAMPLES = {
-    "The figures of a map again, beside it": "jaxgran plot jaxgran_map.nc",
+    "The figures of a map, in its folder": "jaxgran plot jaxgran_map.nc",
     "In another folder": "jaxgran plot ratio.nc --output figures",
 }
 
@@ -50,9 +50,9 @@ def map_command(
     ] = 0.02,
     solver: Annotated[
         Solver | None,
-        typer.Option(help="Iteration of the contact solve in the engine jax. [default: barzilai-borwein]"),
+        typer.Option(help="Method of the contact solve in the engine jax. [default: barzilai-borwein]"),
     ] = None,
-    engine: Annotated[Engine | None, typer.Option(help="What advances the flows. [default: auto, the fastest]")] = None,
+    engine: Annotated[Engine | None, typer.Option(help="Program that advances the flows. [default: auto]")] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
@@ -61,7 +61,7 @@ def map_command(
     ] = None,
     output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
     like: Annotated[
-        Path | None, typer.Option(help="Dataset whose map is repeated; other options override its choices.")
+        Path | None, typer.Option(help="Dataset whose map is repeated; other options override its parameters.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
@@ -91,8 +91,8 @@ def map_command(
     from jaxgran.plotting.map_figures import save_figures
 
     pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
-    for one in by_timestep(data):
-        print_table(_ratio_table(one))
+    for part in by_timestep(data):
+        print_table(_ratio_table(part))
     finish(data, [output, *pictures], interrupted, can_resume=True)
 
 
@@ -100,7 +100,7 @@ def plot_command(
     file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
     output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
 ) -> None:
-    """Draw the figures of a map that has been run."""
+    """Draw the figures of a finished map."""
     from jaxgran.maps.results import read_dataset
     from jaxgran.plotting.map_figures import save_figures
 
@@ -112,18 +112,19 @@ def plot_command(
 
 
 def _like(file: Path) -> dict[str, Any]:
-    """The choices of the map in a file; what else could change its numbers is said on standard error."""
+    """The parameters of the map in a file; other differences that could change its numbers go to standard error."""
     configured_jax()
     from jaxgran.maps.results import choices_of, differences, read_dataset
 
     data = read_dataset(file)
-    chosen, others = choices_of(data), differences(data)
-    if others:
-        say(f"not as in {file}: {'; '.join(others)}.")
+    chosen, different = choices_of(data), differences(data)
+    if different:
+        say(f"not as in {file}: {'; '.join(different)}.")
     return chosen
 
 
 def _ratio_table(data) -> Table:
+    """The force ratio of a map with standard errors; * marks a bad status."""
     timestep, rule = data.attrs["timestep"], data.attrs["activation"]
     title = f"Force ratio at dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
     table = Table(title=title, box=box.SIMPLE, title_justify="left")

@@ -1,4 +1,4 @@
-"""A map or a run from its choices to its file: progress, checkpoint, and what is said in the end."""
+"""Runs a map or a single flow: progress, checkpoint, dataset, and the messages at the end."""
 
 import os
 import shlex
@@ -12,7 +12,7 @@ from jaxgran.cli.progress import progress
 from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, say, say_written, stop
 from jaxgran.environment import usable_cores
 
-_MEANINGS = {
+_MEANING_OF_STATUS = {
     "iteration_limit": "some contact solve ended above the tolerance",
     "not_steady": "temperature and pressure still drifted when the sample began, take more grains",
     "deep_overlap": "some grains overlapped by more than 1e-2 diameters, take a shorter time step",
@@ -36,8 +36,8 @@ def measured(
 ):
     """Run a map with progress, write its dataset, and return it and whether it was interrupted.
 
-    Where ``resume`` is not None a checkpoint is kept beside the output, and continued if ``resume`` is True. What
-    ``record`` is, ``replicas`` says.
+    If ``resume`` is True or False, a checkpoint is kept beside the output; True continues an earlier one. For
+    ``record`` and the other arguments see ``replicas``.
     """
     jax = configured_jax()
     from jaxgran.maps.checkpoint import Checkpoint
@@ -88,8 +88,8 @@ def measured(
             write_dataset(data, output)
         finished = len(results) == count
     except OSError as error:
-        kept = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
-        stop(f"stopped by the file system, {error.strerror or error}{kept}.", NO_FILE)
+        advice = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
+        stop(f"stopped by the file system, {error.strerror or error}{advice}.", NO_FILE)
     finally:
         if checkpoint is not None:
             checkpoint.close(finished)
@@ -97,6 +97,7 @@ def measured(
 
 
 def _say_resumed(checkpoint, count: int) -> None:
+    """Print how much of a map is done, and which files are damaged."""
     journals = len(checkpoint.journals())
     say(f"continued: {len(checkpoint.done)} of {count} replicas are done, {journals} batches are under way.")
     if checkpoint.damaged:
@@ -104,14 +105,14 @@ def _say_resumed(checkpoint, count: int) -> None:
 
 
 def by_timestep(data) -> list:
-    """The part of a map for each of its time steps, which is the attribute ``timestep`` of the part."""
+    """The parts of a map, one for each time step; the attribute ``timestep`` of a part is its time step."""
     if "timestep" not in data.dims:
         return [data]
     return [data.sel(timestep=dt).assign_attrs(timestep=dt) for dt in data.timestep.values.tolist()]
 
 
 def _bad_points(data) -> dict[str, list[str]]:
-    """Points by the name of their bad status."""
+    """The points with a bad status, in words, by the name of the status."""
     names = dict(
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
     )
@@ -128,7 +129,7 @@ def _bad_points(data) -> dict[str, list[str]]:
 
 
 def _say_imprecise(data) -> None:
-    """Say where the error that was asked for has not been reached."""
+    """Print the largest relative error beside its target, and the sampled strains, if a target was given."""
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
@@ -142,16 +143,16 @@ def _say_imprecise(data) -> None:
 
 
 def _say_retried(data) -> None:
-    """Say how many replicas have shorter time steps than asked for, because they had come to nothing."""
-    asked = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
-    retried = int((data.timestep_by_seed < 0.75 * asked).sum())
+    """Print how many replicas failed and were run again with half the time step."""
+    timestep = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
+    retried = int((data.timestep_by_seed < 0.75 * timestep).sum())
     if retried:
         say(f"retried with half the time step: {retried} replicas, see timestep_by_seed.")
 
 
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
-    """Say what was written and what went wrong, and exit with the status that tells it."""
-    started = bool((data.status_by_seed >= 0).any())  # with nothing to save, a file there is an older one
+    """Print what was written and what went wrong, and exit with the matching status."""
+    started = bool((data.status_by_seed >= 0).any())  # without results, an existing file is an older one
     written = [path for path in written if started and path.exists()]
     say_written(written)
     _say_imprecise(data)
@@ -167,5 +168,7 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
     if bad:
         which = "the flow has" if data.status.size == 1 else "points marked * have"
         words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
-        meanings = "; ".join(f"{name.replace('_', ' ')}: {_MEANINGS[name]}" for name in bad if name in _MEANINGS)
+        meanings = "; ".join(
+            f"{name.replace('_', ' ')}: {_MEANING_OF_STATUS[name]}" for name in bad if name in _MEANING_OF_STATUS
+        )
         stop(f"finished, but {which} a bad status. {words}. What that means: {meanings}.", BAD_STATUS)

@@ -8,12 +8,18 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-_PLAIN_SECONDS = 10  # between two lines where there is no terminal
+_SECONDS_BETWEEN_LINES = 10  # without a terminal
 _T = TypeVar("_T")
 
 
 class Meter:
-    """Counts what is done and says so on standard error: a bar on a terminal, a line now and then elsewhere."""
+    """Counts finished replicas and reports on standard error: a bar on a terminal, lines elsewhere.
+
+    Args:
+      costs: relative cost of a replica of each point.
+      seeds: replicas of each point.
+      quiet: whether to report nothing.
+    """
 
     def __init__(self, costs: list[float], seeds: int, quiet: bool):
         self.costs, self.seeds, self.quiet = costs, seeds, quiet
@@ -27,16 +33,18 @@ class Meter:
         self.task = self.bar.add_task("compiling", total=sum(costs) * seeds)
 
     def steps(self, steps: float) -> None:
+        """Count replica-steps."""
         self.done_steps += steps
         self._show()
 
     def resumed(self, points: Iterable[int]) -> None:
-        """Count replicas that an earlier run has done, which say nothing about the time left."""
+        """Count the replicas of an earlier run, by their points; the estimate of the time left leaves them out."""
         for point in points:
             self.left[point] -= 1
             self.known_cost += self.costs[point]
 
     def replica(self, point: int) -> None:
+        """Count a finished replica of a point."""
         self.left[point] -= 1
         self.done_cost += self.costs[point]
         self._show()
@@ -44,7 +52,7 @@ class Meter:
     def _show(self) -> None:
         if self.console.is_terminal:
             self.bar.update(self.task, completed=self.known_cost + self.done_cost, description=self._line())
-        elif time.perf_counter() - self.last_line > _PLAIN_SECONDS:
+        elif time.perf_counter() - self.last_line > _SECONDS_BETWEEN_LINES:
             self.last_line = time.perf_counter()
             self.console.print(self._line(), highlight=False)
 
@@ -58,6 +66,7 @@ class Meter:
 
 @contextmanager
 def progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[Meter]:
+    """A ``Meter`` that is shown while the block runs, and once more at its end."""
     meter = Meter(costs, seeds, quiet)
     if meter.console.is_terminal and not quiet:
         with meter.bar:
@@ -69,7 +78,7 @@ def progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[Meter]:
 
 
 def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
-    """The items one by one, and on a terminal a bar of how many are done, called ``words``."""
+    """The items one by one, with a progress bar on a terminal; ``words`` is its title."""
     console = Console(stderr=True)
     columns = TextColumn(words), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -77,6 +86,7 @@ def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
 
 
 def _duration(seconds: float) -> str:
+    """A time as hours:minutes:seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}"

@@ -1,4 +1,4 @@
-"""The command ``run``: one flow, its averages, and its frames as a trajectory or a movie."""
+"""The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
 import math
 from functools import partial
@@ -16,7 +16,7 @@ from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
 from jaxgran.model.checks import InputError, require_number, shown
 from jaxgran.model.flow import Engine
 
-MOST_RECORDED = 100_000  # of a trajectory
+MOST_RECORDED = 100_000  # frames of a trajectory
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
@@ -33,7 +33,7 @@ def run_command(
     strain: Annotated[float | None, typer.Option(help="Sampled strain. [default: 5]")] = None,
     error: RelativeError = None,
     timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
-    engine: Annotated[Engine, typer.Option(help="What advances the flow; auto is the fastest.")] = "auto",
+    engine: Annotated[Engine, typer.Option(help="Program that advances the flow.")] = "auto",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
     every: Annotated[
         float | None,
@@ -73,7 +73,7 @@ def run_command(
 
 
 def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, strain: float):
-    """What records the flow frame by frame, None where no file is given; and the frames that it keeps for a movie."""
+    """The recorder of the flow and the frames of its movie; None and None if no file is asked for."""
     if trajectory is None and movie is None:
         if every is not None:
             raise InputError(
@@ -90,17 +90,18 @@ def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, 
         least, most = strain / most_frames, strain
         words = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
         require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)
-    kept, frames = [], Frames()
+    keep, frames = [], Frames()
     if trajectory is not None:
         check_trajectory(trajectory)
-        kept.append(partial(write_frame, trajectory))
+        keep.append(partial(write_frame, trajectory))
     if movie is not None:
         check_movie(movie)
-        kept.append(frames.keep)
-    return Recorder(strain / 100 if every is None else every, *kept), frames
+        keep.append(frames.keep)
+    return Recorder(strain / 100 if every is None else every, *keep), frames
 
 
 def _write_movie(movie: Path, frames, quiet: bool) -> None:
+    """Draw and write the movie, with progress unless quiet."""
     from jaxgran.plotting.movie import write_movie
 
     if not quiet:
@@ -110,6 +111,7 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 
 
 def _summary_table(data) -> Table:
+    """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
     title = f"Engine {data.attrs['engine']}, solver {data.attrs['solver']}"
@@ -118,15 +120,16 @@ def _summary_table(data) -> Table:
         table.add_column(name)
     point = data.isel(packing_fraction=0, restitution=0)
     strain = float(point.strain_by_seed.sum())
+
+    def number(name: str) -> float:
+        return float(point[name]) if name in point else math.nan
+
     for name in OBSERVABLES:
         if name not in TENSORS:
             unit = OBSERVABLES[name][1]
-            cell = with_error(float(point[name]), float(point[f"{name}_stderr"]))
-            correlation = (
-                float(point[f"{name}_correlation_strain"]) if f"{name}_correlation_strain" in point else math.nan
-            )
-            samples = strain / correlation
-            theory = float(point[f"theory_{name}"]) if f"theory_{name}" in point else math.nan
-            numbers = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.add_row(name.replace("_", " "), cell, "" if unit == "1" else unit, *numbers)
+            value = with_error(number(name), number(f"{name}_stderr"))
+            samples = strain / number(f"{name}_correlation_strain")
+            theory = number(f"theory_{name}")
+            texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
+            table.add_row(name.replace("_", " "), value, "" if unit == "1" else unit, *texts)
     return table

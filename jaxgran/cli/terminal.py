@@ -1,7 +1,14 @@
-"""What every command shares: exit statuses, sentences on standard error, tables on standard output, JAX as it is used.
+"""Shared by all commands: exit statuses, sentences on standard error, tables on standard output, the set-up of JAX.
 
-Exit status: 0 done; 1 the file system fails; 2 a mistake in the input; 3 finished, but a point carries a bad status;
-130 interrupted.
+===========  ========================================================
+exit status  meaning
+===========  ========================================================
+0            done
+1            the file system failed
+2            a mistake in the input
+3            finished, but a point has a bad status, or a fit failed
+130          interrupted
+===========  ========================================================
 """
 
 import hashlib
@@ -16,11 +23,14 @@ from rich.table import Table
 
 from jaxgran.environment import processor_features
 
-NO_FILE, INPUT_MISTAKE, BAD_STATUS, INTERRUPTED = 1, 2, 3, 130
+NO_FILE = 1
+INPUT_MISTAKE = 2
+BAD_STATUS = 3
+INTERRUPTED = 130
 
 
 def configured_jax():
-    """JAX in double precision, with compiled programs kept in the cache folder of the user."""
+    """JAX in double precision, with a cache of compiled programs in the user's cache folder."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -30,7 +40,7 @@ def configured_jax():
 
 
 def _compilation_cache() -> str:
-    """Folder of compiled programs, one for each kind of processor: a home folder may be shared by several."""
+    """Folder of compiled programs, one for each kind of processor: several machines may share a home folder."""
     kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
     return str(Path(platformdirs.user_cache_dir("jaxgran")) / kind)
 
@@ -41,13 +51,13 @@ def say(sentence: str) -> None:
 
 
 def say_written(paths: Iterable[Path]) -> None:
-    """Name the files that have been written."""
+    """Print the names of the written files."""
     for path in paths:
         say(f"wrote {path}")
 
 
 def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
-    """Say why the command ends, and end it."""
+    """Print why the command ends, and exit with the status."""
     say(f"jaxgran: {sentence}")
     raise SystemExit(status)
 
@@ -58,6 +68,6 @@ def with_error(value: float, error: float) -> str:
 
 
 def print_table(table: Table) -> None:
-    """Print a table on standard output, in full width where that is a file."""
+    """Print a table on standard output, in full width if that is not a terminal."""
     console = Console()
     console.print(table) if console.is_terminal else Console(width=40 + 20 * len(table.columns)).print(table)
