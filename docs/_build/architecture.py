@@ -85,7 +85,7 @@ def drawing() -> Figure:
 def _draw_box(axes: Axes, name: str, k: int) -> None:
     corner = (k - _WIDTH / 2, -k * _BAND - _HEIGHT / 2)
     axes.add_patch(FancyBboxPatch(corner, _WIDTH, _HEIGHT, "round,pad=0,rounding_size=0.08", fc="white", ec="black"))
-    axes.text(k, -k * _BAND, name, ha="center", va="center", fontsize=8.5)
+    axes.text(k, -k * _BAND, name, ha="center", va="center", fontsize=7.5)
 
 
 def _draw_imports(axes: Axes, k: int, imported: dict[int, int]) -> None:
