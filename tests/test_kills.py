@@ -11,7 +11,6 @@ from fault_lab import MARKS, PATIENCE, Lab
 from jaxgran.maps.results import read_dataset
 
 pytestmark = MARKS
-KILLS = {1: 14, 2: 6}  # by the number of workers
 
 
 @pytest.fixture(scope="module")
@@ -19,11 +18,16 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     return Lab(tmp_path_factory.mktemp("lab"))
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: Lab, workers: int) -> None:
+MANY = [pytest.param(1, 14, marks=pytest.mark.slow), pytest.param(2, 6, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("workers", "most_kills"), [(1, 3), (2, 1), *MANY])
+def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(
+    lab: Lab, workers: int, most_kills: int
+) -> None:
     rng, maps, kills, known = random.Random(workers), 1, 0, 0
-    while kills < KILLS[workers]:
-        output = f"killed{workers}-{maps}.nc"
+    while kills < most_kills:
+        output = f"killed{workers}-{most_kills}-{maps}.nc"
         process = lab.start(output, "--resume", "--batch", "1", workers=workers)
         if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start
             lab.wait_for_work(output, process)

@@ -47,11 +47,11 @@ def sources() -> list[Path]:
 
 def cache_folder() -> Path:
     """Where the machine code of these sources is kept, below numba's own choice of a cache or the user's."""
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sources():
-        told.update(path.read_bytes())
+        digest.update(path.read_bytes())
     base = numba.config.CACHE_DIR or user_cache_path("jaxgran") / "machine_code"  # pyright: ignore
-    return Path(base) / f"jaxgran-{told.hexdigest()[:16]}"
+    return Path(base) / f"jaxgran-{digest.hexdigest()[:16]}"
 
 
 def _usable(folder: Path) -> bool:

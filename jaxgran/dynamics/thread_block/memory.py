@@ -112,7 +112,7 @@ class Thread(NamedTuple):
         return [at[row, :] for at, row in zip(memory, rows, strict=True)]
 
     def ask(self, memory: Any, row: int, other: Array, mask: Array) -> Array:
-        """What another thread has told."""
+        """What another thread has written."""
         return triton.load(memory.at[row, other], mask=mask, other=0)
 
     def read(self, memory: Any, *place: Any, mask: Array) -> Array:
