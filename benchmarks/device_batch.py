@@ -21,6 +21,7 @@ from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
 from jaxgran.dynamics import advance
 from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics.engine import select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.sampling.batch import advance_batch, replicated
@@ -81,8 +82,7 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
             if turn:
                 seconds[name].append(time.perf_counter() - start)
     speeds = {name: done / min(seconds[name]) for name, (_, done) in ways.items()}
-    engine = advance.engine(flow, state)
-    taken = "plain" if engine is None else engine.__name__
+    taken = select_engine(flow, state)
     return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
 
 
