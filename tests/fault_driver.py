@@ -15,7 +15,7 @@ from jaxgran.maps import journal, sweep
 
 journal.SECONDS = 0.3  # so that batches of a second have journals
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
-sys.modules["jaxgran.plotting.ratio"] = figures
+sys.modules["jaxgran.plotting.map_figures"] = figures
 FAULT = os.environ.get("FAULT", "")
 
 if FAULT == "clock":
