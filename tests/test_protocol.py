@@ -171,7 +171,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
 
 def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     flow = with_timesteps(1e-4, 2e-2)
-    coarse = np.asarray(timestep.coarse_timestep(flow, predicted(flow)))
+    coarse = np.asarray(timestep.bounded_coarse_timestep(flow, predicted(flow)))
     assert coarse[0] == timestep.COARSE_TIMESTEP
     assert coarse[1] == 2e-2
 

@@ -61,7 +61,7 @@ numbers = st.floats(0.0, 1.0)
 )
 def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int, batch, workers: int) -> None:
     flows = [ShearFlow(64, alpha, nu, dt) for alpha, nu, dt in points]
-    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, grains=64)
+    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, grains=64, engine="auto")
     tasks = sweep._tasks(settings, batch, workers)
     keys = [key for task in tasks for key in task]
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
