@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgran.contact.law import flight_of, kinetic_means
+from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import Frame, PairLists, refresh, separations_now
 from jaxgran.contact.network import first_contact_time
 from jaxgran.dynamics.tally import RunningSums
@@ -87,7 +87,7 @@ def fresh_lists(
 def steps_to_contact(pairs: PairMotion, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
     """Number of steps, at least ``least``, after which some pair first is an approaching contact; may be infinite."""
     time, closest = first_contact_time(pairs.separations(), pairs.velocities(), reach)
-    steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least.astype(time.dtype))
+    steps = jnp.maximum(first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype))
     return smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
 
 

@@ -65,11 +65,11 @@ def predict_contact_steps(p, t, earliest, horizon, flow, grains, pairs):
     discriminant = gap_discriminant(speed, closing, excess)
     if not discriminant >= 0.0:
         return
-    root = math.sqrt(discriminant)
-    turn = _as_step(first_step(t - closing / speed, dt, 0.0))  # the first step in which the pair recedes
-    enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) / speed
+    root, per_speed = math.sqrt(discriminant), 1 / speed
+    turn = _as_step(first_step(t - closing * per_speed, dt, 0.0))  # the first step in which the pair recedes
+    enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) * per_speed
     begin = max(earliest, _as_step(first_step(t + enter, dt, theta)))
-    last = max(turn - 1, _as_step(np.floor((t + (root - closing) / speed) / dt - theta)))
+    last = max(turn - 1, _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta)))
     if begin <= last and begin < MANY:
         calendar[BEGINS, p], calendar[ENDS, p] = begin, last
         if begin < turn:

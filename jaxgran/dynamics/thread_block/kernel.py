@@ -30,7 +30,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array, Int
 
-from jaxgran.contact.law import flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
+from jaxgran.contact.law import first_step, flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
 from jaxgran.dynamics.plain import ended
 from jaxgran.dynamics.tally import LAYOUT, RESIDUAL_EDGES, RunningSums, Tally, sums_from_row
 from jaxgran.dynamics.thread_block.memory import (
@@ -354,7 +354,7 @@ def _steps_to_contact(thread: Thread, motion: Motion, lists: _Lists, least: Arra
     def sooner(k: Array, soonest: Array) -> Array:
         pair = _pair(thread, k, motion, lists)
         time, closest = time_to_touch(*pair.gap())
-        steps = jnp.maximum(jnp.ceil(time / flow.timestep - flow.activation_fraction), least)
+        steps = jnp.maximum(first_step(time, flow.timestep, flow.activation_fraction), least)
         return jnp.where(pair.real & (steps * flow.timestep < closest), jnp.minimum(soonest, steps), soonest)
 
     return jnp.min(lax.fori_loop(0, lists.longest, sooner, jnp.full_like(motion.x, jnp.inf)))
