@@ -179,7 +179,7 @@ def _documentation() -> str:
     rows = [("field", "shape", "unit", "sum of")]
     for name, row in TABLE.items():
         largest = "(the largest) " if row["joined"] == "largest" else ""
-        rows.append((name, str(row["shape"]).replace(",)", ",)"), row["unit"], largest + row["meaning"]))
+        rows.append((name, str(row["shape"]), row["unit"], largest + row["meaning"]))
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     border = "  ".join("=" * width for width in widths)
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -8,8 +8,7 @@ import math
 
 import numpy as np
 
-from jaxgran.contact import law
-from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     ACROSS,
     BEGINS,
@@ -28,9 +27,8 @@ from jaxgran.dynamics.machine_code.layout import (
     Y,
 )
 
-_LAW = compiled_law(law)
-gap_coefficients, gap_discriminant = _LAW["gap_coefficients"], _LAW["gap_discriminant"]
-touching_time, first_step = _LAW["touching_time"], _LAW["first_step"]
+gap_coefficients, gap_discriminant = LAW["gap_coefficients"], LAW["gap_discriminant"]
+touching_time, first_step = LAW["touching_time"], LAW["first_step"]
 
 
 @compiled

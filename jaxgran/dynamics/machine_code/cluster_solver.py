@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 
-from jaxgran.contact import law
 from jaxgran.contact.law import JAMMED_RESPONSE, LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     APPROACH,
     BEST,
@@ -42,7 +41,7 @@ from jaxgran.dynamics.machine_code.layout import (
     P,
 )
 
-largest_eigenvalue = compiled_law(law)["largest_eigenvalue"]
+largest_eigenvalue = LAW["largest_eigenvalue"]
 
 _RELAXATION, _RELAXATION_OF_FEW, _FEW = 1.45, 1.2, 32  # over-relaxation, and that of clusters of up to 32 contacts
 SWEEPS = 200  # after which a cluster is taken for a stiff one

@@ -24,6 +24,8 @@ import numpy as np
 from numba import njit
 from platformdirs import user_cache_path
 
+from jaxgran.contact import law
+
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # nothing here is called from Python
 _KEPT = 8  # versions of the machine code in the cache
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, **_NO_WRAPPERS}
@@ -104,7 +106,7 @@ def _maximum(a, b):
     return a if a > b else b
 
 
-def compiled_law(module: ModuleType) -> dict[str, Any]:
+def _compiled_law(module: ModuleType) -> dict[str, Any]:
     """The functions of a module that is written for arrays of JAX, compiled for numbers from the same source."""
     names: dict[str, Any] = {**vars(module), "where": _where, "maximum": _maximum, "sqrt": math.sqrt, "ceil": np.ceil}
     functions = {
@@ -113,3 +115,6 @@ def compiled_law(module: ModuleType) -> dict[str, Any]:
     for name, function in functions.items():
         names[name] = compiled(FunctionType(function.__code__, names, name))
     return {name: names[name] for name in functions}
+
+
+LAW = _compiled_law(law)  # the functions of ``contact.law``

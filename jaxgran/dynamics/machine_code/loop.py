@@ -18,7 +18,6 @@ import math
 
 import numpy as np
 
-from jaxgran.contact import law
 from jaxgran.dynamics.machine_code.calendar import (
     clear_calendar,
     contacts_of_step,
@@ -26,7 +25,7 @@ from jaxgran.dynamics.machine_code.calendar import (
     predict_contact_steps,
 )
 from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
-from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     CAPACITY,
     DEEP,
@@ -66,8 +65,7 @@ from jaxgran.model.status import DEEP_OVERLAP
 STATUS, TILT, RESULTS = NUMBERS, NUMBERS + 1, NUMBERS + 2  # behind the sums, and the length of all of it
 INPUTS = 9  # numbers of a flow and of its advance
 
-_LAW = compiled_law(law)
-residual_target, relative_residual = _LAW["residual_target"], _LAW["relative_residual"]
+residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
 _PAIRS_PER_GRAIN = 2.7  # expected within the skin: wide lists cost the events, narrow ones the searches
 _PAIR_CAPACITY = 16  # slots of pairs for each grain

@@ -1,7 +1,6 @@
 """The running sums of the machine code, in one row of numbers ordered by the table of ``dynamics.tally``."""
 
-from jaxgran.contact import law
-from jaxgran.dynamics.machine_code.compiled import compiled, compiled_law
+from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     APPROACH,
     DISTANCE,
@@ -16,8 +15,7 @@ from jaxgran.dynamics.machine_code.layout import (
 )
 from jaxgran.dynamics.tally import CONTACT, RESIDUAL_EDGES, place_of, span_of
 
-_LAW = compiled_law(law)
-contact_terms, kinetic_means = _LAW["contact_terms"], _LAW["kinetic_means"]
+contact_terms, kinetic_means = LAW["contact_terms"], LAW["kinetic_means"]
 
 _EDGES = RESIDUAL_EDGES[1:-1]
 _FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
