@@ -19,7 +19,7 @@ from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics import engine as engine_module
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
-from jaxgran.dynamics.machine_code import cluster_solver, layout, loop
+from jaxgran.dynamics.machine_code import cluster_solver, layout
 from jaxgran.dynamics.machine_code.near_pairs import find_near_pairs
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.dynamics.thread_block import kernel, solver
@@ -439,7 +439,8 @@ def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin,
     motion[:, :2] = rng.uniform(0, side, (count, 2))
     motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
     room = count * (count - 1) // 2
-    memory = loop._pairs_of.py_func(count)._replace(ends=np.empty((2, room), np.uint32), images=np.empty((2, room)))
+    heads, links = np.empty(max(9, 2 * count), np.int32), np.empty(count, np.int32)
+    memory = layout.Pairs(np.empty((2, room), np.uint32), np.empty((2, room)), None, None, None, heads, links)
     grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images

@@ -83,18 +83,20 @@ def _advance_jvp(
 
 def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the machine code."""
-    from jaxgran.dynamics.machine_code import ffi, loop
+    from jaxgran.dynamics.machine_code import ffi, layout
 
     ffi.register()
     dtype, grains = state.positions.dtype, state.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
     numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps)
-    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape in (*[state.positions.shape] * 2, (loop.RESULTS,))]
-    call = jax.ffi.ffi_call(ffi.TARGET, shapes, vmap_method="sequential")
+    memory = layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains
+    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,)]
+    results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+    call = jax.ffi.ffi_call(ffi.TARGET, results, vmap_method="sequential")
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    positions, velocities, results = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
-    status, tilt = results[loop.STATUS], results[loop.TILT]
-    sums = sums_from_row(results[:NUMBERS], status.astype(jnp.int32))
+    positions, velocities, found, _ = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
+    status, tilt = found[layout.STATUS], found[layout.TILT]
+    sums = sums_from_row(found[:NUMBERS], status.astype(jnp.int32))
     return ended(state, wrap(positions, state.side, tilt), tilt, velocities, sums)
 
 

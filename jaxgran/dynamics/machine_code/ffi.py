@@ -1,87 +1,109 @@
-"""The machine code as XLA calls it, through its foreign function interface.
+"""The machine code for XLA: compiled once, kept as an object file, and registered as a foreign function.
 
-A call frame and its buffers are structures of words of eight bytes, see ``xla/ffi/api/c_api.h``, whose layout is kept
-from version to version. A frame is (size, extensions, interface, context, stage, arguments, results, ...); arguments
-and results are (size, extensions, count, types, pointers); a buffer is (size, extensions, dtype, data, rank, dims). A
-frame that comes with an extension asks for the version that is spoken.
+The name of the file is a hash of all that its content depends on: the sources that are compiled together, the compiler
+and the processor. So a change in any of them compiles anew, in a user's cache and in the tests. A kept file is loaded
+without the compiler. If the cache cannot be written, every process compiles, with a warning.
 """
 
-# pyright: reportCallIssue=false
-# An intrinsic of numba is called without the context that it is defined with.
-
+import ast
 import ctypes
+import hashlib
+import os
+import tempfile
+import warnings
+from contextlib import suppress
 from functools import cache
+from importlib.metadata import version
+from pathlib import Path
 
 import jax
-from llvmlite import ir
-from numba import carray, cfunc, types
-from numba.extending import intrinsic
-
-from jaxgran.dynamics.machine_code.compiled import cached, compiled
-from jaxgran.dynamics.machine_code.loop import INPUTS, RESULTS, advance_loop
+from llvmlite import binding as llvm
+from platformdirs import user_cache_path
 
 TARGET = "jaxgran_advance"
-_EXTENSIONS, _INTERFACE, _ARGUMENTS, _RESULTS = 1, 2, 9, 14  # words of a frame
-_DATA, _DIMS = 3, 5  # words of a buffer
-_VERSION = 4  # word of the interface: the minor version in the upper half, and the major one, 0, in the lower
+_KEPT = 8  # versions of the machine code in the cache
+_DIGEST = 32  # bytes before the content of a kept file: its hash, so that a damaged file is not run
+_CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
 
-@intrinsic
-def _words(context, address):
-    """The address as a pointer to words of eight bytes."""
-
-    def generate(_, builder, signature, arguments):
-        return builder.inttoptr(arguments[0], ir.IntType(64).as_pointer())
-
-    return types.CPointer(types.int64)(types.int64), generate
-
-
-@intrinsic
-def _doubles(context, address):
-    """The address as a pointer to numbers of double precision."""
-
-    def generate(_, builder, signature, arguments):
-        return builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
-
-    return types.CPointer(types.float64)(types.int64), generate
+def sources() -> list[Path]:
+    """The files that are compiled together: this folder, and what it imports of the package."""
+    here = Path(__file__).parent
+    package, found, left = here.parents[1], set(), list(here.glob("*.py"))
+    while left:
+        path = left.pop()
+        if path not in found:
+            found.add(path)
+            for node in ast.walk(ast.parse(path.read_bytes())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package.name}."):
+                    place = package.joinpath(*(node.module or "").split(".")[1:])
+                    names = [place, *(place / name.name for name in node.names)]
+                    left += [file for name in names if (file := name.with_suffix(".py")).is_file()]
+    return sorted(found)
 
 
-@compiled
-def _data(buffers, k):
-    return _words(_words(buffers)[k])[_DATA]
-
-
-@compiled
-def _length(buffers, k):
-    return _words(_words(_words(buffers)[k])[_DIMS])[0]
-
-
-@cached(cfunc, types.int64(types.int64))
-def handler(frame):
-    """``advance_loop``: arguments and results are buffers of a call frame."""
-    extension = _words(frame)[_EXTENSIONS]
-    if extension != 0:
-        metadata = _words(_words(extension)[3])
-        metadata[3] = _words(_words(frame)[_INTERFACE])[_VERSION] >> 32 << 32
-        return 0
-    given, made = _words(frame)[_ARGUMENTS], _words(frame)[_RESULTS]
-    grains = _length(given, 2)
-    advance_loop(
-        carray(_doubles(_data(given, 0)), (grains, 2)),
-        carray(_doubles(_data(given, 1)), (grains, 2)),
-        carray(_doubles(_data(given, 2)), (grains,)),
-        carray(_doubles(_data(given, 3)), (grains,)),
-        carray(_doubles(_data(given, 4)), (INPUTS,)),
-        carray(_doubles(_data(made, 0)), (grains, 2)),
-        carray(_doubles(_data(made, 1)), (grains, 2)),
-        carray(_doubles(_data(made, 2)), (RESULTS,)),
-    )
-    return 0
+def object_file() -> Path:
+    """Where the machine code is kept: in the user's cache folder, or in that of numba's environment variable."""
+    words = [version("numba"), version("llvmlite"), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
+    digest = hashlib.sha256("\n".join([*words, os.environ.get("NUMBA_OPT", "")]).encode())
+    for path in sources():
+        digest.update(path.read_bytes())
+    folder = Path(os.environ.get(_CACHE_FOLDER) or user_cache_path("jaxgran") / "machine_code")
+    return folder / f"{digest.hexdigest()[:16]}.o"
 
 
 @cache
 def register() -> None:
-    """Compile the machine code, or take what is kept of it, and tell XLA where it is."""
+    """Compile the machine code, or load what is kept of it, and tell XLA where it is."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    processor, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    target = llvm.Target.from_default_triple()
+    machine = target.create_target_machine(cpu=processor, features=features, opt=3, jit=True)
+    path = object_file()
+    content = _kept(path)
+    if content is None:
+        from jaxgran.dynamics.machine_code.handler import object_code
+
+        content = object_code(TARGET, machine)
+        _keep(path, content)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(content))
+    engine.finalize_object()
+    _ENGINES.append(engine)
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    jax.ffi.register_ffi_target(TARGET, new(handler.address, None, None), platform="cpu")
+    jax.ffi.register_ffi_target(TARGET, new(engine.get_function_address(TARGET), None, None), platform="cpu")
+
+
+_ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the machine code
+
+
+def _kept(path: Path) -> bytes | None:
+    """The content of a kept file; None if there is none, or if it is damaged."""
+    with suppress(OSError):
+        text = path.read_bytes()
+        if hashlib.sha256(text[_DIGEST:]).digest() == text[:_DIGEST]:
+            return text[_DIGEST:]
+    return None
+
+
+def _keep(path: Path, content: bytes) -> None:
+    """Write a file in one step, and remove the oldest versions beside it; a warning if that cannot be."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(hashlib.sha256(content).digest() + content)
+        os.replace(file.name, path)
+    except OSError as error:
+        warnings.warn(
+            f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
+            f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to one "
+            "that can.",
+            stacklevel=2,
+        )
+        return
+    with suppress(OSError):
+        versions = sorted(path.parent.glob("*.o"), key=lambda one: one.stat().st_mtime, reverse=True)
+        for old in versions[_KEPT:]:
+            old.unlink(missing_ok=True)

@@ -1,13 +1,19 @@
 """Where numbers lie in the memory of the machine code, and what its functions are given together.
 
 Arrays are handed on whole and read by row and column. Indices are unsigned, which spares a test for negative ones.
+Nothing here needs the compiler, so that kept machine code runs without it.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import Status
+
+INPUTS = 9  # numbers of a flow and of its advance
+STATUS, TILT, RESULTS = NUMBERS, NUMBERS + 1, NUMBERS + 2  # behind the sums, and the length of all of it
+WORDS, WORDS_PER_GRAIN = 512 + NUMBERS, 176  # of eight bytes: bounds of the memory that ``memory`` cuts up
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains
@@ -46,6 +52,17 @@ class Grains(NamedTuple):
 
     motion: Any
     constants: Any
+
+
+class Order(NamedTuple):
+    """The order of the grains in memory: ``given[g]`` is the place of grain g in the state.
+
+    given: (grains,); cells, starts: (grains,) and (grains + 2,), for the sorting.
+    """
+
+    given: Any
+    cells: Any
+    starts: Any
 
 
 class Pairs(NamedTuple):

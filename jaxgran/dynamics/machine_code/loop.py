@@ -32,20 +32,18 @@ from jaxgran.dynamics.machine_code.layout import (
     EPSILON,
     FIRST,
     INVERSE_MASS,
-    LANES,
     MANY,
     NONFINITE,
     OK,
     RADIUS,
+    RESULTS,
     SECOND,
+    STATUS,
     STRIKES,
+    TILT,
     VX,
     VY,
-    Clusters,
     Flow,
-    Grains,
-    Network,
-    Pairs,
     X,
     Y,
 )
@@ -53,27 +51,22 @@ from jaxgran.dynamics.machine_code.near_pairs import (
     LIFE,
     bring_into_cell,
     kinetic_sums,
-    memory_order,
+    put_in_order,
     search,
     skin_loss,
 )
 from jaxgran.dynamics.machine_code.network import gather_kicks, make_network, solve_isolated, sort_by_cluster
 from jaxgran.dynamics.machine_code.sums import add_contacts, add_flight, add_solve
-from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import DEEP_OVERLAP
-
-STATUS, TILT, RESULTS = NUMBERS, NUMBERS + 1, NUMBERS + 2  # behind the sums, and the length of all of it
-INPUTS = 9  # numbers of a flow and of its advance
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
 _PAIRS_PER_GRAIN = 2.7  # expected within the skin: wide lists cost the events, narrow ones the searches
-_PAIR_CAPACITY = 16  # slots of pairs for each grain
 _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @compiled
-def advance_loop(positions, velocities, radii, masses, numbers, new_positions, new_velocities, results):
+def advance_loop(positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, arrays):
     """Advance one replica.
 
     Args:
@@ -83,6 +76,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
       numbers: side, tilt, restitution, timestep, shear rate, tolerance, activation fraction, most iterations of a
         solve, and steps.
       results: (RESULTS,) receives the running sums, the status and the tilt.
+      arrays: memory of the loop, see ``memory``.
     """
     side, tilt, alpha, dt, rate = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     flow = Flow(side, rate, dt, numbers[6], 1.0 + alpha, numbers[5], int(numbers[7]))
@@ -90,11 +84,9 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
     for n in range(RESULTS):
         results[n] = 0.0
 
-    grains = Grains(np.empty((count, 4)), np.empty((count, 2)))
-    pairs, network, step_sums = _pairs_of(count), _network_of(count), np.empty(NUMBERS)
-    clusters = _clusters_of(count, network.kicks)  # the kicks are gathered after the solves
-    order = memory_order(positions, side, tilt)
-    largest, finite = _take_grains(positions, velocities, radii, masses, order, rate, grains)
+    grains, pairs, network, clusters, order, step_sums = arrays
+    put_in_order(positions, side, tilt, order)
+    largest, finite = _take_grains(positions, velocities, radii, masses, order.given, rate, grains)
     widest = max(side / 2 - largest, 1e-3)  # nearest images are unique
     expected = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
     usual = min(max(expected, _NARROWEST_SKIN), widest)
@@ -157,70 +149,21 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         tilt -= math.floor(tilt + 0.5)
         _move(k * dt, grains)
 
-    _deliver(order, rate, grains, new_positions, new_velocities)
+    _deliver(order.given, rate, grains, new_positions, new_velocities)
     if done == 0:  # as it was, to the bit
-        new_positions[:], new_velocities[:] = positions, velocities
+        for g in range(count):
+            new_positions[g, 0], new_positions[g, 1] = positions[g, 0], positions[g, 1]
+            new_velocities[g, 0], new_velocities[g, 1] = velocities[g, 0], velocities[g, 1]
     results[STATUS], results[TILT] = status, tilt
 
 
 @compiled
-def _pairs_of(count):
-    """Memory for the near pairs of so many grains."""
-    room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
-    slots = (room + LANES - 1) // LANES * LANES
-    return Pairs(
-        np.empty((2, slots), np.uint32),
-        np.empty((2, slots)),
-        np.empty((3, slots), np.int32),
-        np.empty(2 * room, np.uint32),
-        np.empty(count + 1, np.uint32),
-        np.empty(max(9, 2 * count), np.int32),
-        np.empty(count, np.int32),
-    )
-
-
-@compiled
-def _network_of(count):
-    """Memory for the contacts of so many grains: contacts of discs form a planar graph, at most 3 N of them."""
-    size = 3 * count
-    return Network(
-        np.empty(size, np.uint32),
-        np.empty((2, size), np.uint32),
-        np.empty((5, size)),
-        np.empty(count, np.uint32),
-        np.zeros(count, np.int32),
-        np.zeros(count, np.int32),
-        np.zeros((count, 2)),
-    )
-
-
-@compiled
-def _clusters_of(count, turns):
-    """Memory for the clusters of so many grains, which changes ``turns`` too."""
-    size = 3 * count
-    parent = np.empty(count, np.uint32)
-    for g in range(count):
-        parent[g] = g
-    return Clusters(
-        np.empty(size, np.uint32),
-        np.empty(size + 1, np.uint32),
-        parent,
-        np.full(count, -1, np.int32),
-        np.empty((2, size), np.uint32),
-        np.empty((size, 9)),
-        np.empty((size, 5)),
-        turns,
-        np.empty((count, 3)),
-    )
-
-
-@compiled
-def _take_grains(positions, velocities, radii, masses, order, rate, grains):
+def _take_grains(positions, velocities, radii, masses, places, rate, grains):
     """Take the grains, with velocities of the laboratory; returns the largest diameter and whether all is finite."""
     motion, constants = grains.motion, grains.constants
     largest, finite = 0.0, True
-    for g in range(order.size):
-        given = order[g]
+    for g in range(places.size):
+        given = places[g]
         motion[g, X], motion[g, Y] = positions[given, 0], positions[given, 1]
         motion[g, VX], motion[g, VY] = velocities[given, 0] + rate * positions[given, 1], velocities[given, 1]
         constants[g, RADIUS], constants[g, INVERSE_MASS] = radii[given], 1 / masses[given]
@@ -309,10 +252,10 @@ def _move(t, grains):
 
 
 @compiled
-def _deliver(order, rate, grains, new_positions, new_velocities):
+def _deliver(places, rate, grains, new_positions, new_velocities):
     """Positions and peculiar velocities of the grains, in the order in which they were given."""
     motion = grains.motion
-    for g in range(order.size):
-        given = order[g]
+    for g in range(places.size):
+        given = places[g]
         new_positions[given, 0], new_positions[given, 1] = motion[g, X], motion[g, Y]
         new_velocities[given, 0], new_velocities[given, 1] = motion[g, VX] - rate * motion[g, Y], motion[g, VY]

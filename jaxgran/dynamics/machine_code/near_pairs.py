@@ -19,26 +19,25 @@ def skin_loss(fastest, rate, distance):
 
 
 @compiled
-def memory_order(positions, side, tilt):
-    """An order of the grains in which neighbours are close in memory: row by row, where a flow outgrows the caches."""
-    count = positions.shape[0]
-    order = np.empty(count, np.uint32)
-    across = max(1, int(side / _ROW_HEIGHT)) if count > _CACHED_GRAINS else 1
-    before = np.zeros(across * across + 1, np.int64)
-    cell = np.zeros(count, np.int64)
+def put_in_order(positions, side, tilt, order):
+    """Write an order that keeps neighbours close in memory: row by row, where a flow outgrows the caches."""
+    given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
+    across = int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
+    for c in range(across * across + 1):
+        starts[c] = 0
     for g in range(count):
+        cells[g] = 0
         if across > 1 and abs(positions[g, 0]) < math.inf and abs(positions[g, 1]) < math.inf:
             row = min(max(int(positions[g, 1] / side * across), 0), across - 1)
             fraction = (positions[g, 0] - tilt * positions[g, 1]) / side
             column = int((fraction - math.floor(fraction)) * across)
-            cell[g] = row * across + min(max(column, 0), across - 1)
-        before[cell[g] + 1] += 1
-    for c in range(before.size - 1):
-        before[c + 1] += before[c]
+            cells[g] = row * across + min(max(column, 0), across - 1)
+        starts[cells[g] + 1] += 1
+    for c in range(across * across):
+        starts[c + 1] += starts[c]
     for g in range(count):
-        order[before[cell[g]]] = g
-        before[cell[g]] += 1
-    return order
+        given[starts[cells[g]]] = g
+        starts[cells[g]] += 1
 
 
 @compiled

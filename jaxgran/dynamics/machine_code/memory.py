@@ -1,0 +1,139 @@
+"""The arrays of the machine code, cut from one block of memory.
+
+XLA provides the block with the results of a call. So the machine code never asks for memory, and needs nothing of the
+runtime of its compiler.
+"""
+
+# pyright: reportCallIssue=false
+# An intrinsic of numba is called without the context that it is defined with.
+
+from typing import Any, NamedTuple
+
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array, populate_array
+
+from jaxgran.dynamics.machine_code.compiled import compiled
+from jaxgran.dynamics.machine_code.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
+from jaxgran.dynamics.tally import NUMBERS
+
+_PAIR_CAPACITY = 16  # slots of pairs for each grain
+
+
+class Arrays(NamedTuple):
+    """All arrays of the time loop: see ``layout``; ``step_sums`` is (NUMBERS,)."""
+
+    grains: Any
+    pairs: Any
+    network: Any
+    clusters: Any
+    order: Any
+    step_sums: Any
+
+
+def _array_of(kind: types.Type) -> Any:
+    """A function of an address and a shape, for the array of this kind there; nobody counts its references."""
+
+    @intrinsic
+    def array(context, address, shape):
+        made = types.Array(kind, shape.count, "C")
+
+        def generate(context, builder, signature, arguments):
+            target = make_array(made)(context, builder)
+            size = context.get_abi_sizeof(context.get_data_type(kind))
+            sizes = cgutils.unpack_tuple(builder, arguments[1], shape.count)
+            strides = [cgutils.intp_t(size)]
+            for length in reversed(sizes[1:]):
+                strides.insert(0, builder.mul(strides[0], length))
+            data = builder.inttoptr(arguments[0], target.data.type)
+            populate_array(target, data, sizes, strides, cgutils.intp_t(size), None)
+            return target._getvalue()
+
+        return made(types.int64, types.UniTuple(types.intp, shape.count)), generate
+
+    return array
+
+
+integers, doubles = _array_of(types.int64), _array_of(types.float64)
+_signed, _unsigned = _array_of(types.int32), _array_of(types.uint32)
+
+
+@compiled
+def _part(memory, items, size):
+    """The address of a part for so many items of so many bytes; ``memory`` is (1,), the address of what is left."""
+    address = memory[0]
+    memory[0] += (items * size + 7) // 8 * 8
+    return address
+
+
+@compiled
+def _pairs_of(memory, count):
+    room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
+    slots, cells = (room + LANES - 1) // LANES * LANES, max(9, 2 * count)
+    return Pairs(
+        _unsigned(_part(memory, 2 * slots, 4), (2, slots)),
+        doubles(_part(memory, 2 * slots, 8), (2, slots)),
+        _signed(_part(memory, 3 * slots, 4), (3, slots)),
+        _unsigned(_part(memory, 2 * room, 4), (2 * room,)),
+        _unsigned(_part(memory, count + 1, 4), (count + 1,)),
+        _signed(_part(memory, cells, 4), (cells,)),
+        _signed(_part(memory, count, 4), (count,)),
+    )
+
+
+@compiled
+def _network_of(memory, count):
+    """Contacts of discs form a planar graph, so there are at most 3 N of them."""
+    size = 3 * count
+    return Network(
+        _unsigned(_part(memory, size, 4), (size,)),
+        _unsigned(_part(memory, 2 * size, 4), (2, size)),
+        doubles(_part(memory, 5 * size, 8), (5, size)),
+        _unsigned(_part(memory, count, 4), (count,)),
+        _signed(_part(memory, count, 4), (count,)),
+        _signed(_part(memory, count, 4), (count,)),
+        doubles(_part(memory, 2 * count, 8), (count, 2)),
+    )
+
+
+@compiled
+def _clusters_of(memory, count, turns):
+    """``turns`` is memory of others, which the solver may change."""
+    size = 3 * count
+    return Clusters(
+        _unsigned(_part(memory, size, 4), (size,)),
+        _unsigned(_part(memory, size + 1, 4), (size + 1,)),
+        _unsigned(_part(memory, count, 4), (count,)),
+        _signed(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, 2 * size, 4), (2, size)),
+        doubles(_part(memory, 9 * size, 8), (size, 9)),
+        doubles(_part(memory, 5 * size, 8), (size, 5)),
+        turns,
+        doubles(_part(memory, 3 * count, 8), (count, 3)),
+    )
+
+
+@compiled
+def arrays_of(memory, count):
+    """All arrays for so many grains, as they are before the first step, and whether the block has room for them.
+
+    ``memory`` is (1,), the address of a block of ``WORDS + WORDS_PER_GRAIN · count`` words.
+    """
+    end = memory[0] + 8 * (WORDS + WORDS_PER_GRAIN * count)
+    grains = Grains(doubles(_part(memory, 4 * count, 8), (count, 4)), doubles(_part(memory, 2 * count, 8), (count, 2)))
+    pairs, network = _pairs_of(memory, count), _network_of(memory, count)
+    clusters = _clusters_of(memory, count, network.kicks)  # the kicks are gathered after the solves
+    order = Order(
+        _unsigned(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, count + 2, 4), (count + 2,)),
+    )
+    step_sums = doubles(_part(memory, NUMBERS, 8), (NUMBERS,))
+    fits = memory[0] <= end
+    for g in range(count if fits else 0):
+        network.degree[g] = network.loaded[g] = 0
+        network.kicks[g, 0] = network.kicks[g, 1] = 0.0
+        clusters.parent[g] = g
+        clusters.number[g] = -1
+    return Arrays(grains, pairs, network, clusters, order, step_sums), fits
