@@ -104,17 +104,16 @@ def timed(compiled, flow: jg.ShearFlow, state: jg.State, strain: float) -> tuple
 
 
 def replicas(sizes: tuple[int, ...]) -> list[dict[str, float]]:
-    """Time of one batch against its number of replicas; the way of the backend (``lax.map`` on a CPU)."""
+    """Time of one batch against its number of replicas; the way of the backend (one after the other on a CPU)."""
     flow = jg.ShearFlow(64, *LARGE_FLOW, 1e-3)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=4.0)
     rows = []
     for size in sizes:
         flows, states = stack([flow] * size), jax.tree.map(lambda leaf, n=size: jnp.stack([leaf] * n), state)
-        compiled = advance_batch.lower(flows, states, jnp.full(size, 1, jnp.int32)).compile()
         steps = jnp.full(size, 1000, jnp.int32)
-        jax.block_until_ready(compiled(flows, states, steps // 10))
+        jax.block_until_ready(advance_batch(flows, states, steps // 10))
         start = time.process_time()
-        jax.block_until_ready(compiled(flows, states, steps))
+        jax.block_until_ready(advance_batch(flows, states, steps))
         seconds = time.process_time() - start
         rate = float(f"{1000 * size / seconds:.4g}")
         rows.append({"replicas": size, "cpu seconds": float(f"{seconds:.4g}"), "replica-steps per second": rate})

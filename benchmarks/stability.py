@@ -28,7 +28,7 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.observables import averages
-from jaxgran.sampling.steady_state import predicted
+from jaxgran.sampling.prediction import predicted
 
 RESTITUTIONS = (0.0, 0.5, 0.9)
 PACKING_FRACTIONS = (0.3, 0.5, 0.6, 0.7, 0.75, 0.8, 0.82, 0.83, 0.835, 0.84)

@@ -16,9 +16,7 @@ default γ̇ = 1).
 Importing this package is quick and changes no flag of JAX. Names are loaded when they are first used.
 """
 
-from importlib.metadata import version
-
 import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-__version__ = version("jaxgran")
+__version__ = "0.1.0"

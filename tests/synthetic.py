@@ -5,7 +5,7 @@ import numpy as np
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import Tally
-from jaxgran.maps.dataset import Replica
+from jaxgran.maps.replica import Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.grains import Grains

@@ -11,7 +11,7 @@ from benchmarks.run_chart import on_front
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack
-from jaxgran.sampling.steady_state import predicted
+from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import (
     automatic_timestep,
     automatic_tolerance,

@@ -16,7 +16,7 @@ from synthetic import one_sentence, random_replica
 from jaxgran.io.atomic import write_arrays
 from jaxgran.maps import checkpoint
 from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.dataset import Key, Replica
+from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status

@@ -8,8 +8,10 @@ import pytest
 import xarray as xr
 from synthetic import one_sentence, random_replica
 
-from jaxgran.maps.dataset import NOT_RUN, THEORY, Key, Replica, map_dataset
-from jaxgran.maps.results import check_output, read_dataset, write_dataset
+from jaxgran.maps.dataset import NOT_RUN, THEORY, map_dataset
+from jaxgran.maps.output import check_output
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.results import read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS

@@ -151,7 +151,7 @@ def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
         assert jg.advance(flow, flowing(0.7), STEPS) == (flow, flowing(0.7), STEPS, True, None, False)
 
 
-def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing, monkeypatch) -> None:
+def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) -> None:
     states = jax.tree.map(lambda x: jnp.stack([x, x]), flowing(0.7))
     found = {}
 
@@ -159,9 +159,8 @@ def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing, mo
         found[flow.engine] = in_batch()
         return state, empty_tally(state.side.dtype)
 
-    monkeypatch.setattr(batch, "advance", notes)
     for engine in ("auto", "machine_code", "jax"):
-        batch.advance_batch.__wrapped__(stack([of(engine)] * 2), states, jnp.ones(2, jnp.int32))
+        batch.batch_program(notes)(stack([of(engine)] * 2), states, jnp.ones(2, jnp.int32))
     assert found == {"auto": False, "machine_code": False, "jax": True}
 
 

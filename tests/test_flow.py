@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxgran.model.checks import InputError
-from jaxgran.model.flow import MAX_PACKING_FRACTION, MIN_GRAINS, ShearFlow, require_sheared
+from jaxgran.model.choices import MAX_PACKING_FRACTION, MIN_GRAINS
+from jaxgran.model.flow import ShearFlow, require_sheared
 
 FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
 NUMBERS = (

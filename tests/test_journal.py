@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import monitoring
 from synthetic import random_tally
 
 from jaxgran.io.atomic import Damaged, read_arrays
@@ -137,6 +138,13 @@ def test_a_batch_goes_on_from_its_journal_without_compiling_anew(whole, tmp_path
     path = tmp_path / "batch.nc"
     with pytest.raises(CutOff):
         measured(Journal(path, KEYS, cut_after(advance_batch, 5), seconds=0))
-    compiled = advance_batch._cache_size()
+    compiled: list[str] = []
+
+    def listen(event: str, seconds: float, **_) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(event)
+
+    monitoring.register_event_duration_secs_listener(listen)
     measured(Journal(path, KEYS, advance_batch, seconds=0))
-    assert advance_batch._cache_size() == compiled
+    monitoring.unregister_event_duration_listener(listen)
+    assert compiled == []

@@ -21,7 +21,8 @@ from jaxgran.model.grains import Grains, own_grains, polydisperse
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.packing import pack, require_room
-from jaxgran.sampling.steady_state import _classes, heated, predicted, prepare
+from jaxgran.sampling.prediction import _classes, predicted
+from jaxgran.sampling.steady_state import heated, prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
 GRAINS = pytest.GRAINS

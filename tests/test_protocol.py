@@ -16,8 +16,9 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling import steady_state, timestep
 from jaxgran.sampling.batch import advance_batch, reporting, stack
+from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import relative_error
-from jaxgran.sampling.steady_state import Batch, predicted, prepare, prepare_batch, sample_batch
+from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
 from jaxgran.sampling.timestep import check_timestep
 
 GRAINS, TIMESTEP = 64, 1e-2
@@ -205,7 +206,7 @@ def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identical(batch) -> None:
-    velocities = batch.state.velocities.at[1, 5, 0].set(jnp.nan)
+    velocities = jnp.asarray(batch.state.velocities).at[1, 5, 0].set(jnp.nan)
     broken = batch._replace(state=replace(batch.state, velocities=velocities))
     end, measured = sample_batch(batch, strain=1.6)
     broken_end, broken_measured = sample_batch(broken, strain=1.6)

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from synthetic import random_replica
 
 from jaxgran.maps import sweep
-from jaxgran.maps.dataset import Key, Replica, map_dataset
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.sweep import predicted_cost, ratio_map, replicas
 from jaxgran.model.flow import ShearFlow

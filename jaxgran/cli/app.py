@@ -2,7 +2,6 @@
 
 import os
 import sys
-from importlib.metadata import version
 from typing import Annotated
 
 import typer
@@ -10,6 +9,7 @@ import typer
 # XLA logs a long error if a cached program was compiled with tuning hints. The variable must be set before JAX loads.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
+import jaxgran
 from jaxgran.cli.arguments import examples
 from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
@@ -44,12 +44,12 @@ for name, (command, short_help, command_examples) in COMMANDS.items():
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"jaxgran {version('jaxgran')}")
+        print(f"jaxgran {jaxgran.__version__}")
         raise typer.Exit
 
 
 @app.callback()
-def jaxgran(
+def command_line(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,

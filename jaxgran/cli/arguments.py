@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.flow import MAX_REPLICAS
+from jaxgran.model.choices import MAX_REPLICAS
 
 FIRST_STRAIN = 4.0  # of samples that are extended until their errors are small
 

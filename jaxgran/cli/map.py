@@ -13,7 +13,7 @@ from jaxgran.cli.measure import by_timestep, finish, measured
 from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.flow import Activation, Engine, Solver
+from jaxgran.model.choices import Activation, Engine, Solver
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",

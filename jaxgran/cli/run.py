@@ -14,7 +14,7 @@ from jaxgran.cli.measure import finish, measured
 from jaxgran.cli.progress import counted
 from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
 from jaxgran.model.checks import InputError, require_number, shown
-from jaxgran.model.flow import Engine
+from jaxgran.model.choices import Engine
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 

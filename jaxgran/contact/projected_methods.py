@@ -36,7 +36,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.delassus import count_bound, diagonal, spectral_bound
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.contact.network import Contacts
-from jaxgran.model.flow import Solver
+from jaxgran.model.choices import Solver
 
 
 class Iterate(NamedTuple):

@@ -32,8 +32,8 @@ from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import METHODS, Iterate, dot
+from jaxgran.model.choices import Solver
 from jaxgran.model.control_flow import any_replica, where_active
-from jaxgran.model.flow import Solver
 from jaxgran.model.status import Status
 
 _DERIVATIVE_TOLERANCE, _WORST_DERIVATIVE = 1e-12, 1e-6  # relative residuals; a derivative above the latter is NaN

@@ -81,18 +81,26 @@ def _advance_jvp(
     return jax.jvp(plain_module.advance, primals, tangents)
 
 
-def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica with the machine code."""
-    from jaxgran.dynamics.machine_code import ffi, layout
+def register_machine_code() -> None:
+    """Tell XLA where the machine code is, which is compiled at its first use."""
+    from jaxgran.dynamics.machine_code import ffi
 
     ffi.register()
+
+
+def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica with the machine code."""
+    from jaxgran.dynamics.machine_code import layout
+    from jaxgran.dynamics.machine_code.ffi import TARGET
+
+    register_machine_code()
     dtype, grains = state.positions.dtype, state.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
     numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps)
     memory = layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains
     shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    call = jax.ffi.ffi_call(ffi.TARGET, results, vmap_method="sequential")
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
     positions, velocities, found, _ = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
     status, tilt = found[layout.STATUS], found[layout.TILT]

@@ -22,8 +22,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxgran.model.checks import InputError
+from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS, in_batch
-from jaxgran.model.flow import Engine, ShearFlow
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads

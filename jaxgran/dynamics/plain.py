@@ -29,8 +29,9 @@ from jaxgran.dynamics.flight import LONGEST_FLIGHT, Carry, add_flight, fly, fres
 from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.checks import require_number, require_whole
+from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica, where_active
-from jaxgran.model.flow import MAX_STEPS, ShearFlow
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, kinetic_energy, relative_momentum, require_state, status_if_finite
 from jaxgran.model.status import Status

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.model.checks import InputError, require, require_number, shown
-from jaxgran.model.flow import MAX_PACKING_FRACTION
+from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.steady_shear import Scalar
 

@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, broadcast, excess_terms, require_jamming, stress_terms
 from jaxgran.maps.schema import require_map
 from jaxgran.model.checks import InputError
-from jaxgran.model.flow import MAX_PACKING_FRACTION
+from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
 from jaxgran.sampling.timestep import JAMMING
 from jaxgran.theory.gaussian_moments import gaussian_moments

@@ -26,7 +26,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.plain import advance
 from jaxgran.model.checks import InputError, require_number, shown
-from jaxgran.model.flow import MAX_STEPS, ShearFlow
+from jaxgran.model.choices import MAX_STEPS
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from jaxgran.model.checks import InputError, shown
@@ -71,6 +70,8 @@ def replaced(path: Path) -> Iterator[Path]:
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
     """Write named arrays, and a JSON-compatible description of them, as an HDF5 file with a checksum."""
+    import h5py  # here, as workers without a checkpoint do not need it
+
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
         for name, array in arrays.items():
@@ -84,6 +85,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     """The arrays and the description that ``write_arrays`` wrote; raises ``Damaged`` for any other content."""
+    import h5py
+
     try:
         file_bytes = path.read_bytes()
     except OSError as error:

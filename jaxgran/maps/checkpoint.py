@@ -28,7 +28,7 @@ import numpy as np
 
 from jaxgran.dynamics.tally import flat_tally, tally_from_flat
 from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
-from jaxgran.maps.dataset import Key, Replica
+from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.sample import Sample

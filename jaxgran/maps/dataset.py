@@ -5,24 +5,23 @@ import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
 
 from jaxgran import environment
 from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
-from jaxgran.sampling.sample import Sample, correlation_strains, estimates
-from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.sampling.prediction import kinetic_theory
+from jaxgran.sampling.sample import correlation_strains, estimates
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1  # status of a replica without a result
-Key = tuple[int, int]  # number of the point, in the order of ``MapSettings.flows``; seed
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
 _AXES = {
@@ -30,14 +29,6 @@ _AXES = {
     "packing_fraction": {"long_name": "packing fraction", "units": "1"},
     "restitution": {"long_name": "restitution", "units": "1"},
 }
-
-
-class Replica(NamedTuple):
-    """Result of one replica: its sample, its worst status, and its strain before the sample."""
-
-    sample: Sample
-    status: int
-    strain: float
 
 
 def map_dataset(
@@ -156,10 +147,9 @@ def map_dataset(
 def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
     """Prediction of kinetic theory at every point; NaN where it has no steady state, as at α = 1."""
     flows = stack(settings.flows())
-    numbers = flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity
-    theory = jax.vmap(gaussian_moments)(*numbers)
+    theory = kinetic_theory(flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity)
     with np.errstate(invalid="ignore"):
-        values = {name: np.asarray(getattr(theory, name)) for name in THEORY}
+        values = {name: getattr(theory, name) for name in THEORY}
         return {name: np.where(np.isfinite(x) & (x < 1e12), x, np.nan) for name, x in values.items()}
 
 

@@ -1,4 +1,4 @@
-"""The file of a map: its path is checked before the run; then it is written, read and compared."""
+"""The file of a map: it is written, read and compared."""
 
 import os
 from dataclasses import fields
@@ -10,24 +10,11 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from jaxgran.io.atomic import replaced, require_place
+from jaxgran.io.atomic import replaced
 from jaxgran.maps.dataset import made_with
 from jaxgran.maps.schema import RATIO, what_lacks
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError, shown
-
-PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
-
-
-def check_output(path: Path) -> None:
-    """Raise an InputError if a dataset cannot be written to ``path``."""
-    require_place(path, "output", ".nc")
-    for file in (path.with_name(f"{path.stem}_{name}.png") for name in PICTURES):
-        if os.path.isdir(file):
-            raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    if unfinished.exists() and not unfinished.is_dir():
-        raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")
 
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:

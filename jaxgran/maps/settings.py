@@ -10,9 +10,10 @@ import numpy as np
 
 from jaxgran.dynamics.engine import select_engine
 from jaxgran.model.checks import InputError, require_number, require_whole, shown, two_digits
-from jaxgran.model.flow import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, ShearFlow, Solver
+from jaxgran.model.choices import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, Solver
+from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
-from jaxgran.sampling.steady_state import predicted
+from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
 _FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks

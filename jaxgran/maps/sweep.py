@@ -13,26 +13,31 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
+from jaxtyping import Array, UInt32
 
 from jaxgran.io.atomic import Damaged
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
-from jaxgran.maps.dataset import Key, Replica, map_dataset
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.pool import Died, run_tasks, send
+from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.flow import MAX_REPLICAS, Activation, Engine, ShearFlow, Solver
+from jaxgran.model.choices import MAX_REPLICAS, Activation, Engine, Solver
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
+from jaxgran.programs import kept_jit
 from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, in_lockstep, reporting, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
 _SEARCH_BYTES = 48  # memory for each pair of grains, in a search that compares all pairs
@@ -61,7 +66,7 @@ def ratio_map(
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
     report: Report | None = None,
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with standard errors.
 
     Args:
@@ -129,6 +134,8 @@ def ratio_map(
         "replica_steps_per_second": done / seconds,
         "workers": workers,
     }
+    from jaxgran.maps.dataset import map_dataset  # here, so that workers need not load xarray
+
     return map_dataset(settings, results, run)
 
 
@@ -309,15 +316,20 @@ def _retried(
     return [(key, second[key] if key in second and second[key].status < first.status else first) for key, first in done]
 
 
+@kept_jit
+def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
+    """The random key of a replica, as numbers; another one for its second run."""
+    key = jax.random.fold_in(jax.random.key(seed), point)
+    return jax.random.key_data(jnp.where(refinement > 1, jax.random.fold_in(key, refinement), key))
+
+
 def _measured(
     settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1, record: Wrap | None = None
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
-    keys = jnp.stack([jax.random.fold_in(jax.random.key(seed), point) for point, seed in task])
-    if refinement > 1:
-        keys = jax.vmap(jax.random.fold_in, (0, None))(keys, refinement)
+    keys = jnp.asarray(np.stack([_key(seed, point, refinement) for point, seed in task]))
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     strain_before = batch.strain
     error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)

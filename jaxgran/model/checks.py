@@ -3,9 +3,7 @@
 from reprlib import Repr
 from typing import Any
 
-import jax
 import numpy as np
-from jax.core import Tracer
 
 
 class InputError(ValueError):
@@ -17,10 +15,15 @@ def known(value: Any) -> np.ndarray | None:
 
     What is neither a number nor an array of numbers becomes ``array(None)``, which no check accepts.
     """
+    if isinstance(value, (bool, int, float)):
+        return np.asarray(value)
+    import jax  # here, so that the command line checks its options without it
+    from jax.core import Tracer
+
     if isinstance(value, Tracer):
         return None
     key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
-    number = isinstance(value, (bool, int, float, np.generic, np.ndarray, jax.Array)) and not key
+    number = isinstance(value, (np.generic, np.ndarray, jax.Array)) and not key
     number = number and not isinstance(value, np.ma.MaskedArray)  # masked values have no meaning
     return np.asarray(value if number else None)
 
@@ -76,6 +79,8 @@ def require_whole(name: str, value: Any, least: int, most: int, why: str) -> Non
 
 def require_key(key: Any) -> None:
     """Raise an InputError unless this is a single JAX random key."""
+    import jax
+
     typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
     raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
     if not typed and not raw:

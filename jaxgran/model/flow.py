@@ -2,25 +2,23 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
 from jaxgran.model.checks import InputError, known, require, require_number, require_whole, shown
+from jaxgran.model.choices import (
+    MAX_GRAINS,
+    MAX_PACKING_FRACTION,
+    MAX_STEPS,
+    MIN_GRAINS,
+    Activation,
+    Engine,
+    Solver,
+)
 from jaxgran.model.display import Row, display_methods
-
-Activation = Literal["midpoint", "touching"]
-Engine = Literal["auto", "machine_code", "jax", "thread_block"]
-Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
-
-MAX_PACKING_FRACTION = 0.83
-MIN_GRAINS = 16
-MAX_GRAINS = 10**7  # more need over 20 GB of memory
-MAX_REPLICAS = 10**6  # of one map
-MAX_STEPS = 2**31 - 1  # of one sample: an int32 counts the steps
-SHORTEST_TIMESTEP = 1e-8  # 1/γ̇; the longest block of a run then has fewer than MAX_STEPS steps
 
 _STATIC = {"static": True}
 _UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxgran.model.checks import InputError, listed, require, require_key, require_number, require_whole, shown
-from jaxgran.model.flow import MAX_GRAINS
+from jaxgran.model.choices import MAX_GRAINS
 
 _POSITIVE = "a list of positive numbers"
 _LARGEST_VALUE = 1e30  # of a diameter or a mass; their sums stay finite in float32

@@ -8,19 +8,21 @@ its share of the replicas. Devices wait for each other only at the end of a call
 """
 
 from collections.abc import Callable
+from functools import wraps
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
-from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.advance import advance, register_machine_code
 from jaxgran.dynamics.tally import Tally
+from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS
-from jaxgran.model.flow import Engine, ShearFlow
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
+from jaxgran.programs import kept_jit
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
 Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
@@ -31,11 +33,12 @@ _DEVICES = "devices"
 def stack(flows: list[ShearFlow]) -> ShearFlow:
     """The flows as one batch: a ShearFlow whose numbers have a leading (replicas,) axis."""
 
-    def joined(path, *values) -> Array:
+    def joined(path, *values) -> np.ndarray:
         numbers = np.stack([np.asarray(value) for value in values])
         if path[-1].name == "max_iterations":
-            return jnp.asarray(numbers, jnp.int32)
-        return jnp.asarray(numbers, None if numbers.dtype.kind == "f" else float)
+            return numbers.astype(np.int32)
+        kind = numbers.dtype if numbers.dtype.kind == "f" else np.dtype(float)
+        return numbers.astype(jax.dtypes.canonicalize_dtype(kind))
 
     return jax.tree_util.tree_map_with_path(joined, *flows)
 
@@ -86,10 +89,37 @@ def _on_all_devices(batched: Callable) -> Callable:
     return on_all_devices
 
 
-@jax.jit
-def advance_batch(flow: ShearFlow, state: State, steps: Int[Array, " replicas"]) -> tuple[State, Tally]:
-    """Advance every replica of a batch by its own number of steps: the plain ``Drive``."""
-    return replicated(advance, flow.engine)(flow, state, steps)
+def batch_program(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
+    """The compiled function of one replica for a batch; its first argument is the flow.
+
+    Replicas that advance in turn are calls of one program, whose shapes do not depend on the size of the batch. For
+    ``register`` see ``kept_jit``.
+    """
+
+    @wraps(function)
+    def replicated_function(flow, *arguments):
+        return replicated(function, flow.engine)(flow, *arguments)
+
+    together, in_turn = kept_jit(replicated_function, register), kept_jit(function, register)
+
+    @wraps(function)
+    def program(flow, *arguments):
+        if in_lockstep(flow.engine) or jax.device_count() > 1:
+            return together(flow, *arguments)
+        batch = jax.tree.map(_on_host, (flow, *arguments))
+        replicas = range(len(jax.tree.leaves(batch)[0]))
+        results = [in_turn(*jax.tree.map(lambda x, k=k: x[k], batch)) for k in replicas]
+        return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *results)
+
+    return program
+
+
+def _on_host(array: Array) -> Array | np.ndarray:
+    """The array in memory of the host, where the numbers of a replica are cheap to take; random keys stay with JAX."""
+    return array if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else np.asarray(array)
+
+
+advance_batch: Drive = batch_program(advance, register_machine_code)  # the plain one
 
 
 def reporting(drive: Drive, report: Report | None) -> Drive:

@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, listed, require, two_digits
-from jaxgran.model.flow import MAX_STEPS, ShearFlow
+from jaxgran.model.choices import MAX_STEPS
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, require_state
 
 _LARGEST_CROSSING = 0.1  # largest motion in one step of a grain of thermal speed, in its diameters

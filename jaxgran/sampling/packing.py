@@ -97,7 +97,10 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
         now = lax.cond(any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now)
         return where_active(active, _fire_step(now, inflated, side, allowed), now)
 
-    end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, start(jnp.int32(0)))
+    # the loop makes the first start too: compiled once, the search for pairs is half of this program
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, jnp.int32(0)))
+    before = nothing._replace(overlap=jnp.full_like(side, jnp.inf), iterations=jnp.int32(_ITERATIONS))
+    end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, before)
     positions, tilt = present(end.neighbours, side)
     found = end.overlap < allowed
     fit = found if generated else found & (widest_skin(grains, side) > 0)

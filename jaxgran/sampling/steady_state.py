@@ -12,7 +12,7 @@ differ by less than twice the standard error of the difference, or by less than 
 
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise, zip_longest
+from itertools import zip_longest
 from typing import NamedTuple
 
 import jax
@@ -26,13 +26,13 @@ from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import Drive, advance_batch, replicated, stack
+from jaxgran.sampling.batch import Drive, advance_batch, batch_program, stack
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
+from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.sampling.timestep import COARSE_TIMESTEP, bounded_coarse_timestep, check_timestep, timestep_ladder
 from jaxgran.statistics import drift
-from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 from jaxgran.theory.steady_shear import SteadyShear
 
 RELAXATION_STRAIN = 0.5  # strain at the final time step before the sample
@@ -48,8 +48,6 @@ _LARGEST_SAMPLE_RATIO = 4.0  # a sample drifts if it exceeds this ratio of drift
 _LARGEST_SAMPLE_DRIFT = 0.2  # and this drift in ln T or ln P
 _CLUSTER_STRAIN = 1.0  # over which the clusters of a dissipative flow move; blocks within it are correlated
 _DRIFT_BLOCKS = 16  # blocks of a sample in the test for a drift
-_SIZE_CLASSES = 8  # of given grains, for kinetic theory
-_LARGEST_RESTITUTION = 0.99  # for kinetic theory, whose temperature diverges at α = 1
 
 
 class Batch(NamedTuple):
@@ -89,7 +87,7 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grain
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
-    return jax.tree.map(lambda x: x[0], batch.state)
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), batch.state)
 
 
 def prepare_batch(
@@ -154,27 +152,6 @@ def sample_batch(
     return batch._replace(status=np.maximum(status, tally.status.max(axis=1))), sample
 
 
-@jax.jit
-def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
-    """Prediction of kinetic theory for every flow of a batch, with α at most 0.99, since T diverges at α = 1.
-
-    Given grains are taken as a mixture of eight classes, sorted by diameter and then by mass.
-    """
-    alpha = jnp.minimum(flow.restitution, _LARGEST_RESTITUTION)
-    if grains is None:
-        return jax.vmap(gaussian_moments)(alpha, flow.packing_fraction, flow.shear_rate, flow.polydispersity)
-    return jax.vmap(mixture_moments)(alpha, flow.packing_fraction, flow.shear_rate, *jax.vmap(_classes)(grains))
-
-
-def _classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
-    """Mean diameters and masses of classes of equal numbers of grains, sorted by diameter and then by mass."""
-    order = jnp.lexsort((grains.masses, grains.radii))
-    edges = np.arange(_SIZE_CLASSES + 1) * order.size // _SIZE_CLASSES
-    members = [order[first:last] for first, last in pairwise(edges)]
-    diameters = jnp.stack([2 * jnp.mean(grains.radii[one]) for one in members])
-    return diameters / jnp.mean(diameters), jnp.stack([jnp.mean(grains.masses[one]) for one in members])
-
-
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
     """A random packing with Gaussian velocities of a given granular temperature.
 
@@ -197,7 +174,7 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     state, found = _heated(stack([flow]), key[None], jnp.asarray([temperature], float), _as_batch(flow, grains))
     if not found[0]:
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
-    return jax.tree.map(lambda x: x[0], state)
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), state)
 
 
 def _as_batch(flow: ShearFlow, grains: Grains | None) -> Grains | None:
@@ -208,22 +185,21 @@ def _as_batch(flow: ShearFlow, grains: Grains | None) -> Grains | None:
     return jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
 
 
-@jax.jit
-def _heated(
-    flow: ShearFlow, keys: Array, temperature: Array, grains: Grains | None = None
-) -> tuple[State, Bool[Array, " replicas"]]:
-    """Packings with Gaussian velocities of the given temperatures and no total momentum; False where none was found."""
+def _heated_replica(
+    flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None = None
+) -> tuple[State, Bool[Array, ""]]:
+    """A packing with Gaussian velocities of a given temperature and no total momentum; False if none was found."""
+    key = jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key
+    pack_key, heat_key = jax.random.split(key)
+    state, found = pack(flow, pack_key, grains)
+    masses = state.grains.masses[:, None]
+    velocities = jax.random.normal(heat_key, state.positions.shape, masses.dtype) / jnp.sqrt(masses)
+    velocities = velocities - jnp.sum(masses * velocities, axis=0, keepdims=True) / jnp.sum(masses)
+    drawn = jnp.sum(masses * velocities**2) / (2 * flow.grains)
+    return replace(state, velocities=velocities * jnp.sqrt(temperature / drawn)), found
 
-    def one(flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None):
-        pack_key, heat_key = jax.random.split(key)
-        state, found = pack(flow, pack_key, grains)
-        masses = state.grains.masses[:, None]
-        velocities = jax.random.normal(heat_key, state.positions.shape, masses.dtype) / jnp.sqrt(masses)
-        velocities = velocities - jnp.sum(masses * velocities, axis=0, keepdims=True) / jnp.sum(masses)
-        drawn = jnp.sum(masses * velocities**2) / (2 * flow.grains)
-        return replace(state, velocities=velocities * jnp.sqrt(temperature / drawn)), found
 
-    return replicated(one)(flow, keys, temperature, grains)
+_heated = batch_program(_heated_replica)
 
 
 def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally]:

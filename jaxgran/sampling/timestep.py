@@ -13,13 +13,12 @@ restitution. The numbers here are bounds on what ``python -m benchmarks stabilit
 speed_vs_accuracy`` find for this size distribution. They serve to choose a time step and are not results.
 """
 
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array
 
 from jaxgran.model.checks import InputError, two_digits
-from jaxgran.model.flow import SHORTEST_TIMESTEP, Activation, ShearFlow
+from jaxgran.model.choices import SHORTEST_TIMESTEP, Activation
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.theory.steady_shear import SteadyShear
@@ -112,13 +111,14 @@ def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
 
 def bounded_coarse_timestep(
     flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
-) -> Array:
+) -> np.ndarray:
     """The coarse time step of each flow, in t: short enough for its thermal speed, and not shorter than its own step.
 
     ``longest`` is in 1/γ̇.
     """
     coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
-    return jnp.maximum(jnp.asarray(coarse, jnp.asarray(flow.timestep).dtype), flow.timestep)
+    timestep = np.asarray(flow.timestep)
+    return np.maximum(coarse.astype(timestep.dtype), timestep)
 
 
 def timestep_ladder(coarse: np.ndarray, final: np.ndarray) -> list[float]:

@@ -260,4 +260,26 @@ def _dense_linear_solve(linear, target):
     """Solve `linear(x) = target` by forming the matrix, which has at most a few dozen columns."""
     columns = jax.vmap(linear)(jnp.eye(target.size, dtype=target.dtype).reshape(-1, *target.shape))
     matrix = columns.reshape(target.size, target.size).T
-    return jnp.linalg.solve(matrix, target.reshape(-1)).reshape(target.shape)
+    solution = jax.lax.custom_linear_solve(
+        partial(jnp.matmul, matrix),
+        target.reshape(-1),
+        lambda _, side: _eliminated(matrix, side),
+        lambda _, side: _eliminated(matrix.T, side),
+    )
+    return solution.reshape(target.shape)
+
+
+def _eliminated(matrix: Float[Array, "n n"], side: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solution of a linear system by Gauss-Jordan elimination with partial pivoting.
+
+    For a dozen unknowns it replaces LAPACK, which JAX would load from SciPy in half a second.
+    """
+    places = jnp.arange(side.size)
+
+    def eliminate(k: Array, rows: Array) -> Array:
+        best = jnp.argmax(jnp.where(places < k, -1, jnp.abs(rows[:, k])))
+        pivot = (rows[best] / rows[best, k])[None, :]
+        rows = rows.at[best].set(rows[k])
+        return jnp.where((places == k)[:, None], pivot, rows - rows[:, k, None] * pivot)
+
+    return jax.lax.fori_loop(0, side.size, eliminate, jnp.concatenate([matrix, side[:, None]], axis=1))[:, -1]

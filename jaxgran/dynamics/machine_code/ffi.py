@@ -5,13 +5,11 @@ and the processor. So a change in any of them compiles anew, in a user's cache a
 without the compiler. If the cache cannot be written, every process compiles, with a warning.
 """
 
-import ast
 import ctypes
 import hashlib
 import os
-import tempfile
+import re
 import warnings
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,9 +18,11 @@ import jax
 from llvmlite import binding as llvm
 from platformdirs import user_cache_path
 
+from jaxgran.cache_files import keep, read_kept
+
 TARGET = "jaxgran_advance"
-_KEPT = 8  # versions of the machine code in the cache
-_DIGEST = 32  # bytes before the content of a kept file: its hash, so that a damaged file is not run
+_MOST_KEPT = 8  # versions of the machine code in the cache
+_IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
 
@@ -34,11 +34,10 @@ def sources() -> list[Path]:
         path = left.pop()
         if path not in found:
             found.add(path)
-            for node in ast.walk(ast.parse(path.read_bytes())):
-                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(f"{package.name}."):
-                    place = package.joinpath(*(node.module or "").split(".")[1:])
-                    names = [place, *(place / name.name for name in node.names)]
-                    left += [file for name in names if (file := name.with_suffix(".py")).is_file()]
+            for module, names in _IMPORTS.findall(path.read_text(encoding="utf-8")):
+                place = package.joinpath(*module.split("."))
+                files = [place, *(place / name for name in re.findall(r"\w+", names))]
+                left += [file for name in files if (file := name.with_suffix(".py")).is_file()]
     return sorted(found)
 
 
@@ -61,12 +60,20 @@ def register() -> None:
     target = llvm.Target.from_default_triple()
     machine = target.create_target_machine(cpu=processor, features=features, opt=3, jit=True)
     path = object_file()
-    content = _kept(path)
+    content = read_kept(path)
     if content is None:
         from jaxgran.dynamics.machine_code.handler import object_code
 
         content = object_code(TARGET, machine)
-        _keep(path, content)
+        try:
+            keep(path, content, _MOST_KEPT)
+        except OSError as error:
+            warnings.warn(
+                f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
+                f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
+                "one that can.",
+                stacklevel=2,
+            )
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
@@ -77,33 +84,3 @@ def register() -> None:
 
 
 _ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the machine code
-
-
-def _kept(path: Path) -> bytes | None:
-    """The content of a kept file; None if there is none, or if it is damaged."""
-    with suppress(OSError):
-        text = path.read_bytes()
-        if hashlib.sha256(text[_DIGEST:]).digest() == text[:_DIGEST]:
-            return text[_DIGEST:]
-    return None
-
-
-def _keep(path: Path, content: bytes) -> None:
-    """Write a file in one step, and remove the oldest versions beside it; a warning if that cannot be."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(hashlib.sha256(content).digest() + content)
-        os.replace(file.name, path)
-    except OSError as error:
-        warnings.warn(
-            f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
-            f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to one "
-            "that can.",
-            stacklevel=2,
-        )
-        return
-    with suppress(OSError):
-        versions = sorted(path.parent.glob("*.o"), key=lambda one: one.stat().st_mtime, reverse=True)
-        for old in versions[_KEPT:]:
-            old.unlink(missing_ok=True)

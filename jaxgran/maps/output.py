@@ -1,0 +1,20 @@
+"""Where a map is written: its path is checked before the run."""
+
+import os
+from pathlib import Path
+
+from jaxgran.io.atomic import require_place
+from jaxgran.model.checks import InputError
+
+PICTURES = ("curves", "contours", "timestep", "theory", "clusters", "rheology")
+
+
+def check_output(path: Path) -> None:
+    """Raise an InputError if a dataset cannot be written to ``path``."""
+    require_place(path, "output", ".nc")
+    for file in (path.with_name(f"{path.stem}_{name}.png") for name in PICTURES):
+        if os.path.isdir(file):
+            raise InputError(f"output must be a file, and {str(file)!r} is a folder.")
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    if unfinished.exists() and not unfinished.is_dir():
+        raise InputError(f"output must leave {str(unfinished)!r} to an unfinished map, and there is a file.")

@@ -1,0 +1,15 @@
+"""The result of one replica of a map."""
+
+from typing import NamedTuple
+
+from jaxgran.sampling.sample import Sample
+
+Key = tuple[int, int]  # number of the point, in the order of ``MapSettings.flows``; seed
+
+
+class Replica(NamedTuple):
+    """Result of one replica: its sample, its worst status, and its strain before the sample."""
+
+    sample: Sample
+    status: int
+    strain: float

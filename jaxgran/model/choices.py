@@ -1,0 +1,14 @@
+"""What a user can choose, and the limits of numbers: names and numbers that need no other module."""
+
+from typing import Literal
+
+Activation = Literal["midpoint", "touching"]
+Engine = Literal["auto", "machine_code", "jax", "thread_block"]
+Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
+
+MAX_PACKING_FRACTION = 0.83
+MIN_GRAINS = 16
+MAX_GRAINS = 10**7  # more need over 20 GB of memory
+MAX_REPLICAS = 10**6  # of one map
+MAX_STEPS = 2**31 - 1  # of one sample: an int32 counts the steps
+SHORTEST_TIMESTEP = 1e-8  # 1/γ̇; the longest block of a run then has fewer than MAX_STEPS steps
