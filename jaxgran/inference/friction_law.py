@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import xarray as xr
-from scipy.optimize import curve_fit
 
 from jaxgran.maps.schema import require_map
 from jaxgran.model.checks import InputError, require_number
@@ -172,6 +171,8 @@ def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
 
 def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float) -> PowerLaw:
     """Return the law through points with errors in both coordinates; its coefficient has the given sign."""
+    from scipy.optimize import curve_fit  # here, as loading it takes longer than a figure
+
     low, high = ([-np.inf, 0.0, _EXPONENTS[0]], [np.inf, np.inf, _EXPONENTS[1]])
     scale = x.max()  # unit of the inertial number in the fit, so that coefficient and offset are of similar size
     parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error

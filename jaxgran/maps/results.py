@@ -11,9 +11,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.io.atomic import replaced
-from jaxgran.maps.dataset import made_with
 from jaxgran.maps.schema import RATIO, what_lacks
-from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError, shown
 
 
@@ -48,6 +46,8 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
 
     Engine and solver are those of the settings. Older files have no engine, and one name of a solver.
     """
+    from jaxgran.maps.settings import MapSettings  # here, so that figures are drawn without loading JAX
+
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
@@ -68,6 +68,8 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
 
 def differences(data: xr.Dataset) -> list[str]:
     """Differences between the versions, device and precision of a dataset and of this process, in words."""
+    from jaxgran.maps.dataset import made_with
+
     here = made_with()
     names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
     return [

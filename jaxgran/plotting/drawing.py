@@ -206,6 +206,14 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def fix_layout(figure: Figure) -> None:
+    """Place all parts of a finished figure, once, so that distances on the page are known."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+
+
 def scientific(value: float) -> str:
     """Return a number as mathematical text, for example 3 × 10⁻⁴."""
     mantissa, exponent = f"{value:.2e}".split("e")

@@ -48,6 +48,7 @@ from jaxgran.plotting.drawing import (
     empty_figure,
     finest,
     finish,
+    fix_layout,
     missing_note,
     ordered,
     padded,
@@ -131,7 +132,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     absent = [level for level in EXCESS_LEVELS if level not in lines]
     notes = [_contour_note(absent), status_note(data), missing_note(measured, " (hatched)")]
     finish(figure, data, measured, notes)
-    figure.canvas.draw()
+    fix_layout(figure)
     label_contours(axes, [(f"{level:.2f}", line) for level, line in lines.items()])
     return figure
 

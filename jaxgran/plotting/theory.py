@@ -40,6 +40,7 @@ from jaxgran.plotting.drawing import (
     empty_figure,
     finest,
     finish,
+    fix_layout,
     is_plane,
     mark_bad,
     missing_note,
@@ -171,7 +172,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
         )
     add_plane_legend(figure, data, measured, entries)
     finish(figure, data, measured, [_THEORY_NOTE, status_note(data), missing_note(measured, " (hatched)")])
-    figure.canvas.draw()
+    fix_layout(figure)
     for axes, lines, over in panels:
         label_contours(axes, list(lines.items()), over, room=4.0)
     return figure
@@ -244,7 +245,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     _add_share_legend(figure, data)
     beyond = f"{left_out} of {measured.size} points have an excess too small for its axis" if left_out else ""
     finish(figure, data, measured, [_CLUSTER_NOTE, beyond, status_note(data), missing_note(measured)])
-    figure.canvas.draw()
+    fix_layout(figure)
     if plane:
         label_contours(axes["m"], [(f"{level:.2f}", line) for level, line in lines.items()], over.values())
     return figure
