@@ -1,44 +1,40 @@
 """Tests run in float64 with strict promotion, so that no precision or rank changes unnoticed.
 
-The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each. What is
-compiled is kept in a folder of the run, for the processes that share its tests and for those that they start. Most of
-the time of a run is compilation, so XLA leaves out optimising machine code. With ``XLA_FLAGS`` of one's own,
-``--xla_backend_optimization_level=3``, the tests run what users have.
+The compiled functions of the engine are shared by all tests: one number of grains, one compilation of each.
+``compiled_programs`` says where they are kept.
 """
 
-import os
-import shutil
-import tempfile
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+import compiled_programs
 import pytest
 
-FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
-if FIRST_PROCESS:
-    os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="jaxgran-tests-")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, and why
-CACHE = Path(os.environ["XDG_CACHE_HOME"])
+compiled_programs.set_up()
 
-jax.config.update("jax_compilation_cache_dir", str(CACHE / "compiled"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+compiled_programs.configure_jax()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from jaxgran.contact.solver import solve  # noqa: E402
+from jaxgran.dynamics import advance as public  # noqa: E402
 from jaxgran.dynamics.plain import advance  # noqa: E402
+from jaxgran.dynamics.thread_block import kernel  # noqa: E402
 from jaxgran.model.flow import ShearFlow  # noqa: E402
 from jaxgran.model.grains import Grains  # noqa: E402
 from jaxgran.model.state import State  # noqa: E402
 from jaxgran.sampling.packing import pack  # noqa: E402
 
 GRAINS = 32
+ENGINES = ("machine_code", "thread_block", "jax")
+
+
+damaged = []  # reports of compiled programs that could not be read
 
 
 def pytest_configure():
@@ -46,10 +42,14 @@ def pytest_configure():
     pytest.GRAINS = GRAINS
 
 
+def pytest_warning_recorded(warning_message):
+    """Such a program is compiled again. JAX does not write it again."""
+    if compiled_programs.DAMAGED in str(warning_message.message):
+        damaged.append(warning_message)
+
+
 def pytest_unconfigure():
-    """The folder of compiled programs goes with the run."""
-    if FIRST_PROCESS:
-        shutil.rmtree(CACHE, ignore_errors=True)
+    compiled_programs.tidy_up(bool(damaged))
 
 
 class Compiled:
@@ -78,6 +78,30 @@ def run():
 
     call.compiled = compiled
     return call
+
+
+@pytest.fixture(scope="session")
+def engines(run):
+    """``engines[name](flow, state, steps)``: the advance by an engine, compiled; the thread block is interpreted."""
+
+    def compiled(advance):
+        call = jax.jit(advance)
+        return lambda flow, state, steps: jax.block_until_ready(call(flow, state, jnp.int32(steps)))
+
+    interpreted = partial(kernel.advance, interpret=True)
+    return {"machine_code": compiled(public.advance), "thread_block": compiled(interpreted), "jax": run}
+
+
+@pytest.fixture(scope="session", params=ENGINES)
+def engine(request) -> str:
+    """A law that asks for it holds for every engine."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def engine_run(engine, engines):
+    """``engine_run(flow, state, steps)``: the advance by each engine in turn."""
+    return engines[engine]
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,7 @@ networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(2, MAX_DISCS))
 STEPS = 40
 
 
+@jax.jit
 def impulses_of(approach, angles, inverse_masses, network: Contacts):
     """Impulses of a network with given approach velocities, directions of the normals and inverse masses of grains."""
     normals = jnp.where(network.used[:, None], jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1), 0)
@@ -153,87 +154,117 @@ def parameters(flow: ShearFlow, state: State) -> dict:
     return numbers | own | {"positions": state.positions, "velocities": state.velocities}
 
 
-def made(flow: ShearFlow, state: State, values: dict, events: int | None = None, moving_contacts: bool = False):
+def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
+    """The flow and the state with these parameters."""
     flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
     grains = Grains(values["radii"], values["masses"])
-    start = State(grains, values["positions"], values["velocities"], values["side"], state.tilt)
-    return advance(flow, start, jnp.int32(STEPS), True, events, moving_contacts)
+    return flow, State(grains, values["positions"], values["velocities"], values["side"], state.tilt)
 
 
 @pytest.fixture(scope="module")
-def tilting(flowing) -> tuple[ShearFlow, State, int]:
-    """A flow whose tilt is about to be remapped, in which outer lists are built anew, and its number of events."""
+def tilting(flowing, run) -> tuple[ShearFlow, State]:
+    """A flow whose tilt is about to be remapped, in which outer lists are built anew."""
     flow = ShearFlow(pytest.GRAINS, 0.6, 0.7, 5e-3, tolerance=1e-12, max_iterations=100_000)
     state = replace(flowing(0.7), tilt=jnp.asarray(0.45))
-    end, tally = jax.jit(advance)(flow, state, jnp.int32(STEPS))
+    end, tally = run(flow, state, STEPS)
     assert end.tilt < 0 and tally.collisions > 20
-    return flow, state, int(jax.jit(count_events)(flow, state, jnp.int32(STEPS)))
+    return flow, state
 
 
 @pytest.fixture(scope="module")
-def derivative(tilting):
-    """A random linear function of the end of the run, its gradient, and the function."""
-    flow, state, events = tilting
+def events_of(tilting):
+    """``events_of(steps)``: how many events that many steps of the flow have."""
+    compiled = jax.jit(count_events)
+    return lambda steps: int(compiled(*tilting, jnp.int32(steps)))
+
+
+@pytest.fixture(scope="module")
+def score_of(tilting, run):
+    """A random linear function of the end of the run."""
     weights = np.random.default_rng(0).normal(size=(2, pytest.GRAINS, 2))
-    with jax.numpy_rank_promotion("allow"):
-        end = jax.jit(lambda values: made(flow, state, values))(parameters(flow, state))[0]
+    end, _ = run(*tilting, STEPS)
 
-    def score(values: dict, events: int | None):
-        after, tally = made(flow, state, values, events)
+    @jax.jit
+    def score(after: State):
         moved = displacement(after.positions, end.positions, lax.stop_gradient(after.side), after.tilt)
-        return jnp.sum(weights[0] * moved) + jnp.sum(weights[1] * after.velocities), tally
+        return jnp.sum(weights[0] * moved) + jnp.sum(weights[1] * after.velocities)
 
-    compiled = jax.jit(jax.value_and_grad(score, has_aux=True), static_argnums=1)
-    (value, tally), slopes = compiled(parameters(flow, state), events)
+    return score
+
+
+@pytest.fixture(scope="module")
+def backward(tilting, score_of, events_of):
+    """``backward(values, steps)``: value, tally and gradient of the score, in a loop with the events of ``STEPS``."""
+    events = events_of(STEPS)
+
+    @jax.jit
+    def compiled(values: dict, steps):
+        def score(values: dict):
+            after, tally = advance(*changed(*tilting, values), steps, True, events)
+            return score_of(after), tally
+
+        return jax.value_and_grad(score, has_aux=True)(values)
+
+    return lambda values, steps: compiled(values, jnp.int32(steps))
+
+
+@pytest.fixture(scope="module")
+def derivative(tilting, backward):
+    """Value and gradient of the score."""
+    (value, tally), slopes = backward(parameters(*tilting), STEPS)
     assert tally.status <= Status.deep_overlap
-    forward = jax.jit(lambda values: score(values, None)[0])
-    return value, slopes, forward, score
+    return value, slopes
 
 
-def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative):
-    flow, state, _ = tilting
-    value, _, forward, _ = derivative
-    np.testing.assert_allclose(value, forward(parameters(flow, state)), rtol=1e-9)
+@pytest.fixture(scope="module")
+def forward(tilting, score_of):
+    """``forward(values, along)``: the derivative of the score along a direction, in forward mode."""
+
+    def score(values: dict):
+        return score_of(advance(*changed(*tilting, values), jnp.int32(STEPS))[0])
+
+    return jax.jit(lambda values, along: jax.jvp(score, (values,), (along,))[1])
+
+
+def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative, score_of, run):
+    np.testing.assert_allclose(derivative[0], score_of(run(*tilting, STEPS)[0]), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
     "name", [name if name in QUICK_NAMES else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
 )
-def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, name):
+def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, forward, score_of, run, name):
     """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and nothing else."""
-    flow, state, _ = tilting
-    _, slopes, forward, score = derivative
-    at = parameters(flow, state)
+    at = parameters(*tilting)
     along = jnp.asarray(np.random.default_rng(1).normal(size=at[name].shape))
     step = 1e-8
-    ends = [forward(at | {name: at[name] + sign * step * along}) for sign in (1, -1)]
-    numerical, exact = float((ends[0] - ends[1]) / (2 * step)), float(jnp.sum(slopes[name] * along))
+    ends = [at | {name: at[name] + sign * step * along} for sign in (1, -1)]
+    high, low = (score_of(run(*changed(*tilting, end), STEPS)[0]) for end in ends)
+    numerical, exact = float((high - low) / (2 * step)), float(jnp.sum(derivative[1][name] * along))
     assert abs(numerical - exact) <= 1e-6 * max(1, abs(exact))
     if name == "radii":
         assert exact == 0
-    change = jax.tree.map(jnp.zeros_like, at) | {name: along}
-    other = jax.jit(lambda a, d: jax.jvp(lambda values: score(values, None)[0], (a,), (d,))[1])(at, change)
-    np.testing.assert_allclose(other, exact, rtol=1e-7, atol=1e-9)
+    change = {other: jnp.asarray(np.zeros(x.shape)) for other, x in at.items()} | {name: along}
+    np.testing.assert_allclose(forward(at, change), exact, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.slow
-def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative):
-    flow, state, events = tilting
-    _, slopes, _, score = derivative
-    at = parameters(flow, state)
+def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative, score_of, events_of):
+    at, events = parameters(*tilting), events_of(STEPS)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), at) | {"restitution": jnp.asarray([0.6, 0.3])}
-    one = jax.grad(lambda values: score(values, events)[0])
+    one = jax.grad(lambda values: score_of(advance(*changed(*tilting, values), jnp.int32(STEPS), True, events)[0]))
     found = jax.jit(jax.vmap(one, axis_name="replica"))(batch)
     for name in NAMES:
-        scale = float(jnp.max(jnp.abs(slopes[name]))) + 1
-        np.testing.assert_allclose(found[name][0], slopes[name], rtol=0, atol=1e-6 * scale)
+        scale = float(jnp.max(jnp.abs(derivative[1][name]))) + 1
+        np.testing.assert_allclose(found[name][0], derivative[1][name], rtol=0, atol=1e-6 * scale)
         assert np.all(np.isfinite(found[name][1]))
 
 
-def test_events_that_do_not_suffice_are_reported(tilting):
-    flow, state, events = tilting
-    short = jax.jit(advance, static_argnums=(3, 4))
-    assert short(flow, state, jnp.int32(STEPS), True, events - 2)[1].status == Status.capacity
+def test_events_that_do_not_suffice_are_reported(tilting, backward, events_of):
+    """Where a few steps more have one event more than the loop is long."""
+    steps = next(steps for steps in range(STEPS, 2 * STEPS) if events_of(steps) > events_of(STEPS))
+    (_, tally), _ = backward(parameters(*tilting), steps)
+    assert tally.status == Status.capacity
 
 
 # What the derivative means

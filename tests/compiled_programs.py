@@ -1,0 +1,94 @@
+"""Where the tests keep what is compiled, and how it is compiled: most of the time of a run is compilation.
+
+Compiled programs are kept from run to run in ``.pytest_cache/jaxgran``, also for processes that the tests start. They
+are found again by what they are compiled from, so nothing has to be removed by hand. Programs that were not used for
+``DAYS`` days go, and the oldest of more than ``MOST_BYTES``. With ``JAXGRAN_TEST_CACHE=temporary``, a run begins with
+an empty folder of its own.
+
+XLA leaves out optimisation, and makes a loop of each operation by its older and quicker method. With ``XLA_FLAGS`` of
+one's own, ``--xla_backend_optimization_level=3``, the tests run what users have.
+"""
+
+import hashlib
+import mmap
+import os
+import shutil
+import tempfile
+import time
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+from jaxgran.environment import processor_features
+
+DAYS = 14
+MOST_BYTES = 2**30
+QUICK_FLAGS = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
+FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
+TEMPORARY = os.environ.get("JAXGRAN_TEST_CACHE") == "temporary"
+DAMAGED = "Error reading persistent compilation cache entry"
+
+
+def cache_folder() -> Path:
+    """The folder of compiled programs of this run; one for each kind of processor."""
+    if TEMPORARY:
+        return Path(tempfile.mkdtemp(prefix="jaxgran-tests-"))
+    kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
+    folder = Path(__file__).parents[1] / ".pytest_cache" / "jaxgran" / kind
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder if os.access(folder, os.W_OK) else Path(tempfile.gettempdir()) / f"jaxgran-tests-{kind}"
+
+
+def remove_unused(folder: Path) -> None:
+    """Remove empty files, which a killed process leaves, those of long ago, and the oldest of too many."""
+    files = [(path, path.stat()) for path in folder.rglob("*") if path.is_file()]
+    files.sort(key=lambda file: max(file[1].st_atime, file[1].st_mtime), reverse=True)
+    held, oldest = 0, time.time() - DAYS * 86400
+    for path, status in files:
+        held += status.st_size
+        if not status.st_size or held > MOST_BYTES or max(status.st_atime, status.st_mtime) < oldest:
+            path.unlink(missing_ok=True)
+
+
+def quick_flags() -> str:
+    """The flags of XLA that this JAX knows; XLA ends the process at a flag that it does not know."""
+    spec = find_spec("jaxlib")
+    libraries = [file for folder in spec.submodule_search_locations or () for file in Path(folder).glob("*jax_common*")]
+    known = set()
+    for library in libraries:
+        with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            known |= {flag for flag in QUICK_FLAGS if text.find(flag.encode()) >= 0}
+    return " ".join(f"--{flag}={value}" for flag, value in QUICK_FLAGS.items() if flag in known)
+
+
+def set_up() -> None:
+    """Set the environment, before JAX is loaded; processes that share the tests find it set."""
+    if FIRST_PROCESS:
+        folder = cache_folder()
+        remove_unused(folder)
+        os.environ["XDG_CACHE_HOME"] = str(folder)
+    if "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = quick_flags()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, and why
+
+
+def configure_jax() -> None:
+    """Keep whatever is compiled."""
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def compiled_programs() -> Path:
+    """The folder of what JAX compiles."""
+    return Path(os.environ["XDG_CACHE_HOME"]) / "compiled"
+
+
+def tidy_up(damaged: bool) -> None:
+    """A temporary folder goes with the run, and so does a folder in which an entry was damaged."""
+    if FIRST_PROCESS and TEMPORARY:
+        shutil.rmtree(os.environ["XDG_CACHE_HOME"], ignore_errors=True)
+    elif damaged:
+        shutil.rmtree(compiled_programs(), ignore_errors=True)
