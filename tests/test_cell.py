@@ -15,6 +15,9 @@ POINTS = 64
 
 measured = jax.jit(displacement)
 wrapped = jax.jit(wrap)
+remapped_tilt = jax.jit(remap_tilt)
+side_of_cell = jax.jit(cell_side)
+relative = jax.jit(relative_velocity)
 
 cells = given(st.integers(0, 2**32 - 1), st.floats(2, 50), st.floats(-0.5, 0.5, exclude_max=True))
 modest = settings(max_examples=30, derandomize=True, deadline=None)
@@ -50,11 +53,13 @@ def test_displacement_equals_that_of_jax_md():
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         from jax_md import space
 
+        @jax.jit
+        def theirs(to, origin, box):
+            return jax.vmap(space.periodic_general(box, fractional_coordinates=False)[0])(to, origin)
+
         for seed, (side, tilt) in enumerate([(5.0, 0.0), (7.0, 0.3), (20.0, -0.5), (11.0, 0.499)]):
             to, origin = points(seed, side)
-            box = jnp.array([[side, tilt * side], [0.0, side]])
-            theirs, _ = space.periodic_general(box, fractional_coordinates=False)
-            expected = np.asarray(jax.vmap(theirs)(jnp.asarray(to), jnp.asarray(origin)))
+            expected = np.asarray(theirs(to, origin, np.array([[side, tilt * side], [0.0, side]])))
             # a box at a slant takes the nearest image only within the circle that fits into it
             shortest = np.linalg.norm(nearest_image(to - origin, side, tilt), axis=-1)
             inside = shortest < side / 2 / np.sqrt(1 + tilt**2) * (1 - 8 * EPS)
@@ -76,7 +81,7 @@ def test_wrap_gives_the_image_in_the_cell(seed, side, tilt):
 @modest
 @given(st.floats(-1e3, 1e3))
 def test_tilt_is_remapped_by_a_whole_number(tilt):
-    remapped = float(remap_tilt(jnp.asarray(tilt)))
+    remapped = float(remapped_tilt(tilt))
     assert -0.5 <= remapped < 0.5
     assert_whole(tilt - remapped, 1e3)
 
@@ -101,7 +106,7 @@ def test_separations_of_images_change_at_the_relative_velocity(seed, side, tilt)
     laboratory = velocities + shear_rate * positions[:, 1:] * [1, 0]
     later = positions + time * laboratory
     after = np.asarray(measured(later[i], later[j], side, tilt + shear_rate * time))
-    u = np.asarray(relative_velocity(jnp.asarray(velocities), i, j, before, jnp.asarray(shear_rate)))
+    u = np.asarray(relative(velocities, i, j, before, shear_rate))
     short = np.linalg.norm(before, axis=-1) < 0.5 * side - 2 * time * np.linalg.norm(u, axis=-1)
     assert np.sum(short) > POINTS / 4
     jumps = np.abs(positions[i] - positions[j] - before)[:, 1] > side / 2
@@ -113,7 +118,7 @@ def test_separations_of_images_change_at_the_relative_velocity(seed, side, tilt)
 @given(st.integers(0, 2**32 - 1), st.floats(0.01, 0.83))
 def test_cell_has_the_packing_fraction(seed, packing_fraction):
     radii = np.random.default_rng(seed).uniform(0.3, 0.7, POINTS)
-    side = float(cell_side(jnp.asarray(radii), packing_fraction))
+    side = float(side_of_cell(radii, packing_fraction))
     assert np.sum(np.pi * radii**2) / side**2 == pytest.approx(packing_fraction, rel=POINTS * EPS)
 
 

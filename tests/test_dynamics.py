@@ -6,55 +6,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import assert_same_state, assert_same_tally, flow_of
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
 from jaxgran.dynamics import collision
 from jaxgran.dynamics.collision import contact_capacities, contacts_now
 from jaxgran.dynamics.plain import advance
-from jaxgran.dynamics.tally import Tally
 from jaxgran.model.cell import displacement, remap_tilt
-from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
-COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
-
-
-# Not the same where impulses agree to rounding only: what measures how well a network was solved.
-OF_THE_SOLVER = ("residual_counts", "worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")
-
-
-def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
-    numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
-    return ShearFlow(pytest.GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
-
-
-def assert_same_state(one, two, atol: float):
-    moved = displacement(one.positions, two.positions, one.side, one.tilt)
-    np.testing.assert_allclose(moved, 0, atol=atol)
-    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=atol)
-    np.testing.assert_allclose(one.tilt, two.tilt, rtol=0, atol=atol)
-
-
-def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] = ()):
-    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their largest component."""
-    for name in COUNTS:
-        assert getattr(one, name) == getattr(two, name), name
-    for name in set(Tally.__dataclass_fields__) - {*COUNTS, *OF_THE_SOLVER, *but}:
-        first, second = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
-        np.testing.assert_allclose(first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name)
+# The same steps in one advance and in two, where contacts are listed and solved in another order
+JOINED = {"machine_code": 1e-7, "thread_block": 1e-7, "jax": 1e-10}
+UNCHANGED = {"machine_code": 0, "thread_block": 0, "jax": 4 * EPS}
 
 
 def assert_identical(one, two):
     jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
-def test_grain_flies_straight_in_the_laboratory(run, scene):
+def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
     """Over many steps, three remaps of the tilt and across the boundary, where the image is faster by γ̇L."""
     state = scene([[3.0, 4.0]], [[0.5, 1.7]])
     flow, steps = flow_of(0.02), 3200
-    after, tally = run(flow, state, steps)
+    after, tally = engine_run(flow, state, steps)
     time = steps * flow.timestep
     tilt = float(remap_tilt(jnp.asarray(time)))
     travelled = np.array([[3.0 + 0.5 * time, 4.0 + 1.7 * time]])
@@ -88,19 +64,19 @@ def test_all_methods_give_the_same_trajectory(run, flowing, packing_fraction):
         assert_same_tally(tally, other, 1e-8, but=("loaded_contacts",))
 
 
-def test_two_samples_joined_are_the_sample_of_both(run, flowing):
+def test_two_samples_joined_are_the_sample_of_both(engine, engine_run, flowing):
     flow, state = flow_of(), flowing(0.6)
-    whole_state, whole = run(flow, state, 100)
-    half_state, first = run(flow, state, 40)
-    joined_state, second = run(flow, half_state, 60)
-    assert_same_state(joined_state, whole_state, 1e-10)
-    assert_same_tally(first + second, whole, 1e-10)
+    whole_state, whole = engine_run(flow, state, 100)
+    half_state, first = engine_run(flow, state, 40)
+    joined_state, second = engine_run(flow, half_state, 60)
+    assert_same_state(joined_state, whole_state, JOINED[engine])
+    assert_same_tally(first + second, whole, JOINED[engine])
 
 
-def test_no_steps_change_nothing(run, flowing):
+def test_no_steps_change_nothing(engine, engine_run, flowing):
     state = flowing(0.6)
-    after, tally = run(flow_of(), state, 0)
-    assert_same_state(after, state, 4 * EPS)
+    after, tally = engine_run(flow_of(), state, 0)
+    assert_same_state(after, state, UNCHANGED[engine])
     assert all(np.all(leaf == 0) for name, leaf in vars(tally).items() if name != "momentum_drift")
     assert tally.momentum_drift < 4 * EPS  # that of the state
 
@@ -139,15 +115,15 @@ def test_contact_buffers_hold_every_planar_network():
         assert list(sizes) == sorted(sizes) and sizes[-1] == 3 * grains
 
 
-def test_deep_overlap_is_reported(run, scene):
+def test_deep_overlap_is_reported(engine_run, scene):
     for overlap, expected in ((0.02, Status.deep_overlap), (0.005, Status.ok)):
-        _, tally = run(flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1)
+        _, tally = engine_run(flow_of(0.02), scene([[5, 5], [6 - overlap, 5]], [[1.0, 0], [-1.0, 0]]), 1)
         assert tally.status == expected
         np.testing.assert_allclose(tally.largest_overlap, overlap, rtol=0, atol=8 * EPS)
 
 
-def test_cap_of_iterations_is_reported(run, flowing):
-    state, tally = run(flow_of(0.75, restitution=0.1, max_iterations=1), flowing(0.75), 100)
+def test_cap_of_iterations_is_reported(engine_run, flowing):
+    state, tally = engine_run(flow_of(0.75, restitution=0.1, max_iterations=1), flowing(0.75), 100)
     assert tally.status == Status.iteration_limit
     assert 0 < tally.unconverged <= tally.solves
     assert np.all(np.isfinite(state.velocities))
@@ -159,11 +135,11 @@ def test_grain_too_fast_for_the_lists_is_reported(run, flowing):
     assert tally.status >= Status.capacity
 
 
-def test_pairs_that_the_lists_cannot_hold_are_reported(run, flowing):
+def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
     state = flowing(0.6)
     heap = replace(state, positions=2 + 0.1 * state.positions)
     assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * pytest.GRAINS
-    _, tally = run(flow_of(), heap, 3)
+    _, tally = engine_run(flow_of(), heap, 3)
     assert tally.status == Status.capacity
 
 
@@ -175,12 +151,11 @@ def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     assert tally.status == Status.capacity
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-@pytest.mark.parametrize("field", ["positions", "velocities"])
-def test_state_that_is_not_finite_stops_at_once(run, flowing, field, bad):
+@pytest.mark.parametrize(("field", "bad"), [("positions", np.nan), ("velocities", np.inf)])
+def test_state_that_is_not_finite_stops_at_once(engine_run, flowing, field, bad):
     state = flowing(0.6)
     spoilt = replace(state, **{field: getattr(state, field).at[3, 1].set(bad)})
-    _, tally = run(flow_of(), spoilt, 2_000_000_000)
+    _, tally = engine_run(flow_of(), spoilt, 2_000_000_000)
     assert tally.status == Status.nonfinite
     assert tally.steps == 0
 
@@ -214,7 +189,7 @@ def traced_batch(replicas):
 @pytest.fixture(scope="module")
 def batches(traced_batch):
     """The two ways to advance a batch: all replicas at once, and one after the other."""
-    together = traced_batch.lower().compile()
+    together = traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})  # sums to the bit as users have them
     in_turn = jax.jit(lambda flows, states, steps: jax.lax.map(lambda each: advance(*each, steps), (flows, states)))
     return {"vmap": together, "map": in_turn}
 

@@ -1,0 +1,36 @@
+"""Flows of the shared number of grains, and when two runs are the same."""
+
+import numpy as np
+import pytest
+
+from jaxgran.dynamics.tally import Tally
+from jaxgran.model.cell import displacement
+from jaxgran.model.flow import ShearFlow
+
+COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
+
+# Not the same where impulses agree to rounding only: what measures how well a network was solved.
+OF_THE_SOLVER = ("residual_counts", "worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")
+
+
+def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
+    """A flow whose contacts are solved to rounding."""
+    numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
+    return ShearFlow(pytest.GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
+
+
+def assert_same_state(one, two, atol: float):
+    """Velocities and tilts agree, and positions up to a lattice vector."""
+    moved = displacement(one.positions, two.positions, one.side, one.tilt)
+    np.testing.assert_allclose(moved, 0, atol=atol)
+    np.testing.assert_allclose(one.velocities, two.velocities, rtol=0, atol=atol)
+    np.testing.assert_allclose(one.tilt, two.tilt, rtol=0, atol=atol)
+
+
+def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] = ()):
+    """Counts agree exactly, sums to a share of the sum itself, and moments to a share of their largest component."""
+    for name in COUNTS:
+        assert getattr(one, name) == getattr(two, name), name
+    for name in set(Tally.__dataclass_fields__) - {*COUNTS, *OF_THE_SOLVER, *but}:
+        first, second = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
+        np.testing.assert_allclose(first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name)
