@@ -19,9 +19,9 @@ import pytest
 import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_up_maps import ratio_dataset, with_timesteps
 from synthetic import one_sentence, snapshot_of
 from test_cli import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
-from test_figures import ratio_dataset, with_timesteps
 
 import jaxgran as jg
 from jaxgran.analysis import fields

@@ -19,9 +19,9 @@ import pytest
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from made_up_maps import made_up_map
 from PIL import Image
 from synthetic import one_sentence, random_replica
-from test_closure import made_up_map
 
 from jaxgran.cli import app, fit, info, measure, run
 from jaxgran.cli import map as map_module

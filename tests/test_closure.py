@@ -1,12 +1,11 @@
 """The closure finds known laws within their errors, tends to kinetic theory, and finds a restitution from stresses."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from made_up_maps import ALPHA, NU, RELATIVE, SCATTER, TRUE, known_closure, made_up_map
 from synthetic import one_sentence
 
 from jaxgran.inference.closure import LAWS, Closure, Law, predict
@@ -14,44 +13,6 @@ from jaxgran.inference.closure_fit import closure_points, fit_closure
 from jaxgran.inference.cross_validation import leave_one_out
 from jaxgran.inference.stress_inversion import restitution_from_stresses
 from jaxgran.theory.gaussian_moments import gaussian_moments
-
-ALPHA, NU = (0.2, 0.35, 0.5, 0.65, 0.8), (0.5, 0.6, 0.65, 0.7, 0.75, 0.79)
-SCATTER = 0.02
-RELATIVE = {"pressure": 0.04, "macroscopic_friction": 0.01, "force_ratio": 0.015}  # standard errors of a made-up map
-TRUE = {
-    "pressure": (7.0, -5.0, 1.5, -1.0, 2.0, -0.6),
-    "macroscopic_friction": (-1.6, 1.0, -0.3, 0.5, -0.5, 0.13),
-    "force_ratio": (-9.0, 8.5, 4.0, 4.7, -4.0),
-}
-
-
-def known_closure(scatter: float = 0.0) -> Closure:
-    """Return the closure of the true coefficients, with no error but the scatter."""
-    laws = [Law(np.array(c), np.zeros((len(c), len(c))), np.array(scatter)) for c in TRUE.values()]
-    spans = np.array([ALPHA[0], ALPHA[-1]]), np.array([NU[0], NU[-1]])
-    return Closure(*laws, *spans, np.array(0.8386), np.array(1e-3))
-
-
-@cache
-def exact() -> np.ndarray:
-    """Pressure, friction and force ratio of the true closure on the map, (3, ν, α)."""
-    seen = predict(known_closure(), np.array(ALPHA), np.array(NU)[:, None])
-    return np.stack([seen.pressure, seen.shear_stress / seen.pressure, seen.force_ratio])
-
-
-def made_up_map(seed: int | None = 0, scatter: float = 0.0, noise: float = 1.0) -> xr.Dataset:
-    """Return a map that obeys the true closure, with Gaussian errors of its logarithms."""
-    random, dims = np.random.default_rng(seed), ("packing_fraction", "restitution")
-    variables = {}
-    for name, value in zip(LAWS, exact(), strict=True):
-        error = noise * RELATIVE[name]
-        shift = random.normal(size=value.shape) * np.hypot(error, scatter) if seed is not None else 0.0
-        variables[name] = (dims, value * np.exp(shift))
-        variables[f"{name}_stderr"] = (dims, value * np.exp(shift) * error)
-    data = xr.Dataset(variables, {"packing_fraction": list(NU), "restitution": list(ALPHA)}, {"timestep": 1e-3})
-    shear_error = np.hypot(RELATIVE["pressure"], RELATIVE["macroscopic_friction"]) * noise
-    data["shear_stress"] = data.pressure * data.macroscopic_friction
-    return data.assign(shear_stress_stderr=data.shear_stress * shear_error)
 
 
 def with_a_bad_point(data: xr.Dataset) -> xr.Dataset:

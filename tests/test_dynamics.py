@@ -139,7 +139,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
     state = flowing(0.6)
     heap = replace(state, positions=2 + 0.1 * state.positions)
     assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * pytest.GRAINS
-    _, tally = engine_run(flow_of(), heap, 3)
+    _, tally = engine_run(flow_of(max_iterations=100), heap, 3)
     assert tally.status == Status.capacity
 
 

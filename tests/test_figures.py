@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from drawn import caption, legend_texts
+from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
 from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
@@ -12,38 +14,6 @@ from matplotlib.figure import Figure
 
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
-
-FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
-RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
-
-
-def excess_of(restitution: np.ndarray, packing_fraction: np.ndarray) -> np.ndarray:
-    """Return a smooth excess whose isolines are straight: 1 − α + 2ν = constant."""
-    return 0.05 * np.exp(RATE * (1.0 - restitution + 2.0 * packing_fraction - 1.6))
-
-
-def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -> xr.Dataset:
-    """Return a synthetic map with the names and attributes of a measured one."""
-    alpha, nu = np.linspace(0.1, 0.9, alphas), np.linspace(0.3, 0.8, nus)
-    excess = excess_of(alpha[None, :], nu[:, None])
-    dims = ("packing_fraction", "restitution")
-    flags = {"flag_values": np.arange(7), "flag_meanings": FLAGS}
-    return xr.Dataset(
-        {
-            "force_ratio": (dims, 1.0 + excess),
-            "force_ratio_stderr": (dims, relative_error * excess),
-            "status": (dims, np.zeros(excess.shape, int), flags),
-        },
-        coords={"packing_fraction": nu, "restitution": alpha},
-        attrs={"timestep": 3e-4, "activation": "midpoint", "grains": 256, "seeds": 2, "strain": 5.0},
-    )
-
-
-def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
-    """Return a map of several time steps whose excess is that of a map at the first and twice as large at each next."""
-    parts = [data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0)) for k in range(len(timesteps))]
-    several = xr.concat(parts, xr.Variable("timestep", list(timesteps)))
-    return several.assign_attrs(data.attrs | {"timestep": list(timesteps)})
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
@@ -68,14 +38,6 @@ def rings(figure: Figure) -> np.ndarray:
     """Return the positions (points, 2) of the marks of bad status."""
     marks = [line for line in figure.axes[0].lines if line.get_markersize() > 8]
     return np.concatenate([np.empty((0, 2))] + [line.get_xydata() for line in marks])
-
-
-def legend_texts(figure: Figure) -> list[str]:
-    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-
-
-def caption(figure: Figure) -> str:
-    return figure.get_supxlabel()
 
 
 def no_value(data: xr.Dataset, *points: tuple[int, int]) -> xr.Dataset:

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from listed import build, listed_pairs, move, pairs_within
 from oracles import gaps_of
 from scipy.stats import norm
 from synthetic import one_sentence
-from test_pairs import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact.near_pairs import widest_skin
 from jaxgran.model.cell import cell_side

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import gaps_of
+from listed import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact import near_pairs
 from jaxgran.contact.near_pairs import (
     Frame,
     PairLists,
-    consumed_skin,
     first_true,
     pair_lists,
     present,
@@ -28,7 +27,6 @@ EPS = np.finfo(float).eps
 
 
 compiled_first = jax.jit(first_true, static_argnums=1)
-build = jax.jit(pair_lists)
 
 
 @pytest.mark.parametrize(("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)])
@@ -42,34 +40,11 @@ def test_first_true_entries(length, size, seed, density):
 
 
 @jax.jit
-def move(hood: PairLists, grains: Grains, side, displacements, strain):
-    """The pair_lists after a motion, with new lists where the old ones would no longer be valid."""
-    moved = Frame(hood.frame.displacements + displacements, hood.frame.strain + strain)
-    valid = consumed_skin(moved, hood.near_frame, 2 * jnp.max(grains.radii)) <= hood.near.skin
-    now = PairLists(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
-    now = jax.lax.cond(valid, lambda: now, lambda: refresh(now, grains, side, jnp.asarray(True)))
-    return now, ~valid, *present(now, side)
-
-
-@jax.jit
 def both_separations(hood: PairLists, side):
     positions, tilt = present(hood, side)
     listed = hood.near
     direct = displacement(positions[listed.i], positions[listed.j], side, tilt)
     return separations_now(listed, hood.frame), direct
-
-
-def listed_pairs(listed) -> set:
-    """The pairs of a list, each once."""
-    filled = np.asarray(listed.reach) > 0
-    found = [tuple(sorted(pair)) for pair in zip(listed.i[filled].tolist(), listed.j[filled].tolist(), strict=True)]
-    assert len(found) == len(set(found))
-    assert all(i != j for i, j in found)
-    return set(found)
-
-
-def pairs_within(gap: float, positions, radii, side, tilt) -> set:
-    return set(zip(*(axis.tolist() for axis in np.nonzero(gaps_of(positions, radii, side, tilt) <= gap)), strict=True))
 
 
 @pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0), (0.02, -0.02)])

@@ -3,39 +3,10 @@
 import numpy as np
 import pytest
 import xarray as xr
+from made_up_maps import FRACTION, FRICTION, dense_map, power
 from synthetic import one_sentence
 
 from jaxgran.inference.friction_law import FrictionLaw, dense_points, friction_law
-
-FRICTION, FRACTION = (0.10, 0.60, 0.40), (0.84, -0.25, 0.80)
-
-
-def power(number: np.ndarray, law: tuple[float, float, float]) -> np.ndarray:
-    return law[0] + law[1] * number ** law[2]
-
-
-def dense_map(
-    seed: int | None = 0, noise: float = 0.02, alphas: tuple[float, ...] = (0.2, 0.5), nus: int = 8, shift: float = 0.0
-) -> xr.Dataset:
-    """Return a map that obeys both laws, with Gaussian errors; each next restitution has `shift` more friction."""
-    nu = np.linspace(0.75, 0.836, nus)
-    number = np.repeat((((FRACTION[0] - nu) / -FRACTION[1]) ** (1 / FRACTION[2]))[:, None], len(alphas), axis=1)
-    friction = power(number, FRICTION) + shift * np.arange(len(alphas))
-    errors = noise * number, noise * friction
-    if seed is not None:
-        random = np.random.default_rng(seed)
-        number, friction = (
-            x + e * random.normal(size=x.shape) for x, e in zip((number, friction), errors, strict=True)
-        )
-    dims = ("packing_fraction", "restitution")
-    variables = {
-        "inertial_number": (dims, number),
-        "inertial_number_stderr": (dims, errors[0]),
-        "macroscopic_friction": (dims, friction),
-        "macroscopic_friction_stderr": (dims, errors[1]),
-        "status": (dims, np.zeros(number.shape, int)),
-    }
-    return xr.Dataset(variables, {"packing_fraction": nu, "restitution": list(alphas)})
 
 
 def fit(data: xr.Dataset) -> FrictionLaw:

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from drawn import caption, legend_texts
+from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.colors import same_color
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
-from test_figures import caption, excess_of, legend_texts, ratio_dataset, with_timesteps
-from test_rheology import dense_map
 
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS

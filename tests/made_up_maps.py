@@ -1,0 +1,106 @@
+"""Made-up maps: of a known closure, of a known excess of the force ratio, and of known laws of dense flow."""
+
+from functools import cache
+
+import numpy as np
+import xarray as xr
+
+from jaxgran.inference.closure import LAWS, Closure, Law, predict
+
+ALPHA, NU = (0.2, 0.35, 0.5, 0.65, 0.8), (0.5, 0.6, 0.65, 0.7, 0.75, 0.79)
+SCATTER = 0.02
+RELATIVE = {"pressure": 0.04, "macroscopic_friction": 0.01, "force_ratio": 0.015}  # standard errors of a made-up map
+TRUE = {
+    "pressure": (7.0, -5.0, 1.5, -1.0, 2.0, -0.6),
+    "macroscopic_friction": (-1.6, 1.0, -0.3, 0.5, -0.5, 0.13),
+    "force_ratio": (-9.0, 8.5, 4.0, 4.7, -4.0),
+}
+FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
+RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
+FRICTION, FRACTION = (0.10, 0.60, 0.40), (0.84, -0.25, 0.80)
+
+
+def known_closure(scatter: float = 0.0) -> Closure:
+    """Return the closure of the true coefficients, with no error but the scatter."""
+    laws = [Law(np.array(c), np.zeros((len(c), len(c))), np.array(scatter)) for c in TRUE.values()]
+    spans = np.array([ALPHA[0], ALPHA[-1]]), np.array([NU[0], NU[-1]])
+    return Closure(*laws, *spans, np.array(0.8386), np.array(1e-3))
+
+
+@cache
+def exact() -> np.ndarray:
+    """Pressure, friction and force ratio of the true closure on the map, (3, ν, α)."""
+    seen = predict(known_closure(), np.array(ALPHA), np.array(NU)[:, None])
+    return np.stack([seen.pressure, seen.shear_stress / seen.pressure, seen.force_ratio])
+
+
+def made_up_map(seed: int | None = 0, scatter: float = 0.0, noise: float = 1.0) -> xr.Dataset:
+    """Return a map that obeys the true closure, with Gaussian errors of its logarithms."""
+    random, dims = np.random.default_rng(seed), ("packing_fraction", "restitution")
+    variables = {}
+    for name, value in zip(LAWS, exact(), strict=True):
+        error = noise * RELATIVE[name]
+        shift = random.normal(size=value.shape) * np.hypot(error, scatter) if seed is not None else 0.0
+        variables[name] = (dims, value * np.exp(shift))
+        variables[f"{name}_stderr"] = (dims, value * np.exp(shift) * error)
+    data = xr.Dataset(variables, {"packing_fraction": list(NU), "restitution": list(ALPHA)}, {"timestep": 1e-3})
+    shear_error = np.hypot(RELATIVE["pressure"], RELATIVE["macroscopic_friction"]) * noise
+    data["shear_stress"] = data.pressure * data.macroscopic_friction
+    return data.assign(shear_stress_stderr=data.shear_stress * shear_error)
+
+
+def excess_of(restitution: np.ndarray, packing_fraction: np.ndarray) -> np.ndarray:
+    """Return a smooth excess whose isolines are straight: 1 − α + 2ν = constant."""
+    return 0.05 * np.exp(RATE * (1.0 - restitution + 2.0 * packing_fraction - 1.6))
+
+
+def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -> xr.Dataset:
+    """Return a synthetic map with the names and attributes of a measured one."""
+    alpha, nu = np.linspace(0.1, 0.9, alphas), np.linspace(0.3, 0.8, nus)
+    excess = excess_of(alpha[None, :], nu[:, None])
+    dims = ("packing_fraction", "restitution")
+    flags = {"flag_values": np.arange(7), "flag_meanings": FLAGS}
+    return xr.Dataset(
+        {
+            "force_ratio": (dims, 1.0 + excess),
+            "force_ratio_stderr": (dims, relative_error * excess),
+            "status": (dims, np.zeros(excess.shape, int), flags),
+        },
+        coords={"packing_fraction": nu, "restitution": alpha},
+        attrs={"timestep": 3e-4, "activation": "midpoint", "grains": 256, "seeds": 2, "strain": 5.0},
+    )
+
+
+def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
+    """Return a map of several time steps whose excess is that of a map at the first and twice as large at each next."""
+    parts = [data.assign(force_ratio=1.0 + 2.0**k * (data.force_ratio - 1.0)) for k in range(len(timesteps))]
+    several = xr.concat(parts, xr.Variable("timestep", list(timesteps)))
+    return several.assign_attrs(data.attrs | {"timestep": list(timesteps)})
+
+
+def power(number: np.ndarray, law: tuple[float, float, float]) -> np.ndarray:
+    return law[0] + law[1] * number ** law[2]
+
+
+def dense_map(
+    seed: int | None = 0, noise: float = 0.02, alphas: tuple[float, ...] = (0.2, 0.5), nus: int = 8, shift: float = 0.0
+) -> xr.Dataset:
+    """Return a map that obeys both laws, with Gaussian errors; each next restitution has `shift` more friction."""
+    nu = np.linspace(0.75, 0.836, nus)
+    number = np.repeat((((FRACTION[0] - nu) / -FRACTION[1]) ** (1 / FRACTION[2]))[:, None], len(alphas), axis=1)
+    friction = power(number, FRICTION) + shift * np.arange(len(alphas))
+    errors = noise * number, noise * friction
+    if seed is not None:
+        random = np.random.default_rng(seed)
+        number, friction = (
+            x + e * random.normal(size=x.shape) for x, e in zip((number, friction), errors, strict=True)
+        )
+    dims = ("packing_fraction", "restitution")
+    variables = {
+        "inertial_number": (dims, number),
+        "inertial_number_stderr": (dims, errors[0]),
+        "macroscopic_friction": (dims, friction),
+        "macroscopic_friction_stderr": (dims, errors[1]),
+        "status": (dims, np.zeros(number.shape, int)),
+    }
+    return xr.Dataset(variables, {"packing_fraction": nu, "restitution": list(alphas)})
