@@ -102,7 +102,7 @@ def test_separations_of_images_change_at_the_relative_velocity(seed, side, tilt)
     rng = np.random.default_rng(seed)
     positions, velocities, shear_rate, time = points(seed, side)[0], rng.normal(size=(POINTS, 2)), 1.3, 1e-3
     i, j = np.arange(POINTS), np.roll(np.arange(POINTS), 1)
-    before = measured(positions[i], positions[j], side, tilt)
+    before = np.asarray(measured(positions[i], positions[j], side, tilt))
     laboratory = velocities + shear_rate * positions[:, 1:] * [1, 0]
     later = positions + time * laboratory
     after = np.asarray(measured(later[i], later[j], side, tilt + shear_rate * time))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracles import delassus
 
+from benchmarks import networks as module
 from benchmarks.exact_contacts import exact, incidence
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
@@ -72,10 +73,12 @@ def operator_and_approach(network) -> tuple[np.ndarray, np.ndarray]:
     return matrix[np.ix_(used, used)], np.asarray(network.contacts.approach)[used]
 
 
-def test_collection_is_the_same_twice(networks):
+def test_collection_is_the_same_twice(networks, monkeypatch):
+    """Of the flows, which take long, the two that differ in packing fraction and restitution."""
+    monkeypatch.setattr(module, "FLOWS", module.FLOWS[-2:])
     again = collection(quick=True)
-    assert again.keys() == networks.keys()
-    jax.tree.map(np.testing.assert_array_equal, again, networks)
+    assert len(again) == len(networks) - 3
+    jax.tree.map(np.testing.assert_array_equal, again, {group: networks[group] for group in again})
 
 
 def test_networks_are_padded_and_consistent(networks):
