@@ -1,5 +1,7 @@
 """The closure finds known laws within their errors, tends to kinetic theory, and finds a restitution from stresses."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -153,8 +155,15 @@ def test_a_point_left_out_does_not_enter_its_own_prediction() -> None:
         np.testing.assert_allclose(before[f"{name}_error"], expected, rtol=1e-12)
 
 
+@cache
+def left_out() -> xr.Dataset:
+    """Of a map with its axes in the other order and a bad point."""
+    data = with_a_bad_point(made_up_map(seed=3, scatter=SCATTER))
+    return leave_one_out(data.transpose("restitution", "packing_fraction"))
+
+
 def test_errors_of_points_left_out_have_the_size_that_is_quoted() -> None:
-    errors = leave_one_out(with_a_bad_point(made_up_map(seed=3, scatter=SCATTER)))
+    errors = left_out()
     assert errors.edge.values.sum() == 18 and not errors.edge[1:-1, 1:-1].any()
     for name in ("pressure", "shear_stress", "force_ratio"):
         pulls = (errors[f"{name}_error"] / errors[f"{name}_stderr"]).values
@@ -166,7 +175,7 @@ def test_errors_of_points_left_out_have_the_size_that_is_quoted() -> None:
 def test_points_of_bad_status_or_without_a_value_are_neither_fitted_nor_predicted() -> None:
     data = with_a_bad_point(made_up_map())
     assert len(closure_points(data).place) == 29
-    errors = leave_one_out(data.transpose("restitution", "packing_fraction"))
+    errors = left_out()
     np.testing.assert_array_equal(np.argwhere(np.isnan(errors.pressure_error.values)), [[0, 0]])
     assert errors.pressure_error.dims == ("packing_fraction", "restitution")
     data.force_ratio[1, 1] = np.nan

@@ -180,6 +180,10 @@ def replica(tree, index: int):
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
+# One after the other, replicas do not meet; the quick tests of the machine code state that they are single runs
+ways = pytest.mark.parametrize("way", ["vmap", pytest.param("map", marks=pytest.mark.slow)])
+
+
 @pytest.fixture(scope="module")
 def traced_batch(replicas):
     batch = jax.vmap(advance, in_axes=(0, 0, None), axis_name="replica")
@@ -194,7 +198,7 @@ def batches(traced_batch):
     return {"vmap": together, "map": in_turn}
 
 
-@pytest.mark.parametrize("way", ["vmap", "map"])
+@ways
 def test_batch_advances_as_single_runs_do(run, replicas, batches, way):
     flows, states = replicas
     after, tallies = batches[way](flows, states, jnp.int32(100))
@@ -206,7 +210,7 @@ def test_batch_advances_as_single_runs_do(run, replicas, batches, way):
         assert_same_tally(replica(tallies, index), tally, 1e-10)
 
 
-@pytest.mark.parametrize("way", ["vmap", "map"])
+@ways
 def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batches, way):
     flows, states = replicas
     _, others = stacked([flow_of()] * 3), stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
@@ -214,7 +218,7 @@ def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replica
     assert_identical(replica(result, 0), replica(changed, 0))
 
 
-@pytest.mark.parametrize("way", ["vmap", "map"])
+@ways
 @pytest.mark.parametrize("field", ["positions", "velocities"])
 def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batches, field, way):
     flows, states = replicas

@@ -16,7 +16,7 @@ from jaxgran.sampling.observables import averages
 
 EPS = np.finfo(float).eps
 # Cases and blocks of steps; the interpreted thread block is slow
-COLLISIONS = {"machine_code": 200, "thread_block": 10, "jax": 200}
+COLLISIONS = {"machine_code": 100, "thread_block": 10, "jax": 100}
 BLOCKS = {"machine_code": 50, "thread_block": 12, "jax": 50}
 # Share of the power that one iteration wastes at least; one of the machine code is a sweep over all contacts
 WASTED = {"machine_code": 5e-4, "thread_block": 1e-2, "jax": 1e-2}
