@@ -43,7 +43,7 @@ def pytest_configure():
 
 
 def pytest_warning_recorded(warning_message):
-    """Such a program is compiled again. JAX does not write it again."""
+    """Such a program is compiled again, and the folder goes at the end."""
     if compiled_programs.DAMAGED in str(warning_message.message):
         damaged.append(warning_message)
 

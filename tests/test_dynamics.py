@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import exact_order
 from flows import assert_same_state, assert_same_tally, flow_of
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
@@ -193,7 +194,7 @@ def traced_batch(replicas):
 @pytest.fixture(scope="module")
 def batches(traced_batch):
     """The two ways to advance a batch: all replicas at once, and one after the other."""
-    together = traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})  # sums to the bit as users have them
+    together = traced_batch.lower().compile(exact_order())
     in_turn = jax.jit(lambda flows, states, steps: jax.lax.map(lambda each: advance(*each, steps), (flows, states)))
     return {"vmap": together, "map": in_turn}
 
