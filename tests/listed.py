@@ -23,8 +23,8 @@ def move(hood: PairLists, grains: Grains, side, displacements, strain):
 
 def listed_pairs(listed) -> set:
     """The pairs of a list, each once."""
-    filled = np.asarray(listed.reach) > 0
-    found = [tuple(sorted(pair)) for pair in zip(listed.i[filled].tolist(), listed.j[filled].tolist(), strict=True)]
+    i, j, reach = (np.asarray(x) for x in (listed.i, listed.j, listed.reach))
+    found = [tuple(sorted(pair)) for pair in zip(i[reach > 0].tolist(), j[reach > 0].tolist(), strict=True)]
     assert len(found) == len(set(found))
     assert all(i != j for i, j in found)
     return set(found)

@@ -16,6 +16,7 @@ from jaxgran.analysis.sensitivity import margins
 from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import solve
+from jaxgran.dynamics import collision as collision_module
 from jaxgran.dynamics.plain import advance, count_events
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement
@@ -154,6 +155,13 @@ def parameters(flow: ShearFlow, state: State) -> dict:
     return numbers | own | {"positions": state.positions, "velocities": state.velocities}
 
 
+def differentiable(*arguments):
+    """The advance with two sizes of the contact buffer in place of five: each is compiled with its derivatives."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collision_module, "contact_capacities", lambda grains: (grains // 2, 3 * grains))
+        return advance(*arguments)
+
+
 def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
     """The flow and the state with these parameters."""
     flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
@@ -200,7 +208,7 @@ def backward(tilting, score_of, events_of):
     @jax.jit
     def compiled(values: dict, steps):
         def score(values: dict):
-            after, tally = advance(*changed(*tilting, values), steps, True, events)
+            after, tally = differentiable(*changed(*tilting, values), steps, True, events)
             return score_of(after), tally
 
         return jax.value_and_grad(score, has_aux=True)(values)
@@ -221,7 +229,7 @@ def forward(tilting, score_of):
     """``forward(values, along)``: the derivative of the score along a direction, in forward mode."""
 
     def score(values: dict):
-        return score_of(advance(*changed(*tilting, values), jnp.int32(STEPS))[0])
+        return score_of(differentiable(*changed(*tilting, values), jnp.int32(STEPS))[0])
 
     return jax.jit(lambda values, along: jax.jvp(score, (values,), (along,))[1])
 
@@ -238,8 +246,12 @@ def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, fo
     at = parameters(*tilting)
     along = jnp.asarray(np.random.default_rng(1).normal(size=at[name].shape))
     step = 1e-8
-    ends = [at | {name: at[name] + sign * step * along} for sign in (1, -1)]
-    high, low = (score_of(run(*changed(*tilting, end), STEPS)[0]) for end in ends)
+    ends = []
+    for sign in (1, -1):
+        flow, start = changed(*tilting, at | {name: at[name] + sign * step * along})
+        flow = replace(flow, **{number: float(getattr(flow, number)) for number in NAMES[:3]})  # compiled for such
+        ends.append(score_of(run(flow, start, STEPS)[0]))
+    high, low = ends
     numerical, exact = float((high - low) / (2 * step)), float(jnp.sum(derivative[1][name] * along))
     assert abs(numerical - exact) <= 1e-6 * max(1, abs(exact))
     if name == "radii":
@@ -275,7 +287,7 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
     flow = ShearFlow(pytest.GRAINS, 0.5, 0.02, dt, tolerance=1e-12)
-    end, _ = advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
+    end, _ = differentiable(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]
 
 

@@ -69,7 +69,7 @@ def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, pac
         )
         if rebuilt:
             assert pairs_within(float(hood.near.skin) - 1e-12, positions, radii, side, tilt) <= listed_pairs(hood.near)
-        frozen, direct = both_separations(hood, state.side)
+        frozen, direct = (np.asarray(x) for x in both_separations(hood, state.side))
         short = np.linalg.norm(direct, axis=-1) < 0.49 * side
         filled = np.asarray(hood.near.reach) > 0
         np.testing.assert_allclose(frozen[filled & short], direct[filled & short], rtol=0, atol=64 * EPS * side)
