@@ -1,4 +1,8 @@
-"""A folder in which maps run as processes of the real command line, and things are done to them."""
+"""A folder in which maps run as processes of the real command line, and things are done to them.
+
+The map that nothing happened to, and what is left to do of the others, run in this process, which compiles once. The
+processes find its compiled programs in its cache.
+"""
 
 import os
 import subprocess
@@ -7,8 +11,10 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import jax
 import pytest
 import xarray as xr
+from command_line import Outcome, jaxgran
 
 from jaxgran.maps.results import read_dataset
 
@@ -17,25 +23,31 @@ MARKS = [
     pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
 ]
 DRIVER = Path(__file__).with_name("fault_driver.py")
-MAP = (
-    "map --restitution 0.3,0.7 --packing-fraction 0.6,0.75 --grains 32 --seeds 2 --timestep 1e-3 "
-    "--equilibrate 0.5 --strain 600 --batch 2"
-)
+FLOWS = ["--restitution", "0.3,0.7", "--packing-fraction", "0.6", "--grains", "32", "--seeds", "2"]
+STRAINS = ["--timestep", "1e-3", "--equilibrate", "0.5", "--strain", "10"]
+MAP = ["map", *FLOWS, *STRAINS, "--batch", "2"]
 PATIENCE = 120.0
 
 
 class Lab:
-    """A folder for maps, with a cache of compiled programs and the map that nothing happened to."""
+    """A folder for maps, with the map that nothing happened to."""
 
     def __init__(self, folder: Path):
         self.folder = folder
-        done = self.finish(self.start("whole.nc", workers=1))
-        assert done.returncode == 0, done.stderr
+        done = self.run_here("whole.nc")
+        assert done.status == 0, done.err
         self.whole = read_dataset(folder / "whole.nc")
 
-    def start(self, output: str, *words: str, fault: str = "", workers: int = 2) -> subprocess.Popen:
-        command = [sys.executable, str(DRIVER), *MAP.split(), "--workers", str(workers), "--output", output, *words]
-        environment = os.environ | {"FAULT": fault, "XLA_FLAGS": ""}  # optimised: these maps run more than they compile
+    def run_here(self, output: str, *words: str) -> Outcome:
+        """Run a map in this process, where nothing happens to it."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
+            return jaxgran(self.folder, *MAP, "--workers", "1", "--output", output, *words)
+
+    def start(self, output: str, *words: str, fault: str = "", workers: int = 1) -> subprocess.Popen:
+        """Start a map in a process of its own, as leader of a group of processes."""
+        command = [sys.executable, str(DRIVER), *MAP, "--workers", str(workers), "--output", output, *words]
+        environment = os.environ | {"FAULT": fault, "COMPILED": jax.config.values["jax_compilation_cache_dir"]}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
         return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)
@@ -69,9 +81,16 @@ class Lab:
             time.sleep(0.02)
 
     def assert_whole(self, output: str) -> None:
+        """The map has the bits of the one that nothing happened to, and nothing else is left."""
         xr.testing.assert_equal(read_dataset(self.folder / output), self.whole)
         assert not (self.folder / f"{output}.unfinished").exists()
         assert not list((self.folder / output).parent.glob(".*"))  # no temporary files
+
+    def assert_whole_when_continued(self, output: str) -> None:
+        """An unfinished map comes to the bits of the one that nothing happened to."""
+        done = self.run_here(output, "--resume")
+        assert done.status == 0, done.err
+        self.assert_whole(output)
 
 
 def children(process: int) -> list[int]:

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import ratio_dataset, with_timesteps
 from synthetic import one_sentence, snapshot_of
-from test_cli import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
+
 
 import jaxgran as jg
 from jaxgran.analysis import fields

@@ -1,29 +1,27 @@
 """The command line does what it says, and says in one sentence what it cannot do."""
 
-import os
 import re
 import shlex
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import redirect_stdout
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 import jax
 import numpy as np
 import pytest
 import typer
+from command_line import POINTS, Outcome, assert_one_sentence, files, in_a_process, jaxgran, made_up_replicas
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up_maps import made_up_map
 from PIL import Image
 from synthetic import one_sentence, random_replica
 
-from jaxgran.cli import app, fit, info, measure, run
+from jaxgran.cli import app
 from jaxgran.cli import map as map_module
 from jaxgran.cli.arguments import FIRST_STRAIN, number_list
 from jaxgran.cli.terminal import print_table
@@ -45,58 +43,6 @@ SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "ac
 SAME += ("solver", "engine", "solver_asked", "engine_asked")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
 MOVIE = ["--movie", "flow.gif", "--every", "0.02"]
-POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
-
-
-class Outcome(NamedTuple):
-    status: int
-    out: str
-    err: str
-
-
-def jaxgran(folder: Path, *arguments: str) -> Outcome:
-    """Run a command in a folder, in this process, with JAX as it is set up here."""
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        redirect_stdout(StringIO()) as out,
-        redirect_stderr(StringIO()) as err,
-        pytest.raises(SystemExit) as end,
-    ):
-        patch.chdir(folder)
-        patch.setattr(sys, "argv", ["jaxgran", *arguments])
-        for module in (fit, info, map_module, measure, run):
-            patch.setattr(module, "configured_jax", lambda: jax)
-        app.main()
-    return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
-
-
-def in_a_process(folder: Path, *arguments: str) -> Outcome:
-    """Run a command as its user would, in a process of its own."""
-    command = [sys.executable, "-c", "from jaxgran.cli.app import main; main()", *arguments]
-    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    return Outcome(done.returncode, done.stdout, done.stderr)
-
-
-def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
-    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
-
-    def replicas(settings, batch, workers, report, checkpoint, warn, scheduler, record) -> Iterator:
-        rng = np.random.default_rng(0)
-        for key, status in statuses.items():
-            report(100.0)
-            replica = random_replica(rng, settings, status)
-            if checkpoint is not None:
-                checkpoint.add({key: replica})
-            yield key, replica
-        if end is not None:
-            raise end
-
-    return replicas
-
-
-def files(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
 
 
 # Lists
@@ -248,14 +194,6 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "text.nc").write_text("not a map")
     (tmp_path / "text.gsd").write_text("not a trajectory")
     return tmp_path
-
-
-def assert_one_sentence(outcome: Outcome) -> None:
-    assert outcome.status == 2
-    assert outcome.out == ""
-    assert outcome.err.startswith("jaxgran: ")
-    assert outcome.err.endswith(".\n")
-    assert outcome.err.count("\n") == 1
 
 
 @pytest.mark.parametrize(("command", "accepted"), MISTAKES.items(), ids=MISTAKES)

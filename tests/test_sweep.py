@@ -130,19 +130,32 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest = sweep._measured, 2
+    measured, largest, sizes = sweep._measured, 1, []
 
     def bounded(settings, task, drive, refinement: int = 1):
+        sizes.append(len(task))
         if len(task) > largest:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
         return measured(settings, task, drive, refinement)
 
     monkeypatch.setattr(sweep, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    assert_same_bits(dict(sweep._run_task(settings, tasks, tmp_path / "journal.nc")), results)
+    halved = sweep._run_task(settings, tasks, tmp_path / "journal.nc")
+    assert sizes == [4, 2, 1, 1, 2, 1, 1]
+    assert [key for key, _ in halved] == tasks
+    assert_same_bits(dict(halved), results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
         sweep._run_task(settings, tasks)
+
+
+def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken_device(*_):
+        raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
+
+    monkeypatch.setattr(sweep, "prepare_batch", broken_device)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
+        sweep._run_task(settings, [(0, 0), (0, 1)])
 
 
 def test_replicas_of_a_point_differ(results) -> None:

@@ -1,0 +1,80 @@
+"""Runs commands of jaxgran as a user gives them, in this process or in one of their own."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+from synthetic import random_replica
+
+from jaxgran.cli import app, fit, info, measure, run
+from jaxgran.cli import map as map_module
+from jaxgran.model.status import Status
+
+POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
+
+
+class Outcome(NamedTuple):
+    status: int
+    out: str
+    err: str
+
+
+def jaxgran(folder: Path, *arguments: str) -> Outcome:
+    """Run a command in a folder, in this process, with JAX as it is set up here."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        redirect_stdout(StringIO()) as out,
+        redirect_stderr(StringIO()) as err,
+        pytest.raises(SystemExit) as end,
+    ):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["jaxgran", *arguments])
+        for module in (fit, info, map_module, measure, run):
+            patch.setattr(module, "configured_jax", lambda: jax)
+        app.main()
+    return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
+
+
+def in_a_process(folder: Path, *arguments: str) -> Outcome:
+    """Run a command as its user would, in a process of its own."""
+    command = [sys.executable, "-c", "from jaxgran.cli.app import main; main()", *arguments]
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
+    """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
+
+    def replicas(settings, batch, workers, report, checkpoint, warn, scheduler, record) -> Iterator:
+        rng = np.random.default_rng(0)
+        for key, status in statuses.items():
+            report(100.0)
+            replica = random_replica(rng, settings, status)
+            if checkpoint is not None:
+                checkpoint.add({key: replica})
+            yield key, replica
+        if end is not None:
+            raise end
+
+    return replicas
+
+
+def files(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def assert_one_sentence(outcome: Outcome) -> None:
+    assert outcome.status == 2
+    assert outcome.out == ""
+    assert outcome.err.startswith("jaxgran: ")
+    assert outcome.err.endswith(".\n")
+    assert outcome.err.count("\n") == 1
