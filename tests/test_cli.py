@@ -48,20 +48,6 @@ PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "cl
 FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "64", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
-    "run",
-    "--restitution",
-    "0.7",
-    "--packing-fraction",
-    "0.6",
-    "--grains",
-    "64",
-    "--timestep",
-    "auto",
-    "--strain",
-    "1",
-    "--output",
-    "flow.nc",
-]
 STRESSES = ["--packing-fraction", "0.7", "--pressure", "3", "--shear-stress", "1"]
 
 
