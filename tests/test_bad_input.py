@@ -21,6 +21,7 @@ from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import ratio_dataset, with_timesteps
+from matplotlib.figure import Figure
 from synthetic import one_sentence, snapshot_of
 
 
@@ -582,6 +583,7 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", f"--output={name}")
     assert outcome.status == 0, outcome.err
     stem = name.removesuffix(".nc")

@@ -210,6 +210,7 @@ def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path:
     assert differences(again) == []
 
 
+@pytest.mark.slow
 def test_a_map_by_jax_and_jacobi_agrees_with_the_machine_code_within_errors() -> None:
     choices = {"grains": 64, "seeds": 1, "equilibrate": 1.0, "strain": 2.0}
     way = {"engine": "jax", "solver": "jacobi", "batch": 2}

@@ -12,6 +12,7 @@ from jaxgran.model.state import State
 
 SOFT = {"lammps": lammps, "jax_md_dense": jax_md_dense}
 PEERS = {"jaxgran_itself": jaxgran_itself, "numba_rival": numba_rival, **SOFT}
+COMPILES = pytest.mark.slow  # the peers serve one benchmark, and share no compiled program with other tests
 SETTINGS = {"jaxgran_itself": 1e-3, "numba_rival": 1e-3, "lammps": 1e4, "jax_md_dense": 1e4}
 
 
@@ -45,6 +46,7 @@ def rebound(peer, restitution: float, setting: float, gap: float) -> float:
     return float(velocities[1] - velocities[0])
 
 
+@COMPILES
 @pytest.mark.parametrize("restitution", [0.5, 0.8])
 @pytest.mark.parametrize("name", SOFT)
 def test_soft_discs_rebound_with_the_restitution_as_their_steps_get_short(
@@ -58,12 +60,14 @@ def test_soft_discs_rebound_with_the_restitution_as_their_steps_get_short(
     assert rebound(peer, restitution, 1e4, 0.02) == pytest.approx(restitution, abs=0.005)
 
 
+@COMPILES
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
 def test_discs_of_the_numba_loop_rebound_with_the_restitution(restitution: float) -> None:
     peer = installed("numba_rival")
     assert rebound(peer, restitution, 1e-3, 0.02) == pytest.approx(restitution, abs=1e-12)
 
 
+@COMPILES
 @pytest.mark.parametrize("name", ["numba_rival", *SOFT])
 def test_a_run_begins_with_the_discs_it_was_given(name: str, sheared: Discs) -> None:
     peer = installed(name)
@@ -77,6 +81,7 @@ def test_a_run_begins_with_the_discs_it_was_given(name: str, sheared: Discs) -> 
         np.testing.assert_allclose(found, given, atol=1e-12)
 
 
+@COMPILES
 @pytest.mark.parametrize("name", ["numba_rival", *SOFT])
 def test_momentum_is_conserved_while_the_cell_tilts_over(name: str, sheared: Discs) -> None:
     peer = installed(name)
@@ -90,6 +95,7 @@ def test_momentum_is_conserved_while_the_cell_tilts_over(name: str, sheared: Dis
     assert overlaps(now)[1] < 0.1
 
 
+@COMPILES
 def test_lammps_and_jax_md_move_soft_discs_alike(sheared: Discs, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lammps, "STEPS_PER_CONTACT", dict.fromkeys(lammps.CURVES, 100))
     monkeypatch.setattr(jax_md_dense, "STEPS_PER_CONTACT", 100)

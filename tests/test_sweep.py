@@ -40,9 +40,15 @@ def settings() -> MapSettings:
 
 
 @pytest.fixture(scope="module")
-def results(settings) -> dict[Key, Replica]:
+def reported() -> list[float]:
+    """The replica-steps that the runs of ``results`` have reported."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def results(settings, reported) -> dict[Key, Replica]:
     """The replicas of a map, run in pairs."""
-    return dict(replicas(settings, batch=2))
+    return dict(replicas(settings, batch=2, report=reported.append))
 
 
 def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
@@ -91,11 +97,21 @@ def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -
     assert_same_bits(dict(mixed), results)
 
 
-def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
-    told = []
-    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
+def assert_every_step_is_reported(reported: list[float]) -> None:
     steps = round(SETTINGS["strain"] / 1e-3) + round(SETTINGS["equilibrate"] / 1e-3)
-    assert sum(told) == pytest.approx(4 * steps)
+    assert sum(reported) == pytest.approx(4 * steps)
+
+
+def test_every_step_of_every_replica_is_reported(results, reported) -> None:
+    assert_every_step_is_reported(reported)
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
+    """A map with a worker is in the tests of faults too."""
+    told: list[float] = []
+    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
+    assert_every_step_is_reported(told)
 
 
 @pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
