@@ -6,11 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import pytest
 
 import jaxgran
-from jaxgran.dynamics.machine_code import compiled as machine_code
+from jaxgran.dynamics.machine_code import ffi
 
 PACKAGE = Path(jaxgran.__file__).parent
 PROGRAM = """
@@ -51,45 +50,73 @@ def changed(path: Path, old: str, new: str) -> None:
     os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # the time stamp says nothing
 
 
-def test_any_change_of_any_source_gives_the_machine_code_another_folder(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here = machine_code.cache_folder()
-    monkeypatch.setattr(machine_code, "__file__", str(copy / Path(machine_code.__file__).relative_to(PACKAGE.parent)))
-    assert machine_code.cache_folder() == here  # the place of the package says nothing
-    sources = machine_code.sources()
+@pytest.fixture
+def of_copy(copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same folder, where the machine code now finds its sources."""
+    monkeypatch.setattr(ffi, "__file__", str(copy / Path(ffi.__file__).relative_to(PACKAGE.parent)))
+    return copy
+
+
+def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: Path) -> None:
+    kept, sources = ffi.object_file(), ffi.sources()
     for path in sources:
         content = path.read_bytes()
         path.write_bytes(content + b"\n")
-        assert machine_code.cache_folder() != here
+        assert ffi.object_file() != kept
         path.write_bytes(content)
-    assert machine_code.cache_folder() == here
-    compiled_here = {*(copy / "jaxgran" / "dynamics" / "machine_code").glob("*.py")}
-    imported = {copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
+    assert ffi.object_file() == kept
+    compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "machine_code").glob("*.py")}
+    imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
     assert compiled_here | imported <= set(sources)
 
 
-def test_a_changed_constant_and_a_changed_function_of_another_file_have_another_folder(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(machine_code, "__file__", str(copy / Path(machine_code.__file__).relative_to(PACKAGE.parent)))
-    folders = {machine_code.cache_folder()}
-    changed(copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
-    folders.add(machine_code.cache_folder())
-    changed(copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
-    folders.add(machine_code.cache_folder())
-    assert len(folders) == 3
+def test_a_constant_and_a_function_of_other_folders_change_the_file(of_copy: Path) -> None:
+    kept = {ffi.object_file()}
+    changed(of_copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
+    kept.add(ffi.object_file())
+    changed(of_copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
+    kept.add(ffi.object_file())
+    assert len(kept) == 3
 
 
-def test_a_cache_that_cannot_be_written_costs_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_compiler_or_processor_has_another_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = {ffi.object_file()}
+    for module, name, value in (
+        (ffi, "version", lambda _: "0.0.1"),
+        (ffi.llvm, "get_host_cpu_name", lambda: "another"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            kept.add(ffi.object_file())
+    monkeypatch.setenv("NUMBA_OPT", "2")
+    kept.add(ffi.object_file())
+    assert len(kept) == 4
+
+
+def test_a_kept_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    path, content = tmp_path / "cache" / "code.o", b"machine code" * 100
+    assert ffi._kept(path) is None
+    ffi._keep(path, content)
+    assert ffi._kept(path) == content
+    assert [file.name for file in path.parent.iterdir()] == ["code.o"]
+    whole = path.read_bytes()
+    for torn in (b"", whole[:20], whole[:-1], whole[:500] + b"!" + whole[501:]):
+        path.write_bytes(torn)
+        assert ffi._kept(path) is None
+
+
+def test_only_some_versions_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
+    for k in range(ffi._KEPT + 2):
+        ffi._keep(tmp_path / f"{k}.o", b"code")
+        os.utime(tmp_path / f"{k}.o", (k, k))
+    ffi._keep(tmp_path / "last.o", b"code")
+    assert {path.stem for path in tmp_path.iterdir()} == {"last", *(str(k) for k in range(3, ffi._KEPT + 2))}
+
+
+def test_a_cache_that_cannot_be_written_costs_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     with pytest.warns(UserWarning, match=r"compiled anew in every process.*cannot be written.*XDG_CACHE_HOME"):
-        usable = machine_code._usable(tmp_path / "file" / "machine_code")
-    assert not usable
-    monkeypatch.setattr(machine_code, "CACHED", usable)
-    monkeypatch.setattr(machine_code, "CACHE", tmp_path / "file" / "machine_code")
-    half = machine_code.cached(numba.njit)(lambda x: x / 2)
-    assert half(3.0) == 1.5
+        ffi._keep(tmp_path / "file" / "machine_code" / "code.o", b"code")
 
 
 @pytest.mark.slow
