@@ -89,10 +89,11 @@ def test_what_is_no_list_is_refused(text: str) -> None:
 def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
     try:
         numbers = number_list(text, "restitution")
-    except InputError:
-        return
-    assert numbers
-    assert all(isinstance(number, float) for number in numbers)
+    except InputError as mistake:
+        assert one_sentence(str(mistake))
+    else:
+        assert numbers
+        assert all(isinstance(number, float) for number in numbers)
 
 
 # Mistakes
