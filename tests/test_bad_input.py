@@ -24,7 +24,6 @@ from made_up_maps import ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
 from synthetic import one_sentence, snapshot_of
 
-
 import jaxgran as jg
 from jaxgran.analysis import fields
 from jaxgran.dynamics import snapshots

@@ -19,10 +19,9 @@ import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, in_a_process, jaxgran, made_up_replicas
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_maps import made_up_map
+from made_up_maps import known_closure, made_up_map
 from PIL import Image
 from synthetic import one_sentence, random_replica
-
 
 from jaxgran.cli import app
 from jaxgran.cli import map as map_module
