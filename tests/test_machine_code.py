@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import jaxgran
+from jaxgran.cache_files import keep, read_kept
 from jaxgran.dynamics.machine_code import ffi
 
 PACKAGE = Path(jaxgran.__file__).parent
@@ -95,28 +96,29 @@ def test_another_compiler_or_processor_has_another_file(monkeypatch: pytest.Monk
 
 def test_a_kept_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     path, content = tmp_path / "cache" / "code.o", b"machine code" * 100
-    assert ffi._kept(path) is None
-    ffi._keep(path, content)
-    assert ffi._kept(path) == content
+    assert read_kept(path) is None
+    keep(path, content, 1)
+    assert read_kept(path) == content
     assert [file.name for file in path.parent.iterdir()] == ["code.o"]
     whole = path.read_bytes()
     for torn in (b"", whole[:20], whole[:-1], whole[:500] + b"!" + whole[501:]):
         path.write_bytes(torn)
-        assert ffi._kept(path) is None
+        assert read_kept(path) is None
 
 
-def test_only_some_versions_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
-    for k in range(ffi._KEPT + 2):
-        ffi._keep(tmp_path / f"{k}.o", b"code")
+def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
+    for k in range(5):
+        keep(tmp_path / f"{k}.o", b"code", 3)
         os.utime(tmp_path / f"{k}.o", (k, k))
-    ffi._keep(tmp_path / "last.o", b"code")
-    assert {path.stem for path in tmp_path.iterdir()} == {"last", *(str(k) for k in range(3, ffi._KEPT + 2))}
+    keep(tmp_path / "last.o", b"code", 3)
+    assert {path.name for path in tmp_path.iterdir()} == {"last.o", "3.o", "4.o"}
 
 
-def test_a_cache_that_cannot_be_written_costs_a_sentence(tmp_path: Path) -> None:
+def test_a_cache_that_cannot_be_written_is_an_error_of_the_file_system(tmp_path: Path) -> None:
+    """The machine code makes a warning of it: see the slow test."""
     (tmp_path / "file").write_text("no folder")
-    with pytest.warns(UserWarning, match=r"compiled anew in every process.*cannot be written.*XDG_CACHE_HOME"):
-        ffi._keep(tmp_path / "file" / "machine_code" / "code.o", b"code")
+    with pytest.raises(OSError):
+        keep(tmp_path / "file" / "machine_code" / "code.o", b"code", 1)
 
 
 @pytest.mark.slow
