@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.mistakes import MISTAKES
+
 
 @dataclass(frozen=True)
 class Option:
@@ -203,5 +205,11 @@ BENCHMARKS = (
         (4, 0.5),
         ("load.json", "soak.png"),
         (Option("--soak", "sweeps for so many minutes instead, and soak.png", float),),
+    ),
+    Benchmark(
+        "mutants",
+        "Do the tests find mistakes of one word, made in a copy of the code?",
+        (120, 2),
+        options=(Option("--only", "one mistake alone; writes nothing", choices=tuple(one.name for one in MISTAKES)),),
     ),
 )

@@ -3,7 +3,7 @@
 Compiled programs are kept from run to run in ``.pytest_cache/jaxgran``, also for processes that the tests start. They
 are found again by what they are compiled from, so nothing has to be removed by hand. Programs that were not used for
 ``DAYS`` days go, and the oldest of more than ``MOST_BYTES``. With ``JAXGRAN_TEST_CACHE=temporary``, a run begins with
-an empty folder of its own.
+an empty folder of its own; any other value names a folder.
 
 XLA leaves out optimisation, and makes a loop of each operation by its older and quicker method. With ``XLA_FLAGS`` of
 one's own, ``--xla_backend_optimization_level=3``, the tests run what users have.
@@ -25,7 +25,8 @@ DAYS = 14
 MOST_BYTES = 2**30
 QUICK_FLAGS = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": "false"}
 FIRST_PROCESS = "PYTEST_XDIST_WORKER" not in os.environ
-TEMPORARY = os.environ.get("JAXGRAN_TEST_CACHE") == "temporary"
+CHOSEN = os.environ.get("JAXGRAN_TEST_CACHE")
+TEMPORARY = CHOSEN == "temporary"
 DAMAGED = "Error reading persistent compilation cache entry"
 
 
@@ -33,6 +34,8 @@ def cache_folder() -> Path:
     """The folder of compiled programs of this run; one for each kind of processor."""
     if TEMPORARY:
         return Path(tempfile.mkdtemp(prefix="jaxgran-tests-"))
+    if CHOSEN:
+        return Path(CHOSEN)
     kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
     folder = Path(__file__).parents[1] / ".pytest_cache" / "jaxgran" / kind
     with suppress(OSError):
@@ -83,8 +86,11 @@ def configure_jax() -> None:
     """Keep whatever is compiled."""
     import jax
 
+    from jaxgran import programs
+
     jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    programs._folder = lambda: None  # tests replace functions, of which the key of a kept program knows nothing
 
 
 def compiled_programs() -> Path:
