@@ -35,6 +35,8 @@ def run(output: Output, only: str | None = None) -> None:
     """Make the mistakes, run the tests, print a table, and write JSON unless one mistake is chosen."""
     names = [only] if only else QUICK if output.quick else [one.name for one in MISTAKES]
     chosen = [one for one in MISTAKES if one.name in names]
+    if not chosen:
+        raise SystemExit(f"there is no mistake {only!r}: it must be one of {', '.join(one.name for one in MISTAKES)}.")
     with tempfile.TemporaryDirectory(prefix="jaxgran-mutants-") as folder:
         copy = Copy(Path(folder) / "tree", Path(folder) / "cache")
         copy.fill()

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.mistakes import MISTAKES
-
 
 @dataclass(frozen=True)
 class Option:
@@ -210,6 +208,6 @@ BENCHMARKS = (
         "mutants",
         "Do the tests find mistakes of one word, made in a copy of the code?",
         (120, 2),
-        options=(Option("--only", "one mistake alone; writes nothing", choices=tuple(one.name for one in MISTAKES)),),
+        options=(Option("--only", "one mistake alone, by its name; writes nothing"),),
     ),
 )
