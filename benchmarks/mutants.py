@@ -28,6 +28,7 @@ from benchmarks.process import ROOT
 NEAREST_LIMIT, WHOLE_LIMIT = 1200, 3600  # seconds of one run of the tests
 OWN_TEST = "tests/test_mutants.py"  # fails with every mistake, since it looks for the lines without one
 NO_FAILURE = (0, 5)  # exit statuses of pytest: all passed, nothing to run
+NOT_PASSED_ON = ("JAX_ENABLE_X64", "NUMBA_CACHE_DIR")  # set for benchmarks; a cache in use, which mistakes would fill
 TIME_LIMIT = "the tests did not end within {} s"
 
 
@@ -80,7 +81,7 @@ class Copy:
         """That of the tests: the copy comes first, what is compiled is kept, and precision is as they choose it."""
         path = os.pathsep.join([str(self.tree), *filter(None, [os.environ.get("PYTHONPATH")])])
         ours = {"PYTHONPATH": path, "JAXGRAN_TEST_CACHE": str(self.cache), "PYTHONDONTWRITEBYTECODE": "1"}
-        return {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"} | ours
+        return {name: value for name, value in os.environ.items() if name not in NOT_PASSED_ON} | ours
 
     def failures(self, words: Sequence[str], limit: float) -> tuple[list[str], float]:
         """The tests that fail in one run of pytest, and its seconds; why it ended, if that was no test."""
