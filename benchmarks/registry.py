@@ -171,6 +171,12 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "startup",
+        "How long does a command take from the prompt to its end, and where does the time go?",
+        (3, 1),
+        ("startup.json",),
+    ),
+    Benchmark(
         "timestep_study",
         "What becomes of the force ratio as the time step vanishes?",
         (25, 1),

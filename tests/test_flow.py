@@ -113,9 +113,10 @@ def test_a_flow_may_be_without_shear():
 
 def test_flow_is_a_pytree_of_its_numbers():
     leaves, structure = jax.tree.flatten(FLOW)
-    assert leaves == [getattr(FLOW, name) for name in NUMBERS]
-    assert jax.tree.unflatten(structure, leaves) == FLOW
-    for change in ({"grains": 65}, {"activation": "touching"}, {"solver": "jacobi"}, {"engine": "jax"}):
+    assert leaves == [*(getattr(FLOW, name) for name in NUMBERS), 0.5]
+    assert jax.tree.unflatten(structure, leaves) == replace(FLOW, activation=0.5)
+    assert jax.tree.structure(replace(FLOW, activation="touching")) == structure
+    for change in ({"grains": 65}, {"solver": "jacobi"}, {"engine": "jax"}):
         assert jax.tree.structure(replace(FLOW, **change)) != structure
 
 

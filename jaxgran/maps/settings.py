@@ -145,7 +145,9 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
         flows = stack(
             MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4, "strain": 1.0}).flows()
         )
-        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, flows.activation, target_error)
+        steps = automatic_timestep(
+            _temperature(flows), flows.packing_fraction, chosen.get("activation", "midpoint"), target_error
+        )
         least = int(np.argmin(steps))
         chosen["timestep"] = float(two_digits(steps[least], up=False))
         words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")

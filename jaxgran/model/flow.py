@@ -21,6 +21,7 @@ from jaxgran.model.choices import (
 from jaxgran.model.display import Row, display_methods
 
 _STATIC = {"static": True}
+_LOOK_AHEAD = {"midpoint": 0.5, "touching": 0.0}  # θ of the activation rules
 _UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
 
 
@@ -33,8 +34,9 @@ class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
     The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
-    ``grains``, ``activation``, ``solver`` and ``engine`` are static. All other fields are traced: changing them
-    recompiles nothing, and a batch of flows is one ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis.
+    ``grains``, ``solver`` and ``engine`` are static. All other fields are traced: changing them recompiles nothing, and
+    a batch of flows is one ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis. JAX traces the number θ of
+    ``activation``, so the flow that a transformed function receives has θ in that field.
 
     ================  =================  ===============================================================
     field             unit               meaning
@@ -48,7 +50,7 @@ class ShearFlow:
     tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
     max_iterations    –                  largest number of iterations of one contact solve
     activation        –                  "midpoint": contact if the grains overlap after half a step of free flight;
-                                         "touching": contact if the grains overlap now
+                                         "touching": contact if the grains overlap now; or θ, 0.5 or 0
     relaxation        –                  ω in (0, 2) of the Jacobi methods
     solver            –                  projected method of the contact solve in the engine "jax", see
                                          ``projected_methods``; the other engines have their own solver and run
@@ -75,7 +77,7 @@ class ShearFlow:
     tolerance: float | jax.Array = 1e-4
     max_iterations: int | jax.Array = 5000
     relaxation: float | jax.Array = 1.8
-    activation: Activation = field(default="midpoint", metadata=_STATIC)
+    activation: Activation | float | jax.Array = "midpoint"
     solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
     engine: Engine = field(default="auto", metadata=_STATIC)
 
@@ -83,14 +85,16 @@ class ShearFlow:
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
-        for name, kind in (("activation", Activation), ("solver", Solver), ("engine", Engine)):
+        for name, kind in (("solver", Solver), ("engine", Engine)):
             allowed = get_args(kind)
             value = getattr(self, name)
             if not isinstance(value, str) or value not in allowed:
                 raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")
+        if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
+            require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
         for name, (accepts, words) in _RANGES.items():
             require(name, getattr(self, name), accepts, words)
-        shapes = sorted({np.shape(getattr(self, name)) for name in _RANGES} - {()})
+        shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
         if len(shapes) > 1:
             raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {shown(shapes)}.")
         timestep, shear_rate = known(self.timestep), known(self.shear_rate)
@@ -100,13 +104,17 @@ class ShearFlow:
             raise InputError(f"timestep must be at most 0.1 / shear_rate, not {shown(self.timestep)}.")
 
     @property
-    def activation_fraction(self) -> float:
+    def activation_fraction(self) -> float | jax.Array:
         """θ: fraction of a time step of free flight after which an overlapping pair is a contact."""
-        return 0.5 if self.activation == "midpoint" else 0.0
+        return _LOOK_AHEAD[self.activation] if isinstance(self.activation, str) else self.activation
 
 
 _TRACED_FIELDS = tuple(f.name for f in fields(ShearFlow) if not f.metadata.get("static"))
 _STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("static"))
+
+
+def _traced(flow: ShearFlow, name: str) -> Any:
+    return flow.activation_fraction if name == "activation" else getattr(flow, name)
 
 
 def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
@@ -120,7 +128,7 @@ def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
 jax.tree_util.register_pytree_with_keys(
     ShearFlow,
     lambda flow: (
-        [(jax.tree_util.GetAttrKey(name), getattr(flow, name)) for name in _TRACED_FIELDS],
+        [(jax.tree_util.GetAttrKey(name), _traced(flow, name)) for name in _TRACED_FIELDS],
         tuple(getattr(flow, name) for name in _STATIC_FIELDS),
     ),
     _unflatten,
