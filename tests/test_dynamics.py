@@ -88,6 +88,7 @@ def test_change_of_a_number_compiles_nothing(run, flowing):
     before = run.compiled.traces
     for change in (
         {"restitution": 0.9},
+        {"activation": "touching"},
         {"packing_fraction": 0.59},
         {"timestep": 1e-5},
         {"shear_rate": 2.0},

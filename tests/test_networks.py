@@ -73,6 +73,7 @@ def operator_and_approach(network) -> tuple[np.ndarray, np.ndarray]:
     return matrix[np.ix_(used, used)], np.asarray(network.contacts.approach)[used]
 
 
+@pytest.mark.slow
 def test_collection_is_the_same_twice(networks, monkeypatch):
     """Of the flows, which take long, the two that differ in packing fraction and restitution."""
     monkeypatch.setattr(module, "FLOWS", module.FLOWS[-2:])

@@ -110,7 +110,7 @@ def test_callback_and_observable_together_find_what_the_observable_finds_alone(f
     np.testing.assert_allclose(told.own["stress"], observed[1].own["stress"], rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("axis_name", ["replica", None])
+@pytest.mark.parametrize("axis_name", [pytest.param("replica", marks=pytest.mark.slow), None])
 def test_transformations_apply(flowing, axis_name) -> None:
     states = jax.tree.map(lambda *x: jnp.stack(x), flowing(0.7), flowing(0.7, 1))
 
