@@ -1,12 +1,41 @@
-"""Files of a cache: each is written in one step and read with its checksum, and the oldest are removed."""
+"""Files of a cache: each is written in one step and read with its checksum, and the oldest are removed.
+
+Processes that miss the same file wait for the first of them, and then read what it has written.
+"""
 
 import hashlib
 import os
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+try:
+    import fcntl
+except ImportError:  # a system without such locks: every process writes the file
+    fcntl = None
+
 _DIGEST = 32  # bytes at the beginning of a file: the hash of what follows
+
+
+@contextmanager
+def one_at_a_time(path: Path) -> Iterator[None]:
+    """Wait until no other process is in this block for the same file; it leaves when it ends, however it ends."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        lock = path.with_suffix(".lock").open("w")
+    except OSError:  # nothing can be kept there, so there is nothing to wait for
+        yield
+        return
+    with lock:
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.with_suffix(".lock").unlink()
 
 
 def read_kept(path: Path) -> bytes | None:

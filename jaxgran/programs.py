@@ -22,7 +22,7 @@ from jax import monitoring
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from jaxgran.cache_files import keep, read_kept
+from jaxgran.cache_files import keep, one_at_a_time, read_kept
 from jaxgran.environment import processor_features
 
 _MOST_KEPT = 64  # programs of up to 4 MB
@@ -51,7 +51,11 @@ def kept_jit(function: Callable, register: Callable[[], None] = lambda: None) ->
         key = (structure, tuple(map(jax.typeof, leaves)), _flags())
         if key not in programs:
             path = folder / f"{_digest(function, key)}.program"
-            programs[key] = _loaded(path, register) or _compiled(jitted, arguments, path)
+            found = _loaded(path, register)
+            if found is None:
+                with one_at_a_time(path):
+                    found = _loaded(path, register) or _compiled(jitted, arguments, path)
+            programs[key] = found
         return programs[key](*arguments)
 
     return call

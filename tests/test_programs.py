@@ -1,6 +1,8 @@
 """Compiled programs that are kept on disk: found without tracing, compiled again if anything they depend on changes."""
 
+import time
 from pathlib import Path
+from threading import Thread
 
 import jax
 import jax.numpy as jnp
@@ -97,7 +99,26 @@ def test_program_that_calls_a_library_of_scipy_is_not_kept(folder: Path) -> None
     """Loaded without being lowered, it would call a function that is not there."""
     solved = programs.kept_jit(jnp.linalg.solve)(np.eye(2), np.array([[1.0], [2.0]]))
     np.testing.assert_allclose(solved, [[1.0], [2.0]])
-    assert not folder.exists()
+    assert list(folder.iterdir()) == []
+
+
+def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None:
+    path, inside, most = tmp_path / "cache" / "code.o", [], []
+
+    def enter(name: int) -> None:
+        with cache_files.one_at_a_time(path):
+            inside.append(name)
+            most.append(len(inside))
+            time.sleep(0.01)
+            inside.remove(name)
+
+    threads = [Thread(target=enter, args=(name,)) for name in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1, 1]
+    assert list(path.parent.iterdir()) == []
 
 
 def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ import jax
 from llvmlite import binding as llvm
 from platformdirs import user_cache_path
 
-from jaxgran.cache_files import keep, read_kept
+from jaxgran.cache_files import keep, one_at_a_time, read_kept
 
 TARGET = "jaxgran_advance"
 _MOST_KEPT = 8  # versions of the machine code in the cache
@@ -62,18 +62,8 @@ def register() -> None:
     path = object_file()
     content = read_kept(path)
     if content is None:
-        from jaxgran.dynamics.machine_code.handler import object_code
-
-        content = object_code(TARGET, machine)
-        try:
-            keep(path, content, _MOST_KEPT)
-        except OSError as error:
-            warnings.warn(
-                f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
-                f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
-                "one that can.",
-                stacklevel=2,
-            )
+        with one_at_a_time(path):
+            content = read_kept(path) or _compiled(path, machine)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
@@ -81,6 +71,23 @@ def register() -> None:
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     jax.ffi.register_ffi_target(TARGET, new(engine.get_function_address(TARGET), None, None), platform="cpu")
+
+
+def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
+    """The machine code, compiled and kept if possible."""
+    from jaxgran.dynamics.machine_code.handler import object_code
+
+    content = object_code(TARGET, machine)
+    try:
+        keep(path, content, _MOST_KEPT)
+    except OSError as error:
+        warnings.warn(
+            f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
+            f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
+            "one that can.",
+            stacklevel=3,
+        )
+    return content
 
 
 _ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the machine code
