@@ -61,6 +61,9 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
     assert without == {"seed", "axis_a", "axis_b", "status", "status_by_seed"}
     for name, (_, units) in OBSERVABLES.items():
         assert data[name].attrs["units"] == data[f"{name}_stderr"].attrs["units"] == units
+    by_hand = {"timestep_by_seed": "1 / shear rate", "strain_by_seed": "1", "contact_force": "m sigma / t^2"}
+    by_hand |= {"pressure": "m / t^2", "granular_temperature": "m sigma^2 / t^2", "max_overlap": "sigma"}
+    assert {name: data[name].attrs["units"] for name in by_hand} == by_hand
 
 
 def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:

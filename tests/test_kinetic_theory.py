@@ -12,7 +12,7 @@ import pytest
 from jaxgran.theory import gaussian_moments as moments_module
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
-from jaxgran.theory.steady_shear import SteadyShear, contact_value
+from jaxgran.theory.steady_shear import SteadyShear, contact_value, maxwellian_collision_rate
 
 PLANE = [axis.ravel() for axis in np.meshgrid(np.append(np.arange(0, 1, 0.1), 0.99), [0.01, 0.1, 0.3, 0.5, 0.7, 0.83])]
 
@@ -62,6 +62,24 @@ def test_moments_come_close_to_event_driven_discs(packing_fraction, restitution,
     predicted = moments(restitution, packing_fraction)
     np.testing.assert_allclose(predicted.pressure, pressure, rtol=0.06)
     np.testing.assert_allclose(predicted.collision_rate, collision_rate, rtol=0.06)
+
+
+@pytest.mark.parametrize("restitution", [0.3, 0.5, 0.9])
+def test_collisions_are_those_of_the_velocities_in_the_source(restitution):
+    """The mean relative speed of a Maxwellian with a Sonine term of weight a₂, by quadrature, to first order in a₂."""
+    nodes, weights = np.polynomial.hermite.hermgauss(16)
+    c = np.stack(np.meshgrid(*[nodes] * 4, indexing="ij"))
+    weight = np.prod(np.meshgrid(*[weights] * 4, indexing="ij"), axis=0)
+    squared = c[0] ** 2 + c[1] ** 2
+    speed = np.hypot(c[0] - c[2], c[1] - c[3])
+    change = 2 * np.sum(weight * (squared**2 / 2 - 2 * squared + 1) * speed) / np.sum(weight * speed)
+    alpha, nu = restitution, 0.4
+    kurtosis = 16 * (1 - alpha) * (1 - 2 * alpha**2) / (57 - 25 * alpha + 30 * alpha**2 * (1 - alpha))
+    found = garzo_dufty(alpha, nu)
+    maxwellian = maxwellian_collision_rate(4 * nu / np.pi, contact_value(nu), found.granular_temperature)
+    excess = float(found.collision_rate / maxwellian) - 1
+    assert abs(excess) > 1e-4
+    assert excess == pytest.approx(change * kurtosis, rel=0.1)  # of the quadrature, whose integrand has a cusp
 
 
 @pytest.mark.parametrize("theory", THEORIES)

@@ -160,5 +160,10 @@ def test_drift_and_its_error_hold_for_correlated_noise(correlation: float) -> No
     assert abs(covered - 0.954) < 4 * np.sqrt(0.954 * 0.046 / trials) + 0.01
 
 
+def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:
+    """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means have half of it."""
+    assert drift(np.array([0.0, 2.0, 5.0, 7.0])) == (5.0, pytest.approx(np.sqrt(4 / 2)))
+
+
 def test_drift_of_a_record_with_nan_is_nan() -> None:
     assert np.isnan(drift(np.array([1.0, np.nan, 1.0, 1.0]))).all()
