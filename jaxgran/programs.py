@@ -36,7 +36,8 @@ def kept_jit(function: Callable, register: Callable[[], None] = lambda: None) ->
     """``jax.jit`` of a function, with its compiled programs kept on disk where JAX has a folder for its cache.
 
     Args:
-      function: a function of pytrees of arrays, without static arguments.
+      function: a function of pytrees of arrays, without static arguments. The flags of JAX are read when it is first
+        called for some shapes.
       register: called before a program that calls the machine code is loaded.
     """
     jitted = jax.jit(function)
@@ -48,7 +49,7 @@ def kept_jit(function: Callable, register: Callable[[], None] = lambda: None) ->
         folder = _folder()
         if folder is None or any(isinstance(leaf, Tracer) for leaf in leaves):
             return jitted(*arguments)
-        key = (structure, tuple(map(jax.typeof, leaves)), _flags())
+        key = (structure, tuple(map(jax.typeof, leaves)))
         if key not in programs:
             path = folder / f"{_digest(function, key)}.program"
             found = _loaded(path, register)
@@ -86,7 +87,7 @@ def _origin() -> str:
 
 
 def _digest(function: Callable, key: tuple) -> str:
-    words = f"{_origin()}\n{function.__module__}.{function.__qualname__}\n{key}"
+    words = f"{_origin()}\n{_flags()}\n{function.__module__}.{function.__qualname__}\n{key}"
     return hashlib.sha256(words.encode()).hexdigest()[:32]
 
 

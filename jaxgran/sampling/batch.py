@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import wraps
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, PartitionSpec
@@ -28,6 +29,7 @@ Report = Callable[[float], None]  # called with the replica-steps done since the
 Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
 Wrap = Callable[[Drive], Drive]  # adds reports or records to a drive; states stay the same
 _DEVICES = "devices"
+_GROUP = 4  # replicas of a compiled program that advances them in turn
 
 
 def stack(flows: list[ShearFlow]) -> ShearFlow:
@@ -92,24 +94,37 @@ def _on_all_devices(batched: Callable) -> Callable:
 def batch_program(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
     """The compiled function of one replica for a batch; its first argument is the flow.
 
-    Replicas that advance in turn are calls of one program, whose shapes do not depend on the size of the batch. For
+    Replicas that advance in turn do so in groups of one size. So one compiled program serves batches of any size. For
     ``register`` see ``kept_jit``.
     """
 
     @wraps(function)
-    def replicated_function(flow, *arguments):
+    def all_replicas(flow, *arguments):
         return replicated(function, flow.engine)(flow, *arguments)
 
-    together, in_turn = kept_jit(replicated_function, register), kept_jit(function, register)
+    @wraps(function)
+    def group(real, arguments):
+        def one(real, arguments):
+            empty = jax.eval_shape(function, *arguments)
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
+            return lax.cond(real, lambda: function(*arguments), lambda: zeros)
+
+        return lax.map(lambda each: one(*each), (real, arguments))
+
+    together, in_group = kept_jit(all_replicas, register), kept_jit(group, register)
 
     @wraps(function)
     def program(flow, *arguments):
         if in_lockstep(flow.engine) or jax.device_count() > 1:
             return together(flow, *arguments)
         batch = jax.tree.map(_on_host, (flow, *arguments))
-        replicas = range(len(jax.tree.leaves(batch)[0]))
-        results = [in_turn(*jax.tree.map(lambda x, k=k: x[k], batch)) for k in replicas]
-        return jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *results)
+        count = len(jax.tree.leaves(batch)[0])
+        groups = []
+        for first in range(0, count, _GROUP):
+            places = np.arange(first, first + _GROUP)
+            filled = jax.tree.map(lambda x, k=places: x[np.minimum(k, count - 1)], batch)
+            groups.append(jax.tree.map(np.asarray, in_group(places < count, filled)))
+        return jax.tree.map(lambda *x: np.concatenate(x)[:count], *groups)
 
     return program
 
