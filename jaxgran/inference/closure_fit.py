@@ -13,13 +13,13 @@ import xarray as xr
 from jaxtyping import Array
 from scipy.optimize import brentq
 
-from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, broadcast, excess_terms, require_jamming, stress_terms
+from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, excess_terms, require_jamming, stress_terms
 from jaxgran.maps.schema import require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
+from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.timestep import JAMMING
-from jaxgran.theory.gaussian_moments import gaussian_moments
 
 FEWEST_POINTS = 12  # of a map
 FEWEST_VALUES = 3  # of restitution, and of packing fraction, among the points
@@ -52,9 +52,7 @@ def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
     """
     require_map(data, *NEEDED)
     require_jamming(jamming_fraction)
-    points = closure_points(data)
-    require_enough(points, FEWEST_POINTS)
-    return fit_points(points, jamming_fraction)
+    return fit_points(closure_points(data), jamming_fraction)
 
 
 class Points(NamedTuple):
@@ -84,7 +82,7 @@ class Points(NamedTuple):
         return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "timestep"})
 
 
-def closure_points(data: xr.Dataset) -> Points:
+def closure_points(data: xr.Dataset, fewest: int = FEWEST_POINTS) -> Points:
     """The points that :func:`fit_closure` fits: of status ok, positive, with known errors, and with α < 1."""
     data = finest(data)
     alpha, nu = (data[name].astype(float).values for name in ("restitution", "packing_fraction"))
@@ -95,7 +93,8 @@ def closure_points(data: xr.Dataset) -> Points:
     if "status" in data:
         known &= table(data, ["status"])[:, 0] == Status.ok
     nu, alpha, values, errors = (x[known] for x in (nu, alpha, values, errors))
-    theory = jax.vmap(gaussian_moments)(*broadcast(restitution=alpha, packing_fraction=nu))
+    require_enough(alpha, nu, fewest)
+    theory = kinetic_theory(alpha, nu)
     pressure, shear_stress = (np.asarray(x, float) for x in (theory.pressure, theory.shear_stress))
     return Points(
         place=np.flatnonzero(known),
@@ -216,10 +215,10 @@ def table(data: xr.Dataset, names: list[str]) -> np.ndarray:
     return np.stack([data[n].transpose("packing_fraction", "restitution").values.ravel() for n in names], axis=1)
 
 
-def require_enough(points: Points, fewest: int) -> None:
-    alphas, nus = (len(np.unique(x)) for x in (points.restitution, points.packing_fraction))
-    if len(points.place) < fewest or min(alphas, nus) < FEWEST_VALUES:
+def require_enough(restitution: np.ndarray, packing_fraction: np.ndarray, fewest: int) -> None:
+    alphas, nus = (len(np.unique(x)) for x in (restitution, packing_fraction))
+    if len(restitution) < fewest or min(alphas, nus) < FEWEST_VALUES:
         raise InputError(
             f"a closure needs at least {fewest} points of status ok, at {FEWEST_VALUES} restitutions below 1 and "
-            f"{FEWEST_VALUES} packing fractions, and there are {len(points.place)} at {alphas} and {nus}."
+            f"{FEWEST_VALUES} packing fractions, and there are {len(restitution)} at {alphas} and {nus}."
         )

@@ -47,12 +47,11 @@ def leave_one_out(data: xr.Dataset, jamming_fraction: float = JAMMING) -> xr.Dat
     """
     require_map(data, *NEEDED, "shear_stress", "shear_stress_stderr")
     require_jamming(jamming_fraction)
-    points = closure_points(data)
-    require_enough(points, FEWEST_POINTS + 1)
+    points = closure_points(data, FEWEST_POINTS + 1)
     indices, closures = np.arange(len(points.place)), []
     for k in indices:
         others = points.chosen(indices != k)
-        require_enough(others, FEWEST_POINTS)
+        require_enough(others.restitution, others.packing_fraction, FEWEST_POINTS)
         closures.append(fit_points(others, jamming_fraction))
     batch = jax.tree.map(lambda *x: np.stack(x), *closures)
     alpha, nu = broadcast(restitution=points.restitution, packing_fraction=points.packing_fraction)

@@ -20,7 +20,7 @@ _LARGEST_RESTITUTION = 0.99  # the temperature diverges at α = 1
 
 
 def kinetic_theory(
-    restitution: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike, polydispersity: ArrayLike
+    restitution: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0, polydispersity: ArrayLike = 0.26
 ) -> SteadyShear:
     """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1."""
     numbers = np.stack(np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1)
