@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+import typer.main
 from synthetic import random_replica
 
 from jaxgran.cli import app, fit, info, measure, run
@@ -19,6 +21,9 @@ from jaxgran.cli import map as map_module
 from jaxgran.model.status import Status
 
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
+
+
+commands = cache(typer.main.get_command)  # Typer makes them anew at every call, which takes longer than a mistake
 
 
 class Outcome(NamedTuple):
@@ -37,6 +42,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
     ):
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
+        patch.setattr(typer.main, "get_command", commands)
         for module in (fit, info, map_module, measure, run):
             patch.setattr(module, "configured_jax", lambda: jax)
         app.main()

@@ -31,6 +31,7 @@ from jaxgran.maps import settings as map_settings
 from jaxgran.maps import sweep
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
+from jaxgran.plotting import map_figures
 from jaxgran.sampling import free_cooling, sample, steady_state, timestep
 
 GRAINS = 32
@@ -577,12 +578,17 @@ def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, t
 # Where things are written
 
 
-@pytest.mark.parametrize("name", ["my first map.nc", "-a'b\"c $d Strömung 流れ.x.nc", "\udcff.nc"])
+PLAIN = pytest.param("my first map.nc", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", [PLAIN, "-a'b\"c $d Strömung 流れ.x.nc", "\udcff.nc"])
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
+    for drawing in ("ratio_curves", "cluster_shares"):
+        monkeypatch.setattr(map_figures, drawing, lambda _: Figure())
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", f"--output={name}")
     assert outcome.status == 0, outcome.err
     stem = name.removesuffix(".nc")
