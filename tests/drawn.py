@@ -1,6 +1,17 @@
 """What a figure shows, as text."""
 
+from pathlib import Path
+
+import pytest
 from matplotlib.figure import Figure
+
+from jaxgran.plotting import ratio, theory
+
+
+def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
+    """Figures keep their parts where Matplotlib puts them first: the layout takes longer than all that is drawn."""
+    for module in (ratio, theory):
+        patch.setattr(module, "fix_layout", lambda figure: figure.set_layout_engine("none"))
 
 
 def legend_texts(figure: Figure) -> list[str]:
@@ -9,3 +20,8 @@ def legend_texts(figure: Figure) -> list[str]:
 
 def caption(figure: Figure) -> str:
     return figure.get_supxlabel()
+
+
+def write_without_drawing(patch: pytest.MonkeyPatch) -> None:
+    """Pictures are files of a few bytes, for tests of which files are written."""
+    patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, legend_texts
+from drawn import caption, leave_out_layout, legend_texts, write_without_drawing
 from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
 from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
@@ -14,6 +14,17 @@ from matplotlib.figure import Figure
 
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
+
+
+@pytest.fixture
+def page() -> None:
+    """A test of what stands where on the page asks for it."""
+
+
+@pytest.fixture(autouse=True)
+def layout_of_pages_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "page" not in request.fixturenames:
+        leave_out_layout(monkeypatch)
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
@@ -249,7 +260,7 @@ def test_bad_status_has_a_ring_at_its_time_step() -> None:
 @pytest.mark.parametrize(
     "timesteps", [(1e-2, 1e-3, 1e-4), (1e-3, 1e-4), (5e-4, 3e-4), (2e-3, 5e-4), (1e-3, 9e-4, 8e-4)]
 )
-def test_time_step_axis_has_at_least_two_numbers(timesteps: tuple[float, ...]) -> None:
+def test_time_step_axis_has_at_least_two_numbers(page, timesteps: tuple[float, ...]) -> None:
     figure = ratio_against_timestep(with_timesteps(ratio_dataset(2, 2), *timesteps))
     figure.canvas.draw()
     low, high = figure.axes[0].get_xlim()
@@ -270,8 +281,8 @@ def test_time_steps_without_any_value_are_drawn() -> None:
     assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
 
 
-@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), (5, 5), (10, 12)])
-def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
+@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), pytest.param(5, 5, marks=pytest.mark.slow), (10, 12)])
+def test_panels_of_time_steps_do_not_overlap(page, alphas: int, nus: int) -> None:
     data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 3e-4, 1e-5)
     data.status[0, 1, 0] = 1
     figure = ratio_against_timestep(data)
@@ -288,7 +299,7 @@ def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
         assert not any(box.overlaps(other) for k, box in enumerate(labels) for other in labels[:k])
 
 
-def test_nothing_overlaps_on_the_page() -> None:
+def test_nothing_overlaps_on_the_page(page) -> None:
     data = ratio_dataset()
     data.status[5, 0] = 1
     for figure in (ratio_curves(data), ratio_contours(no_value(data, (5, 2)))):
@@ -300,18 +311,20 @@ def test_nothing_overlaps_on_the_page() -> None:
             assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
 
 
-def test_files_are_written_whole(tmp_path: Path) -> None:
+def test_files_are_written_whole(page, tmp_path: Path) -> None:
     written = save_figures(ratio_dataset(), tmp_path / "my.map")
     assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
     assert sorted(tmp_path.iterdir()) == sorted(written)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
 
 
-def test_line_of_points_writes_only_the_curves(tmp_path: Path) -> None:
+def test_line_of_points_writes_only_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_without_drawing(monkeypatch)
     assert save_figures(ratio_dataset(alphas=1), tmp_path / "line") == [tmp_path / "line_curves.png"]
 
 
-def test_several_time_steps_have_a_file_of_their_own(tmp_path: Path) -> None:
+def test_several_time_steps_have_a_file_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_without_drawing(monkeypatch)
     written = save_figures(with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4), tmp_path / "map")
     assert [path.name for path in written] == ["map_curves.png", "map_contours.png", "map_timestep.png"]
     assert sorted(tmp_path.iterdir()) == sorted(written)

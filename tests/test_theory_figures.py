@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, legend_texts
+from drawn import caption, leave_out_layout, legend_texts, write_without_drawing
 from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
@@ -21,6 +21,17 @@ from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, 
 
 DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress, relative
+
+
+@pytest.fixture
+def page() -> None:
+    """A test of what stands where on the page asks for it."""
+
+
+@pytest.fixture(autouse=True)
+def layout_of_pages_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "page" not in request.fixturenames:
+        leave_out_layout(monkeypatch)
 
 
 def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
@@ -187,7 +198,7 @@ def test_error_within_its_noise_is_dotted() -> None:
     assert "within ± std. error" not in legend_texts(figure)
 
 
-def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> None:
+def test_points_without_a_prediction_are_hatched_but_keep_the_collisions(page) -> None:
     data = theory_dataset()
     elastic = data.restitution == data.restitution[-1]
     data = data.assign({name: data[name].where(~elastic) for name in ("theory_pressure", "theory_shear_stress")})
@@ -277,7 +288,7 @@ def test_excess_too_small_for_the_axis_is_counted() -> None:
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
-def test_line_of_points_has_shares_without_a_plane(alphas: int, nus: int) -> None:
+def test_line_of_points_has_shares_without_a_plane(page, alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
     data.status[0, 0] = 1
     figure = cluster_shares(data)
@@ -355,7 +366,7 @@ def test_restitution_with_too_few_points_says_so() -> None:
 
 @pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
 @pytest.mark.parametrize(("alphas", "nus"), [(2, 2), pytest.param(5, 6, marks=pytest.mark.slow), (10, 12)])
-def test_nothing_overlaps_on_the_page(draw, alphas: int, nus: int) -> None:
+def test_nothing_overlaps_on_the_page(page, draw, alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
     data.status[1, 1] = 1
     data = data.assign(force_ratio=data.force_ratio.where(data.restitution > 0.1))
@@ -363,7 +374,7 @@ def test_nothing_overlaps_on_the_page(draw, alphas: int, nus: int) -> None:
 
 
 @pytest.mark.parametrize("alphas", [(0.5,), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98)])
-def test_laws_do_not_overlap_on_the_page(alphas: tuple[float, ...]) -> None:
+def test_laws_do_not_overlap_on_the_page(page, alphas: tuple[float, ...]) -> None:
     data = dense_dataset(alphas=alphas, nus=10)
     data.status[0, 0] = 2
     assert_nothing_overlaps(friction_figure(data))
@@ -402,7 +413,10 @@ def test_shortest_time_step_is_drawn(draw) -> None:
     ],
     ids=["all", "line", "no theory", "dense", "few"],
 )
-def test_figures_are_written_where_the_map_has_their_data(data: xr.Dataset, names: list[str], tmp_path: Path) -> None:
+def test_figures_are_written_where_the_map_has_their_data(
+    data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_without_drawing(monkeypatch)
     written = save_figures(data, tmp_path / "map")
     assert [path.name for path in written] == [f"map_{name}.png" for name in names]
     assert sorted(tmp_path.iterdir()) == sorted(written)
