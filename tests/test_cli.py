@@ -17,6 +17,7 @@ import pytest
 import typer
 import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, in_a_process, jaxgran, made_up_replicas
+from drawn import leave_out_layout, write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up_maps import known_closure, made_up_map
@@ -544,6 +545,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
         path.touch()
         return path
 
+    leave_out_layout(monkeypatch)
     monkeypatch.setattr(sweep, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
     monkeypatch.setattr("jaxgran.maps.settings._temperature", lambda flows: np.full(np.shape(flows.restitution), 0.1))
@@ -568,6 +570,7 @@ def test_version_is_printed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", [["--show-completion", "bash"], ["--help"]])
 def test_completion_is_offered_and_its_script_calls_the_command(words: list[str], tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
+    monkeypatch.setattr("command_line.commands", typer.main.get_command)  # made anew, as they depend on this variable
     outcome = jaxgran(tmp_path, *words)
     assert outcome.status == 0
     assert (
@@ -664,6 +667,8 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
 def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_theirs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    leave_out_layout(monkeypatch)
+    write_without_drawing(monkeypatch)
     statuses = {(point, 0): Status.deep_overlap if point == 3 else Status.ok for point in range(4)}
     monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--timestep", "1e-3,1e-4")
@@ -698,6 +703,8 @@ def test_single_time_step_is_a_number_and_no_dimension(
 
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave_out_layout(monkeypatch)
+    write_without_drawing(monkeypatch)
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130
