@@ -179,7 +179,7 @@ def test_missing_points_leave_the_rest() -> None:
         assert not inside.any()
 
 
-def test_map_without_any_value_is_drawn() -> None:
+def test_map_without_any_value_is_drawn(page) -> None:
     data = ratio_dataset()
     empty = no_value(data, *np.ndindex(data.force_ratio.shape))
     for figure in (ratio_curves(empty), ratio_contours(empty)):

@@ -381,7 +381,7 @@ def test_laws_do_not_overlap_on_the_page(page, alphas: tuple[float, ...]) -> Non
 
 
 @pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
-def test_map_without_any_value_is_drawn(draw) -> None:
+def test_map_without_any_value_is_drawn(draw, page) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
     figure = draw(empty)
