@@ -86,7 +86,10 @@ def map_command(
     chosen = (PRESETS[preset] if like is None else _like(like)) | {
         name: value for name, value in given.items() if value is not None
     }
-    data, interrupted = measured(chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler)
+    figures = ["jaxgran.plotting.map_figures"]
+    data, interrupted = measured(
+        chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler, load=figures
+    )
 
     from jaxgran.plotting.map_figures import save_figures
 

@@ -4,7 +4,9 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from threading import Thread
 from typing import Any, Literal
@@ -34,11 +36,12 @@ def measured(
     resume: bool | None = None,
     scheduler: str | None = None,
     record: Callable | None = None,
+    load: Iterable[str] = (),
 ):
     """Run a map with progress, write its dataset, and return it and whether it was interrupted.
 
     If ``resume`` is True or False, a checkpoint is kept beside the output; True continues an earlier one. For
-    ``record`` and the other arguments see ``replicas``.
+    ``record`` and the other arguments see ``replicas``. Modules named in ``load`` are imported while the flows run.
     """
     jax = configured_jax()
     from jaxgran.maps.checkpoint import Checkpoint
@@ -68,7 +71,7 @@ def measured(
     if resume:
         _say_resumed(checkpoint, count)
 
-    Thread(target=_load_xarray, daemon=True).start()
+    Thread(target=_load_beside, args=(settings, load), daemon=True).start()
     start, interrupted, finished = time.perf_counter(), False, False
     try:
         with progress(costs, settings.seeds, quiet) as meter:
@@ -100,13 +103,19 @@ def measured(
     return data, interrupted
 
 
-def _load_xarray() -> None:
-    """Load what writes the dataset while the flows run; its first dataset loads as much again."""
-    import xarray
+def _load_beside(settings, modules: Iterable[str]) -> None:
+    """Load, beside the flows, their machine code and what is needed at the end; errors come back where it is used."""
+    with suppress(Exception):
+        from jaxgran.dynamics.advance import register_machine_code
+        from jaxgran.dynamics.engine import select_engine
 
-    import jaxgran.maps.results  # noqa: F401
+        if select_engine(settings.flows()[0]) == "machine_code":
+            register_machine_code()
+        for name in ("jaxgran.maps.dataset", "jaxgran.maps.results", *modules):
+            import_module(name)
+        import xarray
 
-    xarray.Dataset({"numbers": ("numbers", [0.0])})
+        xarray.Dataset({"numbers": ("numbers", [0.0])})  # the first dataset loads as much again
 
 
 def _say_resumed(checkpoint, count: int) -> None:

@@ -13,6 +13,7 @@ import warnings
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from threading import Lock
 
 import jax
 from llvmlite import binding as llvm
@@ -21,6 +22,7 @@ from platformdirs import user_cache_path
 from jaxgran.cache_files import keep, one_at_a_time, read_kept
 
 TARGET = "jaxgran_advance"
+_LOCK = Lock()
 _MOST_KEPT = 8  # versions of the machine code in the cache
 _IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
@@ -51,9 +53,14 @@ def object_file() -> Path:
     return folder / f"{digest.hexdigest()[:16]}.o"
 
 
-@cache
 def register() -> None:
-    """Compile the machine code, or load what is kept of it, and tell XLA where it is."""
+    """Compile the machine code, or load what is kept of it, and tell XLA where it is; once in a process."""
+    with _LOCK:
+        _register()
+
+
+@cache
+def _register() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     processor, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
