@@ -39,7 +39,7 @@ from jaxgran.model.status import Status
 from jaxgran.plotting import movie
 
 SMALL_MAP = (
-    "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 64 --seeds 1 --timestep 1e-3 "
+    "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
@@ -345,7 +345,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
 
 
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
-    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 64 --error 0.1 --output flow.nc"
+    words = "run --restitution 0.7 --packing-fraction 0.6 --grains 32 --error 0.1 --output flow.nc"
     outcome = jaxgran(tmp_path, *words.split())
     data = read_dataset(tmp_path / "flow.nc")
     assert data.attrs["error"] == 0.1

@@ -21,7 +21,7 @@ from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 KEYS = [(0, 0), (1, 0)]
-GRAINS = 64  # as in the tests of the protocol: compiled once
+GRAINS = 32  # as in the tests of the protocol: compiled once
 
 
 class CutOff(Exception):

@@ -23,7 +23,7 @@ from jaxgran.model.status import Status
 SETTINGS = {
     "restitution": (0.5, 0.9),
     "packing_fraction": (0.6,),
-    "grains": 64,
+    "grains": 32,
     "seeds": 2,
     "timestep": 1e-3,
     "equilibrate": 0.5,
