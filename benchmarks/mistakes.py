@@ -45,7 +45,7 @@ MISTAKES = (
         "return 2 * fastest * (1 + LIFE) + rate * distance / 2",
         "return 1 * fastest * (1 + LIFE) + rate * distance / 2",
         "a list of near pairs holds until two of the fastest grains could have crossed its skin",
-        (*_ENGINES, "test_own_grains.py"),
+        _ENGINES,
     ),
     Mistake(
         "half of a closing gap",

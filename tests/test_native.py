@@ -20,7 +20,7 @@ from jaxgran.dynamics import engine as engine_module
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
 from jaxgran.dynamics.machine_code import cluster_solver, layout
-from jaxgran.dynamics.machine_code.near_pairs import find_near_pairs
+from jaxgran.dynamics.machine_code.near_pairs import LIFE, find_near_pairs, skin_loss
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.dynamics.thread_block import kernel, solver
 from jaxgran.model.checks import InputError
@@ -336,6 +336,25 @@ def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass,
     after, tally = native_run(replace(of(0.6, shear_rate=shear_rate), max_iterations=100), state, 20)
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    fastest=st.floats(0.1, 10),
+    distance=st.floats(0.8, 3),
+    angles=st.tuples(*[st.floats(0, 2 * np.pi)] * 3),
+    strain=st.floats(1e-6, LIFE),
+    shear_rate=st.sampled_from([1.0, 3.0]),
+)
+@example(fastest=1.0, distance=1.0, angles=(0.0, np.pi, 0.0), strain=0.01, shear_rate=1.0)  # head on
+def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distance, angles, strain, shear_rate) -> None:
+    """Both grains fly straight in the laboratory, with the largest peculiar speed in any directions."""
+    apart = distance * np.array([np.cos(angles[0]), np.sin(angles[0])])
+    (ci, si), (cj, sj) = ((np.cos(a), np.sin(a)) for a in angles[1:])
+    velocity = fastest * np.array([ci - cj, si - sj]) + [shear_rate * apart[1], 0]
+    time = strain / shear_rate
+    closed = distance - np.linalg.norm(apart + velocity * time)
+    assert closed <= skin_loss.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
 
 
 near_pairs_found = njit(find_near_pairs.py_func)  # with a way in from Python
