@@ -21,6 +21,7 @@ MAP_EXAMPLES = {
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
     "Until the errors are below 2 %, continued after an interruption": "jaxgran map --error 0.02 --resume",
 }
+NOT_DRAWN = ("_by_seed", "_correlation_strain")  # endings of variables that no figure shows; there are many
 PLOT_EXAMPLES = {
     "The figures of a map, in its folder": "jaxgran plot jaxgran_map.nc",
     "In another folder": "jaxgran plot ratio.nc --output figures",
@@ -107,7 +108,7 @@ def plot_command(
     from jaxgran.maps.results import read_dataset
     from jaxgran.plotting.map_figures import save_figures
 
-    data = read_dataset(file)
+    data = read_dataset(file, without=NOT_DRAWN)
     folder = file.parent if output is None else output
     if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
         raise InputError(f"output must be a folder that exists and can be written to, not {shown(str(folder))}.")

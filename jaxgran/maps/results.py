@@ -24,14 +24,14 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
         temporary.write_bytes(content.getbuffer())
 
 
-def read_dataset(path: Path) -> xr.Dataset:
-    """Read a dataset of ``write_dataset``; InputError if the file is not one."""
+def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
+    """Read a dataset of ``write_dataset``, without variables of given endings; InputError if the file is not one."""
     if not os.path.isfile(path):
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
         with h5py.File(path, "r") as file:  # h5netcdf would print a second error for a file it cannot open
-            file.attrs.get("_nc3_strict")
-        data = xr.load_dataset(path, engine="h5netcdf")
+            left_out = [name for name in file if without and name.endswith(without)]
+        data = xr.load_dataset(path, engine="h5netcdf", drop_variables=left_out)
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
