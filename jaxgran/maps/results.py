@@ -30,7 +30,7 @@ def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
         with h5py.File(path, "r") as file:  # h5netcdf would print a second error for a file it cannot open
-            left_out = [name for name in file if without and name.endswith(without)]
+            left_out = [name for name in map(str, file) if name.endswith(without)]
         data = xr.load_dataset(path, engine="h5netcdf", drop_variables=left_out)
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
