@@ -630,7 +630,7 @@ def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monke
 
 
 def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupts(_) -> NoReturn:
+    def interrupts(*_, **__) -> NoReturn:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(map_module, "say_written", interrupts)
