@@ -4,7 +4,7 @@ For each, the nearest tests are run in one process until one fails. If none fail
 and written is the first test that fails. The nearest tests are also run without a mistake: a test that fails there
 finds nothing. The working tree is never changed. What unchanged code compiles to is shared by all runs.
 
-    python -m benchmarks mutants                               # 1 to 3 hours on two cores
+    python -m benchmarks mutants                               # 20 minutes on two cores
     python -m benchmarks mutants --quick                       # three mistakes, and their nearest tests only
     python -m benchmarks mutants --only "sign of the tilt"     # one mistake; writes nothing
 """

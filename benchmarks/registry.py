@@ -213,7 +213,7 @@ BENCHMARKS = (
     Benchmark(
         "mutants",
         "Do the tests find mistakes of one word, made in a copy of the code?",
-        (120, 2),
+        (20, 2),
         options=(Option("--only", "one mistake alone, by its name; writes nothing"),),
     ),
 )
