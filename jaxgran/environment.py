@@ -1,5 +1,6 @@
 """Software and hardware of a run: versions, commit, processor, cores, memory, devices and precision."""
 
+import hashlib
 import os
 import platform
 import subprocess
@@ -40,6 +41,11 @@ def processor_features() -> str:
     """The list of the processor's instruction sets; its name on systems without such a list."""
     features = (line for line in processor_lines() if line.startswith(("flags", "Features")))
     return next(features, platform.processor())
+
+
+def processor_kind() -> str:
+    """A name for folders of compiled programs: processors with the same instruction sets have the same."""
+    return hashlib.sha256(processor_features().encode()).hexdigest()[:12]
 
 
 def processor_lines() -> list[str]:

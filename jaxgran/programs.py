@@ -22,8 +22,8 @@ from jax import monitoring
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from jaxgran.cache_files import keep, one_at_a_time, read_kept
 from jaxgran.environment import processor_features
+from jaxgran.files import keep, one_at_a_time, read_kept
 
 _MOST_KEPT = 64  # programs of up to 4 MB
 _PACKAGES = ("jax", "jaxlib", "numpy")

@@ -9,7 +9,6 @@ XLA leaves out optimisation, and makes a loop of each operation by its older and
 one's own, ``--xla_backend_optimization_level=3``, the tests run what users have.
 """
 
-import hashlib
 import mmap
 import os
 import shutil
@@ -19,7 +18,7 @@ from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
-from jaxgran.environment import processor_features
+from jaxgran.environment import processor_kind
 
 DAYS = 14
 MOST_BYTES = 2**30
@@ -36,7 +35,7 @@ def cache_folder() -> Path:
         return Path(tempfile.mkdtemp(prefix="jaxgran-tests-"))
     if CHOSEN:
         return Path(CHOSEN)
-    kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
+    kind = processor_kind()
     folder = Path(__file__).parents[1] / ".pytest_cache" / "jaxgran" / kind
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

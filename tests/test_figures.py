@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, leave_out_layout, legend_texts, write_without_drawing
+from drawn import caption, legend_texts, write_without_drawing
 from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
 from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
@@ -15,16 +15,7 @@ from matplotlib.figure import Figure
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
 
-
-@pytest.fixture
-def page() -> None:
-    """A test of what stands where on the page asks for it."""
-
-
-@pytest.fixture(autouse=True)
-def layout_of_pages_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "page" not in request.fixturenames:
-        leave_out_layout(monkeypatch)
+pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:

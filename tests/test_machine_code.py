@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import jaxgran
-from jaxgran.cache_files import keep, read_kept
 from jaxgran.dynamics.machine_code import ffi
+from jaxgran.files import keep, read_kept
 
 PACKAGE = Path(jaxgran.__file__).parent
 PROGRAM = """

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran import cache_files, programs
+from jaxgran import files, programs
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_content_that_is_no_program_is_compiled_again(folder: Path) -> None:
     traces: list = []
     counted(traces)(*ARGUMENTS)
     (path,) = folder.iterdir()
-    cache_files.keep(path, b"whole, but no program", 8)
+    files.keep(path, b"whole, but no program", 8)
     counted(traces)(*ARGUMENTS)
     assert len(traces) == 2
 
@@ -106,7 +106,7 @@ def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None
     path, inside, most = tmp_path / "cache" / "code.o", [], []
 
     def enter(name: int) -> None:
-        with cache_files.one_at_a_time(path):
+        with files.one_at_a_time(path):
             inside.append(name)
             most.append(len(inside))
             time.sleep(0.01)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from jaxgran.io.atomic import Damaged, read_arrays, replaced, write_arrays
+from jaxgran.files import replaced
+from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
 
 ARRAYS = {
     "numbers": np.random.default_rng(0).normal(size=(3, 7)),

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, leave_out_layout, legend_texts, write_without_drawing
+from drawn import caption, legend_texts, write_without_drawing
 from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
@@ -23,15 +23,7 @@ DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress, relative
 
 
-@pytest.fixture
-def page() -> None:
-    """A test of what stands where on the page asks for it."""
-
-
-@pytest.fixture(autouse=True)
-def layout_of_pages_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "page" not in request.fixturenames:
-        leave_out_layout(monkeypatch)
+pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
 
 
 def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:

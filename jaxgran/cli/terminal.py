@@ -11,7 +11,6 @@ exit status  meaning
 ===========  ========================================================
 """
 
-import hashlib
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,7 +20,7 @@ import platformdirs
 from rich.console import Console
 from rich.table import Table
 
-from jaxgran.environment import processor_features
+from jaxgran.environment import processor_kind
 
 NO_FILE = 1
 INPUT_MISTAKE = 2
@@ -41,8 +40,7 @@ def configured_jax():
 
 def _compilation_cache() -> str:
     """Folder of compiled programs, one for each kind of processor: several machines may share a home folder."""
-    kind = hashlib.sha256(processor_features().encode()).hexdigest()[:12]
-    return str(Path(platformdirs.user_cache_dir("jaxgran")) / kind)
+    return str(Path(platformdirs.user_cache_dir("jaxgran")) / processor_kind())
 
 
 def say(sentence: str) -> None:

@@ -1,7 +1,4 @@
-"""Files that exist whole or not at all, and arrays on disc with a checksum.
-
-A file is written under a temporary name in its final folder, synced, and renamed. A process that is killed leaves the
-old file or the new one, never half of one.
+"""Places for files, and arrays on disc with a checksum, whole or not at all (``files``).
 
 Arrays are stored as HDF5, followed by the SHA-256 checksum of the HDF5 content. Other readers ignore the checksum. The
 content is assembled and read in memory. So a full disc raises an ``OSError`` with its number, and the HDF5 library,
@@ -13,14 +10,13 @@ import hashlib
 import io
 import json
 import os
-import secrets
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from jaxgran.files import replaced
 from jaxgran.model.checks import InputError, shown
 
 _DIGEST = hashlib.sha256().digest_size  # bytes
@@ -51,21 +47,6 @@ def require_place(path: Path, option: str, ending: str) -> None:
         raise InputError(
             f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
         ) from None
-
-
-@contextmanager
-def replaced(path: Path) -> Iterator[Path]:
-    """The name of a temporary file to write beside ``path``; after success it replaces ``path``."""
-    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
-    try:
-        yield temporary
-        _sync(temporary)
-        os.replace(temporary, path)
-        if os.name == "posix":  # on other systems a folder cannot be opened
-            _sync(path.parent)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
@@ -100,12 +81,3 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             return arrays, json.loads(str(file.attrs["about"]))
     except (OSError, KeyError, ValueError) as error:  # the checksum is right, but the file was not written here
         raise Damaged(f"{path.name} cannot be read: {error}") from error
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file or a folder is on the disc."""
-    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

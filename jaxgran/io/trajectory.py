@@ -40,7 +40,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.io.atomic import replaced, require_place
+from jaxgran.files import replaced
+from jaxgran.io.atomic import require_place
 from jaxgran.model.cell import centred, remap_tilt, wrap
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.grains import Grains

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import xarray as xr
 
-from jaxgran.io.atomic import replaced
+from jaxgran.files import replaced
 from jaxgran.maps.schema import RATIO, what_lacks
 from jaxgran.model.checks import InputError, shown
 

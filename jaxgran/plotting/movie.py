@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.io.atomic import replaced, require_place
+from jaxgran.files import replaced
+from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.flow import BINARY_COLOUR, COLOURS, Colour, Scene, common_scale, draw_picture, scene_of

@@ -19,7 +19,7 @@ import jax
 from llvmlite import binding as llvm
 from platformdirs import user_cache_path
 
-from jaxgran.cache_files import keep, one_at_a_time, read_kept
+from jaxgran.files import keep, one_at_a_time, read_kept
 
 TARGET = "jaxgran_advance"
 _LOCK = Lock()

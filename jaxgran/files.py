@@ -1,11 +1,15 @@
-"""Files of a cache: each is written in one step and read with its checksum, and the oldest are removed.
+"""Files that exist whole or not at all, and those of a cache.
 
-Processes that miss the same file wait for the first of them, and then read what it has written.
+A file is written under a temporary name in its final folder, synced, and renamed. A process that is killed leaves the
+old file or the new one, never half of one.
+
+A file of a cache is read with its checksum, and the oldest are removed. Processes that miss the same file wait for the
+first of them, and then read what it has written.
 """
 
 import hashlib
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,6 +20,21 @@ except ImportError:  # a system without such locks: every process writes the fil
     fcntl = None
 
 _DIGEST = 32  # bytes at the beginning of a file: the hash of what follows
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """The name of a temporary file to write beside ``path``; after success it replaces ``path``."""
+    temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        if os.name == "posix":  # on other systems a folder cannot be opened
+            _sync(path.parent)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager
@@ -54,10 +73,18 @@ def keep(path: Path, content: bytes, most: int) -> None:
       OSError: the folder cannot be made, or not be written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
-        file.write(hashlib.sha256(content).digest() + content)
-    os.replace(file.name, path)
+    with replaced(path) as temporary:
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
     with suppress(OSError):
         kept = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda one: one.stat().st_mtime, reverse=True)
         for old in kept[most:]:
             old.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file or a folder is on the disc."""
+    handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
