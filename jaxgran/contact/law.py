@@ -14,6 +14,8 @@ from typing import Any
 from jax.numpy import ceil, maximum, sqrt, where
 from jaxtyping import Array
 
+from jaxgran.model.status import DEEP_OVERLAP
+
 Number = Any  # a number, or an array of them
 
 LONGEST_STRIDE = 1e4  # step length of the method of Barzilai and Borwein, in units of that of Nesterov's
@@ -156,4 +158,5 @@ def contact_terms(
         approaching,
         overlap,
         impulse * impulse,
+        where(overlap > DEEP_OVERLAP, used, 0),
     )

@@ -19,7 +19,7 @@ from jaxgran.model.control_flow import in_batch, largest_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.model.status import DEEP_OVERLAP, Status
+from jaxgran.model.status import Status
 
 Observe = Callable[[State, Contacts, Array], Any]  # of a time step: the state, its contacts and their impulses
 
@@ -196,8 +196,8 @@ def _impulses(
         jnp.where(clustered, impulses, 0),
         *flags,
     )
-    status = jnp.where(deepest > DEEP_OVERLAP, Status.deep_overlap, Status.ok)
-    status = jnp.maximum(jnp.where(overflow, Status.capacity, status), solution.status).astype(jnp.int32)
+    status = jnp.where(overflow, Status.capacity, Status.ok)
+    status = jnp.maximum(status, solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok
     counts = jnp.stack([jnp.asarray(x, nx.dtype) for x in (jnp.ones_like(bounce), solution.iterations, unconverged)])
     edges = jnp.asarray(RESIDUAL_EDGES[1:-1], nx.dtype)

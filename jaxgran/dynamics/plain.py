@@ -28,6 +28,7 @@ from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact
 from jaxgran.dynamics.flight import LONGEST_FLIGHT, Carry, add_flight, fly, fresh_lists, pairs_now, steps_to_contact
 from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
+from jaxgran.dynamics.velocity_scales import local_temperature, wave_temperature
 from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica, where_active
@@ -88,12 +89,15 @@ def _ended(state: State, end: Carry, unfinished: Callable) -> tuple[State, Tally
 def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: RunningSums) -> tuple[State, Tally]:
     """The state and the tally of an advance that led from a state to these positions, tilt and velocities."""
     grains = state.grains
+    end = State(grains, positions, velocities, state.side, tilt)
     tally = sums.tally(
         energy_change=kinetic_energy(grains, velocities) - kinetic_energy(grains, state.velocities),
+        local_kinetic=sums.duration * local_temperature(end),
+        wave_kinetic=sums.duration * wave_temperature(end),
         momentum_drift=relative_momentum(grains, velocities),
     )
     status = jnp.maximum(sums.status, status_if_finite(positions, velocities))
-    return State(grains, positions, velocities, state.side, tilt), replace(tally, status=status)
+    return end, replace(tally, status=status)
 
 
 def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:

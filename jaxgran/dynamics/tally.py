@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxgran.model.status import DEEP_SHARE, Status
+
 RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
 
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order of the table.
@@ -21,6 +23,7 @@ CONTACT = "contact"  # each contact of a solved network, by the law of a contact
 SOLVE = "solve"  # each solved network
 LARGEST = "largest"  # each solved network; the largest value counts
 AT_END = "end"  # the end of an advance
+INSTANT = "instant"  # the state at the end of an advance, which stands for its whole duration
 KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST)
 _TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
 
@@ -64,10 +67,24 @@ class Tally:
     )
     overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
     squared_impulse: Float[Array, "*b"] = _sum(CONTACT, "m²σ²γ̇²", "squares p² of the contact impulses")
+    deep_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``")
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
+    local_kinetic: Float[Array, "*b"] = _sum(
+        INSTANT, "mσ²γ̇", "granular temperature relative to the mean velocity of a box, at the end, times the duration"
+    )
+    wave_kinetic: Float[Array, "*b"] = _sum(
+        INSTANT, "mσ²γ̇", "granular temperature of the longest waves, at the end, times the duration"
+    )
     momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
+
+    @property
+    def outcome(self) -> Int[Array | np.ndarray, "*b"]:
+        """The status, or ``deep_overlap`` if that is worse and too large a share of the contacts overlaps deeply."""
+        xp = jnp if isinstance(self.status, jax.Array) else np
+        deep = xp.where(self.deep_contacts > DEEP_SHARE * self.contacts, Status.deep_overlap, Status.ok)
+        return xp.maximum(self.status, deep.astype(self.status.dtype))
 
     def __add__(self, other: "Tally") -> "Tally":
         return jax.tree.map(lambda *both: jnp.stack(both), self, other).total(axis=0)
@@ -130,9 +147,14 @@ class RunningSums(NamedTuple):
     status: Int[Array, ""]
     user_sums: Any = ()
 
-    def tally(self, energy_change: Array, momentum_drift: Array) -> Tally:
-        """The tally; what is known only at the end of an advance is given."""
-        ends = {"energy_change": energy_change, "momentum_drift": momentum_drift, "status": self.status}
+    @property
+    def duration(self) -> Float[Array, ""]:
+        """Time so far."""
+        return self._named("duration")
+
+    def tally(self, **ends: Array) -> Tally:
+        """The tally; what is known only at the end of an advance is given by name, but the status."""
+        ends = {**ends, "status": self.status}
         return Tally(**{name: ends[name] if name in ends else self._named(name) for name in TABLE})
 
     def _named(self, name: str) -> Array:
@@ -156,7 +178,7 @@ def empty_sums(dtype: jnp.dtype) -> RunningSums:
 def empty_tally(dtype: jnp.dtype) -> Tally:
     """The tally of no time at all."""
     zero = jnp.zeros((), dtype)
-    return empty_sums(dtype).tally(zero, zero)
+    return empty_sums(dtype).tally(**{name: zero for name, row in TABLE.items() if row["kind"] not in KINDS})
 
 
 def flat_tally(tally: Tally, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a user can choose, and the limits of numbers: names and numbers that need no other module."""
+"""What a user can choose, the limits of numbers, and what an error means: all that needs no other module."""
 
 from typing import Literal
 
@@ -11,4 +11,5 @@ MIN_GRAINS = 16
 MAX_GRAINS = 10**7  # more need over 20 GB of memory
 MAX_REPLICAS = 10**6  # of one map
 MAX_STEPS = 2**31 - 1  # of one sample: an int32 counts the steps
+HALF_INTERVAL = 1.96  # standard errors in half an interval of 95 %
 SHORTEST_TIMESTEP = 1e-8  # 1/γ̇; the longest block of a run then has fewer than MAX_STEPS steps

@@ -28,7 +28,7 @@ NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
 MANY = 2.0**30  # steps, the end of the calendar
 LANES = 64  # entries of the calendar that are compared together
 EPSILON = float(np.finfo(np.float64).eps)
-OK, ITERATION_LIMIT, DEEP = int(Status.ok), int(Status.iteration_limit), int(Status.deep_overlap)
+OK, ITERATION_LIMIT = int(Status.ok), int(Status.iteration_limit)
 INFEASIBLE, CAPACITY, NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
 
 

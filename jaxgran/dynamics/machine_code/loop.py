@@ -28,7 +28,6 @@ from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
 from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     CAPACITY,
-    DEEP,
     EPSILON,
     FIRST,
     INVERSE_MASS,
@@ -57,7 +56,6 @@ from jaxgran.dynamics.machine_code.near_pairs import (
 )
 from jaxgran.dynamics.machine_code.network import gather_kicks, make_network, solve_isolated, sort_by_cluster
 from jaxgran.dynamics.machine_code.sums import add_contacts, add_flight, add_solve
-from jaxgran.model.status import DEEP_OVERLAP
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
@@ -192,7 +190,7 @@ def _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, res
     gather_kicks(contacts, hits, flow.bounce, network)
     add_contacts(results, step_sums, contacts, flow.bounce, grains, network)
     add_solve(results, iterations, residual, outcome, deepest)
-    return hits, max(outcome, DEEP if deepest > DEEP_OVERLAP else OK)
+    return hits, outcome
 
 
 @compiled

@@ -48,7 +48,7 @@ from jaxgran.dynamics.thread_block.memory import (
     Thread,
     status_if,
 )
-from jaxgran.model.status import DEEP_OVERLAP, Status
+from jaxgran.model.status import Status
 
 
 class Solve(NamedTuple):
@@ -179,9 +179,8 @@ def collided(
         overlap=jnp.maximum(counts.overlap, deepest),
         residual=jnp.maximum(counts.residual, residual),
     )
-    deep = status_if(deepest > DEEP_OVERLAP, Status.deep_overlap)
     kicked = motion._replace(cx=motion.cx + bounce * x, cy=motion.cy + bounce * y)
-    return kicked, counts, jnp.maximum(solve.status, deep)
+    return kicked, counts, solve.status
 
 
 class _Descent(NamedTuple):
