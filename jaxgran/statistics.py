@@ -1,14 +1,81 @@
-"""Standard errors of sums over blocks by the jackknife, the correlation of blocks, and the drift of a series."""
+"""Standard errors of estimates from sums over blocks, the correlation of blocks, and the drift of a series.
+
+``standard_errors`` infers how long the blocks remember from the blocks themselves. Its intervals hold where a seed is
+several memories long. ``jackknife`` assumes that merged blocks are independent. Its errors are too small where few
+merged blocks are.
+"""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # blocks in a group; with 32 blocks a seed, the last compares whole seeds
 _FEWEST_GROUPS = 4  # the spread over fewer groups is too uncertain; single blocks are used in any case
+_MOST_BLOCKS = 32  # of a seed in ``standard_errors``; more are merged
+_MEMORIES = np.geomspace(0.2, 20, 12)  # of a series, in blocks
+_WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # of the variance of a block, which the next block does not remember
+_EXPECTED_MEMORY = 2.5  # blocks; longer ones are less and less likely before the blocks are seen
+_LEVEL = 0.95  # of an interval of 1.96 standard errors
+_NORMAL_QUANTILE = 1.959964
+_NEWTON_STEPS = 4
+_MOST_FREEDOM = 2000  # degrees of freedom, from where Student's distribution is Gaussian
 Estimates = dict[str, np.ndarray]
+
+
+class _Posterior(NamedTuple):
+    """What is known about n means: a mixture of Student's t distributions over the (models,) of the correlation.
+
+    ``shift`` is the mean of a model less the plain mean, and ``width`` its scale, both (models, n), as ``weight``.
+    """
+
+    weight: np.ndarray
+    shift: np.ndarray
+    width: np.ndarray
+    freedom: int
+
+
+def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
+    """Estimates from the sums over all blocks of all seeds, and their standard errors.
+
+    The error is the half-width of the 95 % interval over 1.96. So two errors are an interval that holds, also where few
+    blocks are independent and Student's distribution is wide. The series of an estimate is the influence of each block,
+    from the jackknife. It is a mean plus Gaussian noise with the correlation
+
+        R_ij = (1 - w) exp(-|i - j| / t) + w δ_ij
+
+    within a seed, and none between seeds: a first-order autoregressive process plus white noise. The memory t, in
+    blocks, and the white share w are not known. For given (t, w), with flat priors of the mean and of ln σ, the mean is
+    distributed as Student's t with M - 1 degrees of freedom for M blocks in all. Its centre is the generalised
+    least-squares mean μ = 1'R⁻¹x / 1'R⁻¹1, its scale is S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its
+    weight is |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 memories from 0.2 to 20
+    blocks and three white shares, around the plain mean. The prior is t^(1/4) / (1 + (t/2.5)²) in ln t and flat in w.
+
+    With 32 blocks of a seed, intervals of sheared flows hold where a seed is eight memories of the flow long or more,
+    and those of most flows from four (``python -m benchmarks coverage``).
+
+    Args:
+      estimate: maps a pytree of sums with any leading axes to named estimates with the same leading axes.
+      sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
+
+    Returns:
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks,
+      and zero where all blocks are equal.
+
+    Examples:
+      Eight blocks that drift. Independent blocks would have an error of 0.87.
+
+      >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
+      >>> value, error = standard_errors(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
+      >>> float(value["mean"]), round(float(error["mean"]), 1)
+      (4.5, 2.4)
+    """
+    whole, influence, scale, named = _influences(estimate, sums)
+    if influence.shape[0] * influence.shape[1] < 2:
+        return named(whole), named(np.full_like(whole, np.nan))
+    return named(whole), named(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
 
 
 def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
@@ -78,6 +145,92 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
     correlation = np.clip(lagged, least_correlation, 0.9)
     variance = squares / (2 * half - 2) * 2 / half
     return float(means[1] - means[0]), float(np.sqrt(variance * (1 + correlation) / (1 - correlation)))
+
+
+def _influences(
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Callable[[np.ndarray], Estimates]]:
+    """All estimates (n,), influences of at most ``_MOST_BLOCKS`` blocks (seeds, blocks, n), their scale, and names.
+
+    The influence of a block is n_blocks θ - (n_blocks - 1) θ without the block, less the mean of all, over the scale.
+    """
+    seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
+    fewer = min(blocks, _MOST_BLOCKS)
+    first = np.arange(fewer) * blocks // fewer
+    merged = jax.tree.map(lambda x: np.add.reduceat(x, first, axis=1), sums)
+    merges = [1] if seeds * fewer > 1 else []
+    flat, named = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), merged)))
+    without = flat[1:].astype(float) if merges else np.full(flat.shape, np.nan)
+    influence = (seeds * fewer - 1) * (without.mean(axis=0) - without)
+    scale = np.sqrt(np.mean(influence**2, axis=0))
+    influence = influence / np.where(scale > 0, scale, 1)
+    return flat[0], influence.reshape(seeds, fewer, -1), scale, named
+
+
+@lru_cache(maxsize=_MOST_BLOCKS)
+def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Eigenvectors (memories, blocks, modes), eigenvalues (memories, white, modes) and logarithm of the prior."""
+    lag = np.abs(np.subtract.outer(np.arange(blocks), np.arange(blocks)))
+    values, vectors = np.linalg.eigh(np.exp(-lag / _MEMORIES[:, None, None]))
+    eigenvalues = (1 - _WHITE_SHARES[:, None]) * values[:, None] + _WHITE_SHARES[:, None]
+    prior = np.log(_MEMORIES**0.25 / (1 + (_MEMORIES / _EXPECTED_MEMORY) ** 2))
+    return vectors, eigenvalues, np.repeat(prior, len(_WHITE_SHARES))
+
+
+def _posterior(series: np.ndarray) -> _Posterior:
+    """Posterior of the means of n series (seeds, blocks, n) with plain mean zero; see ``standard_errors``."""
+    seeds, blocks, count = series.shape
+    vectors, eigenvalues, prior = _correlation_models(blocks)
+    models, freedom = len(prior), seeds * blocks - 1
+    flat = series.transpose(1, 0, 2).reshape(blocks, -1)
+    modes = vectors.swapaxes(1, 2) @ flat  # (memories, modes, seeds * n)
+    ones = vectors.sum(axis=1)[:, None]
+    squares = (modes**2).reshape(len(modes), blocks, seeds, count).sum(axis=2)
+    sums = modes.reshape(len(modes), blocks, seeds, count).sum(axis=2)
+    information = seeds * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
+    weighted = ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
+    square = ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
+    shift = weighted / information
+    residual = np.maximum(square - weighted * shift, np.finfo(float).tiny)
+    determinant = seeds * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
+    log_weight = prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2
+    weight = np.exp(log_weight - log_weight.max(axis=0))
+    return _Posterior(weight / weight.sum(axis=0), shift, np.sqrt(residual / (freedom * information)), freedom)
+
+
+def _half_width(posterior: _Posterior) -> np.ndarray:
+    """Half-width (n,) of the interval around zero that holds a mean with the probability ``_LEVEL``.
+
+    It is found by Newton's method. Student's distribution is interpolated from a table of z/√(ν + z²), because it is
+    evaluated 300 times for each mean.
+    """
+    weight, shift, width, freedom = posterior
+    freedom = min(freedom, _MOST_FREEDOM)
+    places, probability, density, quantile = _student(freedom)
+    half = np.sqrt(np.sum(weight * ((quantile * width) ** 2 + shift**2), axis=0))
+    for _ in range(_NEWTON_STEPS):
+        z = np.stack([half - shift, half + shift]) / width
+        place = z / np.sqrt(freedom + z**2)
+        excess = np.sum(weight * np.interp(place, places, probability), axis=(0, 1)) - 1 - _LEVEL
+        slope = np.sum(weight / width * np.interp(place, places, density), axis=(0, 1))
+        half = np.clip(half - excess / slope, half / 2, 2 * half)
+    return half
+
+
+@lru_cache(maxsize=32)
+def _student(freedom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Places u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of the interval.
+
+    With u = sin φ the density of φ is proportional to cos^(ν - 1) φ.
+    """
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 4001)
+    cosines = np.maximum(np.cos(angles), 0)
+    powers = cosines ** (freedom - 1)
+    probability = np.concatenate([[0], np.cumsum(powers[1:] + powers[:-1]) / 2])
+    factor = 1 / (probability[-1] * (angles[1] - angles[0]) * np.sqrt(freedom))
+    probability /= probability[-1]
+    quantile = np.sqrt(freedom) * np.tan(np.interp((1 + _LEVEL) / 2, probability, angles))
+    return np.sin(angles), probability, factor * cosines ** (freedom + 1), float(quantile)
 
 
 def _merged(x: np.ndarray, merge: int) -> np.ndarray:

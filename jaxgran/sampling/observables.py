@@ -26,6 +26,11 @@ OBSERVABLES: dict[str, tuple[str, str]] = {
     "binary_shear_stress": ("shear stress of the contact forces if collisions were binary", STRESS_UNIT),
     "kinetic_shear_stress": ("shear stress of the peculiar motion", STRESS_UNIT),
     "granular_temperature": ("granular temperature, sum of m c^2 over 2 N", "m sigma^2 / t^2"),
+    "local_granular_temperature": (
+        "granular temperature relative to the mean velocity of boxes of about 25 grains",
+        "m sigma^2 / t^2",
+    ),
+    "wave_share": ("kinetic energy of the four longest waves of velocity over that of equipartition", "1"),
     "bagnold_pressure": ("pressure over mass of a mean grain times squared shear rate", "1"),
     "bagnold_shear_stress": ("shear stress over mass of a mean grain times squared shear rate", "1"),
     "cluster_pressure_share": ("share of the contact pressure in clusters of three or more grains", "1"),
@@ -87,6 +92,7 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
     total_pressure = pressure["contact"] + pressure["kinetic"]
     total_shear = shear["contact"] + shear["kinetic"]
     work = total_shear * shear_rate * volume
+    temperature = pressure["kinetic"] * area / grains
     return {
         "force_ratio": _ratio(tally.impulse, tally.binary_impulse),
         "contact_force": _ratio(tally.impulse, tally.loaded_contacts * dt),
@@ -96,7 +102,9 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
         **{f"{name}_pressure": x for name, x in pressure.items()},
         "shear_stress": total_shear,
         **{f"{name}_shear_stress": x for name, x in shear.items()},
-        "granular_temperature": pressure["kinetic"] * area / grains,
+        "granular_temperature": temperature,
+        "local_granular_temperature": _ratio(tally.local_kinetic, tally.duration),
+        "wave_share": _ratio(tally.wave_kinetic, temperature * tally.duration),
         "bagnold_pressure": total_pressure / shear_rate**2,
         "bagnold_shear_stress": total_shear / shear_rate**2,
         "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (in_clusters, in_all))),

@@ -24,7 +24,7 @@ from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
-from jaxgran.statistics import Estimates, correlation_length, jackknife
+from jaxgran.statistics import Estimates, correlation_length, standard_errors
 
 BLOCKS = 32
 MOST_BLOCKS = 10**6
@@ -132,16 +132,16 @@ class Sample:
         return self.averages["stress_ratio"]
 
     @property
-    def status(self) -> Int[Array, "*replicas"]:
-        """The worst status of the blocks."""
-        return jnp.max(self.tally.status, axis=-1)
+    def status(self) -> Int[Array | np.ndarray, "*replicas"]:
+        """The worst status, see ``Tally.outcome``."""
+        return self._total.outcome
 
     @property
     def _total(self) -> Tally:
         return self.tally.total(axis=jnp.ndim(self.area))
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Standard errors of the averages of one replica, by the names of the observables (see ``jackknife``)."""
+        """Standard errors of the averages of one replica, by the names of the observables; see ``standard_errors``."""
         if jnp.ndim(self.area):
             raise InputError("errors are those of one replica, and this sample holds a batch: index it first.")
         return estimates([self])[1]
@@ -151,7 +151,7 @@ class Sample:
 
         Args:
           estimate: a function of the means, such as a ratio of two of them. The errors are those of its result, see
-            ``jackknife``.
+            ``standard_errors``.
 
         Returns:
           Values and errors, two pytrees of the form that ``estimate`` returns.
@@ -172,18 +172,18 @@ class Sample:
         sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.own, self.tally.steps))
         total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
         structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
-        values, errors = jackknife(leaves_by_number, sums)
+        values, errors = standard_errors(leaves_by_number, sums)
         return structure.unflatten(values.values()), structure.unflatten(errors.values())
 
 
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
-    """Averages over all blocks of several replicas of one flow, and their standard errors by the jackknife.
+    """Averages over all blocks of several replicas of one flow, and their ``standard_errors``.
 
     For an extreme, such as the largest overlap, the value is the largest of all blocks. Its error is the standard
     deviation over the blocks.
     """
     average, sums = _stacked(seeds)
-    values, errors = jackknife(average, sums)
+    values, errors = standard_errors(average, sums)
     extremes = {name: getattr(sums, field) for name, field in EXTREME_OBSERVABLES.items()}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
     spread = {name: np.asarray(x.std()) for name, x in extremes.items()}

@@ -8,8 +8,12 @@ The test for a steady state is statistical. The flow is sheared in chunks, and t
 chunk are recorded. The last two thirds of the record are split into halves. The means of ln T of the two halves must
 differ by less than twice the standard error of the difference, or by less than 0.1. This standard error must be at most
 0.1. The same must hold for ln P. The error takes chunks as correlated at least as long as the memory of the flow.
+
+A chunk lasts a quarter of a memory, which is measured in the first chunks. So the preparation takes at least three
+memories. A sample lasts six, unless its strain is given. If that is less than four, the status is ``short_sample``.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
@@ -27,27 +31,36 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.batch import Drive, advance_batch, batch_program, stack
+from jaxgran.sampling.memory import (
+    FEWEST_MEMORIES,
+    LEAST_SAMPLE,
+    RELAXATION_STRAIN,
+    SAMPLE_MEMORIES,
+    memory_strain,
+)
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
-from jaxgran.sampling.timestep import COARSE_TIMESTEP, bounded_coarse_timestep, check_timestep, timestep_ladder
+from jaxgran.sampling.timestep import (
+    COARSE_TIMESTEP,
+    bounded_coarse_timestep,
+    check_timestep,
+    expected_temperature,
+    timestep_ladder,
+)
 from jaxgran.statistics import drift
-from jaxgran.theory.steady_shear import SteadyShear
 
-RELAXATION_STRAIN = 0.5  # strain at the final time step before the sample
 LONGEST_STRAIN = 256.0  # of a sample that is extended until its errors are small
+LONGEST_MEMORIES = 32.0  # the same limit for flows that remember long
 _SHORTENING_STRAIN = 0.1  # strain at each time step between the coarse and the final one
 _SHORTEST_CHUNK = 0.75  # strain of a chunk
 _FEWEST_CHUNKS = 12  # before the first test for a steady state
+_MEASURING_CHUNKS = 4  # whose averages give the length of the chunks after them; the test leaves them out
 _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
 _LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing
-_LARGEST_SAMPLE_RATIO = 4.0  # a sample drifts if it exceeds this ratio of drift to standard error
-_LARGEST_SAMPLE_DRIFT = 0.2  # and this drift in ln T or ln P
-_CLUSTER_STRAIN = 1.0  # over which the clusters of a dissipative flow move; blocks within it are correlated
-_DRIFT_BLOCKS = 16  # blocks of a sample in the test for a drift
 
 
 class Batch(NamedTuple):
@@ -57,6 +70,7 @@ class Batch(NamedTuple):
     state: State
     status: Int[np.ndarray, " replicas"]
     strain: Float[np.ndarray, " replicas"]  # before the sample
+    memory: Float[np.ndarray, " replicas"]  # strain over which the flow remembers
 
 
 def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grains: Grains | None = None) -> State:
@@ -97,59 +111,64 @@ def prepare_batch(
     drive: Drive = advance_batch,
     coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
+    heat: float = 1.0,
 ) -> Batch:
     """``prepare`` for a batch of flows: a failure is the status of its replica, not an exception.
 
-    Given grains have a leading (replicas,) axis too.
+    Given grains have a leading (replicas,) axis too. ``heat`` is the first granular temperature over the expected one.
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
-    state, packed = _heated(flow, keys, theory.granular_temperature, grains)
+    expected = expected_temperature(theory.granular_temperature, flow.packing_fraction, flow.shear_rate)
+    state, packed = _heated(flow, keys, (heat * expected).astype(theory.granular_temperature.dtype), grains)
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, coarse_timestep, grains))
-    batch = Batch(coarse, state, status, np.zeros(len(status)))
+    predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
+    batch = Batch(coarse, state, status, np.zeros(len(status)), np.zeros(len(status)))
+    batch = batch._replace(memory=_memory(batch, predictions))
     if equilibrate is None:
-        batch = _until_steady(batch, theory, drive)
-    else:
-        too_short = equilibrate < _memory(batch, theory)
-        batch = _sheared(batch, np.full(len(status), equilibrate), drive) if equilibrate > 0 else batch
+        batch = _until_steady(batch, drive)
+    elif equilibrate > 0:
+        batch = _sheared(batch, np.full(len(status), equilibrate), drive, measure=True)
+    if equilibrate is not None:
+        too_short = equilibrate < batch.memory
         batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
     return _shortened(batch, flow, drive)
 
 
 def sample_batch(
-    batch: Batch, strain: float, drive: Drive = advance_batch, error: float | None = None
+    batch: Batch, strain: float | None, drive: Drive = advance_batch, error: float | None = None
 ) -> tuple[Batch, Sample]:
-    """Sample every replica of a batch in blocks of equal strain; a drift within a sample gives ``not_steady``.
+    """Sample every replica of a batch in blocks of equal strain.
 
     Args:
       batch: prepared replicas.
-      strain: strain to sample.
+      strain: strain to sample, or None for six memories of each flow and at least 8.
       drive: advances the batch.
       error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica is
-        doubled until it is reached, up to ``LONGEST_STRAIN``. None samples ``strain`` only.
+        doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 memories. None samples ``strain`` only.
     """
-    strains = np.full(len(batch.status), strain)
+    strains = (
+        np.maximum(LEAST_SAMPLE, SAMPLE_MEMORIES * batch.memory)
+        if strain is None
+        else np.full_like(batch.memory, strain)
+    )
+    longest = np.maximum(LONGEST_STRAIN, LONGEST_MEMORIES * batch.memory)
     batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, drive)
     while error is not None:
         worst = np.array([relative_error(one) for one in _split(_as_sample(batch, tally))])
-        extended = (worst > error) & (2 * strains <= LONGEST_STRAIN) & (batch.status < Status.nonfinite)
+        extended = (worst > error) & (2 * strains <= longest) & (batch.status < Status.nonfinite)
         if not extended.any():
             break
         strains = np.where(extended, 2 * strains, strains)
         batch, more = _blocks(batch, np.where(extended, strains / BLOCKS, 0), BLOCKS // 2, drive)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
-    merged = jax.tree.map(lambda x: x.reshape(x.shape[0], _DRIFT_BLOCKS, -1, *x.shape[2:]), tally).total(axis=2)
-    area, shear_rate = (np.asarray(x)[:, None] for x in (sample.area, sample.shear_rate))
-    by_block = _averages(merged, area, batch.flow.grains, shear_rate)
-    memory = np.maximum(_CLUSTER_STRAIN, _memory(batch, predicted(batch.flow)))
-    correlation = np.exp(-strains / _DRIFT_BLOCKS / memory)
-    series = np.log(np.stack([by_block["pressure"], by_block["granular_temperature"]], axis=1))
-    drifting = [any(_drifts(one, rho) for one in pair) for pair, rho in zip(series, correlation, strict=True)]
-    status = np.maximum(batch.status, np.where(drifting, Status.not_steady, Status.ok))
-    return batch._replace(status=np.maximum(status, tally.status.max(axis=1))), sample
+    batch = batch._replace(memory=_memory(batch, _averages(batch, sample._total)))
+    short = strains < FEWEST_MEMORIES * batch.memory
+    found = np.where(short, Status.short_sample, Status.ok)
+    return batch._replace(status=np.maximum.reduce([batch.status, found, sample.status])), sample
 
 
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
@@ -243,36 +262,41 @@ def _split(sample: Sample) -> list[Sample]:
     return [jax.tree.map(lambda x, k=k: x[k], sample) for k in range(len(sample.area))]
 
 
-def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, longest: float = 1.0) -> Batch:
-    """Shear every replica by its own strain, in chunks of at most ``longest`` so that progress can be reported."""
-    chunks = max(1, int(np.ceil(np.max(strain) / longest)))
+def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, measure: bool = False) -> Batch:
+    """Shear every replica by its own strain, in chunks of at most 1 so that progress can be reported.
+
+    With ``measure`` the chunks give the memory of the flow; that of the last one stays.
+    """
+    chunks = max(1, int(np.ceil(np.max(strain))))
     for _ in range(chunks):
-        batch, _ = _chunk(batch, strain / chunks, drive)
+        batch, tally = _chunk(batch, strain / chunks, drive)
+        if measure:
+            batch = batch._replace(memory=_memory(batch, _averages(batch, tally)))
     return batch._replace(strain=batch.strain + strain)
 
 
-def _memory(batch: Batch, theory: SteadyShear) -> np.ndarray:
-    """Memory of each flow in strain: the longer of contact-network relaxation and heating by the shear."""
-    density = batch.flow.grains / np.asarray(batch.state.side) ** 2
-    heating = density * np.asarray(theory.granular_temperature) / np.asarray(theory.shear_stress)
-    return np.maximum(RELAXATION_STRAIN, heating)
+def _memory(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Strain over which each flow of a batch remembers, see ``memory_strain``."""
+    masses = np.ascontiguousarray(batch.state.grains.masses)  # or the order of the sum would depend on their place
+    mass, area = np.sum(masses, axis=-1), np.asarray(batch.state.side) ** 2
+    return memory_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
 
 
-def _until_steady(batch: Batch, theory: SteadyShear, drive: Drive) -> Batch:
+def _until_steady(batch: Batch, drive: Drive) -> Batch:
     """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are not advanced."""
-    memory = _memory(batch, theory)
-    chunk = np.maximum(_SHORTEST_CHUNK, memory / 2)
-    correlation = np.exp(-chunk / memory)
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
-    area, shear_rate = np.asarray(batch.state.side) ** 2, np.asarray(batch.flow.shear_rate)
     for chunks in range(1, _MOST_CHUNKS + 1):
         waiting = steady | (batch.status == Status.nonfinite)
         if waiting.all():
             break
+        chunk = np.maximum(_SHORTEST_CHUNK, batch.memory / 4)
+        correlation = np.exp(-2 * chunk / batch.memory)
         batch, tally = _chunk(batch, np.where(waiting, 0, chunk), drive)
         batch = batch._replace(strain=batch.strain + np.where(waiting, 0, chunk))
-        means = _averages(tally, area, batch.flow.grains, shear_rate)
+        means = _averages(batch, tally)
+        if chunks <= _MEASURING_CHUNKS:
+            batch = batch._replace(memory=_memory(batch, means))
         record.append(np.log(np.stack([means["granular_temperature"], means["pressure"]])))
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
@@ -308,13 +332,8 @@ def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
     )
 
 
-def _drifts(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the two halves of a sample differ significantly and by more than is accepted; True if not finite."""
-    difference, error = drift(series, least_correlation)
-    return not abs(difference) <= max(_LARGEST_SAMPLE_RATIO * error, _LARGEST_SAMPLE_DRIFT)
-
-
-def _averages(tally: Tally, area: np.ndarray, grains: int, shear_rate: np.ndarray) -> dict[str, np.ndarray]:
-    """All observables as NumPy arrays."""
+def _averages(batch: Batch, tally: Tally) -> dict[str, np.ndarray]:
+    """All observables of tallies of a batch, (replicas,), as NumPy arrays."""
+    area, shear_rate = np.asarray(batch.state.side) ** 2, np.asarray(batch.flow.shear_rate)
     with np.errstate(invalid="ignore"):
-        return jax.tree.map(np.asarray, partial(averages, grains=grains)(tally, area=area, shear_rate=shear_rate))
+        return jax.tree.map(np.asarray, averages(tally, area, batch.flow.grains, shear_rate))

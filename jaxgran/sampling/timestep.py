@@ -36,12 +36,12 @@ def expected_temperature(theory: ArrayLike, packing_fraction: ArrayLike, shear_r
 
     It is within a factor of two of simulations for 0 ≤ α ≤ 0.98 and 0.2 ≤ ν ≤ 0.83.
     """
-    return np.asarray(theory) + 0.02 * np.asarray(shear_rate) ** 2 / _distance_to_jamming(packing_fraction) ** 1.2
+    return np.asarray(theory) + 0.02 * np.asarray(shear_rate) ** 2 / distance_to_jamming(packing_fraction) ** 1.2
 
 
 def longest_timestep(temperature: ArrayLike, packing_fraction: ArrayLike, activation: Activation) -> np.ndarray:
     """Longest time step, in t, for which a sample of strain 10 and some hundred grains has no deep overlap."""
-    overlap = 2.5 + 1.23 / np.sqrt(_distance_to_jamming(packing_fraction)) + (3 if activation == "touching" else 0)
+    overlap = 2.5 + 1.23 / np.sqrt(distance_to_jamming(packing_fraction)) + (3 if activation == "touching" else 0)
     return DEEP_OVERLAP / (overlap * np.sqrt(np.asarray(temperature)))
 
 
@@ -54,7 +54,7 @@ def stress_error(crossing: ArrayLike, packing_fraction: ArrayLike) -> np.ndarray
       >>> [round(float(stress_error(1e-3, nu)), 3) for nu in (0.5, 0.7, 0.8)]
       [0.003, 0.01, 0.041]
     """
-    gap = np.minimum(_distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5)
+    gap = np.minimum(distance_to_jamming(packing_fraction) / (2 * np.asarray(packing_fraction)), 0.5)
     return np.asarray(crossing) / gap
 
 
@@ -76,7 +76,7 @@ def automatic_tolerance(target_error: float) -> float:
     return float(np.clip(target_error / 70, 1e-10, 1e-2))
 
 
-def _distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
+def distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
     """Difference between the packing fraction at jamming and this one."""
     return np.maximum(JAMMING - np.asarray(packing_fraction), _SMALLEST_DISTANCE)
 

@@ -1,0 +1,134 @@
+"""The whole error of an average: sampling, time step, tolerance and number of grains, each by a measured law.
+
+A standard error says how an average scatters over samples of the same length. It does not say how far the average is
+from that of a large system, of short time steps and of exact contact solves. The laws here bound these differences.
+
+=========  ========================================================================================================
+part       law, and what it was measured with
+=========  ========================================================================================================
+time step  ``stress_error``: the share of its free path that a grain moves in one step (``benchmarks stability``)
+tolerance  34 times the relative residual of a contact solve, for the part of the stress that contacts carry
+           (``benchmarks speed_vs_accuracy``)
+size       ``size_error``: loose, dissipative flows lose as 1/√N, dense ones gain faster (``benchmarks size_study``)
+=========  ========================================================================================================
+
+The bounds of the size hold against N = 25,600. A granular temperature that grows without a limit is larger still in a
+larger system. A force ratio belongs to its time step, so it has no error of the time step.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.sampling.timestep import distance_to_jamming, stress_error
+
+RESIDUAL_FACTOR = 34  # largest relative error of the stress of one solve, over its relative residual
+
+# Largest part of a whole error that each of its parts may take where they are chosen; their squares add up to one.
+SHARES = {"sampling": 0.65, "size": 0.6, "timestep": 0.4, "tolerance": 0.2}
+
+
+class Law(NamedTuple):
+    """How the errors of one average follow from those of the stresses, as factors; 0 where there is none."""
+
+    timestep: float
+    tolerance: float
+    size: float
+
+
+BUDGET: dict[str, Law] = {
+    "force_ratio": Law(0.0, 1.0, 1.0),  # that of the size is the share of the excess, see ``error_budget``
+    "pressure": Law(1.0, 1.0, 1.0),
+    "shear_stress": Law(1.0, 1.0, 1.0),
+    "granular_temperature": Law(1.0, 1.0, 3.0),
+    "local_granular_temperature": Law(1.0, 1.0, 0.6),
+    "macroscopic_friction": Law(1.0, 1.0, 0.7),
+}
+
+
+class Budget(NamedTuple):
+    """The parts of an error, in the unit of the average; all but ``stderr`` are bounds or half-widths of 95 %."""
+
+    stderr: np.ndarray
+    timestep: np.ndarray
+    size: np.ndarray
+    tolerance: np.ndarray
+    error: np.ndarray  # together
+
+
+def size_error(restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
+    """Bound on the difference of the pressure at N grains from that of a large system, over the latter.
+
+    The first term is that of long waves of velocity. It grows with dissipation and ends towards dense flows. The second
+    is that of jamming: the packing fraction at which a small system jams scatters.
+
+    Examples:
+      The default number of grains, in a loose and in a dense flow:
+
+      >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
+      [0.168, 0.136]
+    """
+    alpha, nu, count = (np.asarray(x, float) for x in (restitution, packing_fraction, grains))
+    waves = (0.03 + 0.13 * (1 - alpha**2)) * np.clip((0.83 - nu) / 0.06, 0, 1)
+    jamming = 0.007 / distance_to_jamming(nu)
+    return waves * np.sqrt(400 / count) + jamming * (100 / count) ** 1.25
+
+
+def sampling_error(error: float) -> float:
+    """The standard error that takes the share of sampling in a whole error."""
+    return SHARES["sampling"] * error / HALF_INTERVAL
+
+
+def fewest_grains(restitution: float, packing_fraction: float, size: float) -> int:
+    """The smallest of 256, 362, 512, 724, ... grains, in steps of √2, whose ``size_error`` is within a given one.
+
+    Few numbers of grains are compiled for, and none is much larger than it has to be.
+    """
+    step = 0
+    while size_error(restitution, packing_fraction, _grains_at(step)) > size:
+        step += 1
+    return _grains_at(step)
+
+
+def _grains_at(step: int) -> int:
+    return round(256 * 2 ** (step / 2))
+
+
+def error_budget(
+    values: Mapping[str, ArrayLike],
+    errors: Mapping[str, ArrayLike],
+    restitution: ArrayLike,
+    packing_fraction: ArrayLike,
+    grains: ArrayLike,
+    timestep: ArrayLike,
+    tolerance: ArrayLike,
+) -> dict[str, Budget]:
+    """The budget of every average in ``BUDGET``, for arrays of points.
+
+    Args:
+      values, errors: averages and their standard errors, by name; also contact_pressure.
+      restitution, packing_fraction, grains: of the flow.
+      timestep: dt of the sample, in t.
+      tolerance: relative residual of a contact solve.
+
+    The parts are independent, so ``error`` is √((1.96 stderr)² + timestep² + size² + tolerance²).
+    """
+    temperature = np.asarray(values["granular_temperature"], float)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        step = stress_error(np.asarray(timestep) * np.sqrt(temperature), packing_fraction)
+        in_contacts = np.asarray(values["contact_pressure"]) / np.asarray(values["pressure"])
+    solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts
+    size = size_error(restitution, packing_fraction, grains)
+    size = size / np.maximum(1 - size, 0.1)  # over the average at N grains, which may be the smaller one
+    budget = {}
+    for name, law in BUDGET.items():
+        value, stderr = np.asarray(values[name], float), np.asarray(errors[name], float)
+        scale = np.abs(value)
+        sized = np.abs(value - 1) + 0.03 if name == "force_ratio" else scale
+        parts = law.timestep * step * scale, law.size * size * sized, law.tolerance * solve * scale
+        whole = np.sqrt((HALF_INTERVAL * stderr) ** 2 + sum(part**2 for part in parts))
+        budget[name] = Budget(stderr, *parts, whole)
+    return budget
