@@ -18,10 +18,12 @@ from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
 from .model.state import State
 from .model.status import Status
+from .plotting.errors import dominating_errors
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
 from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
+from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
 from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
@@ -44,9 +46,11 @@ __all__ = [
     "Tally",
     "Trajectory",
     "advance",
+    "averages_against_grains",
     "cluster_shares",
     "cooling",
     "count_events",
+    "dominating_errors",
     "fields_at",
     "fit_closure",
     "fit_restitution",

@@ -8,13 +8,14 @@ import typer
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.choices import MAX_REPLICAS
 
-FIRST_STRAIN = 4.0  # of samples that are extended until their errors are small
+_MOST_DIGITS = 20  # of a whole number
 
 RelativeError = Annotated[
     float | None,
     typer.Option(
         "--error",
-        help="Relative standard error of force ratio and stresses to reach, in place of --strain.",
+        help="Whole relative error of force ratio and stresses to reach, 95 %: chooses grains, time step, tolerance "
+        "and strain that are not given.",
     ),
 ]
 
@@ -44,6 +45,17 @@ def numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | 
     return numbers[0] if len(numbers) == 1 else numbers
 
 
+def whole_numbers(text: str | None, name: str) -> int | tuple[int, ...] | str | None:
+    """One whole number, or several from ``256,1000,4000``, or "auto"; None if the option is not given."""
+    if text is None or text == "auto":
+        return text
+    parts = text.split(",")
+    if not all(part.isdecimal() and len(part) <= _MOST_DIGITS for part in parts):
+        raise InputError(f"{name} must be a whole number or a list like 256,1000,4000, not {shown(text)}.")
+    numbers = tuple(int(part) for part in parts)
+    return numbers[0] if len(numbers) == 1 else numbers
+
+
 def batch_size(text: str) -> int | Literal["auto"]:
     """Number of replicas that run together, or "auto"."""
     if text == "auto":
@@ -53,11 +65,15 @@ def batch_size(text: str) -> int | Literal["auto"]:
     return int(text)
 
 
-def first_strain(strain: float | None, error: float | None) -> float | None:
-    """The sampled strain, or the first strain of a sample if a target for the error is given instead."""
+def require_one(strain: float | None, error: float | None) -> None:
+    """Raise an InputError if both the sampled strain and a target for the error are given."""
     if strain is not None and error is not None:
         raise InputError("--strain and --error exclude each other: give one of them.")
-    return strain if error is None else FIRST_STRAIN
+
+
+def chosen_for(error: float | None) -> dict[str, str]:
+    """The parameters that are chosen for a target of the error, unless they are given."""
+    return {} if error is None else dict.fromkeys(("grains", "timestep", "tolerance"), "auto")
 
 
 def examples(commands: Mapping[str, str]) -> str:

@@ -1,6 +1,7 @@
 """The commands ``map`` and ``plot``: a plane of restitutions and packing fractions, and its figures."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,8 +9,16 @@ import typer
 from rich import box
 from rich.table import Table
 
-from jaxgran.cli.arguments import RelativeError, batch_size, first_strain, number_list, numbers_or_auto
-from jaxgran.cli.measure import by_timestep, finish, measured
+from jaxgran.cli.arguments import (
+    RelativeError,
+    batch_size,
+    chosen_for,
+    number_list,
+    numbers_or_auto,
+    require_one,
+    whole_numbers,
+)
+from jaxgran.cli.measure import finish, measured, print_budget
 from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
@@ -19,7 +28,7 @@ MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
     "Another plane, at an automatic time step": "jaxgran map --restitution 0.1,0.5,0.9 "
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
-    "Until the errors are below 2 %, continued after an interruption": "jaxgran map --error 0.02 --resume",
+    "Until the errors are below 10 %, continued after an interruption": "jaxgran map --error 0.1 --resume",
 }
 NOT_DRAWN = ("_by_seed", "_correlation_strain")  # endings of variables that no figure shows; there are many
 PLOT_EXAMPLES = {
@@ -34,14 +43,18 @@ def map_command(
         str | None, typer.Option(help="List of restitutions: 0.1,0.5,0.9 or start:stop:count.")
     ] = None,
     packing_fraction: Annotated[str | None, typer.Option(help="List of packing fractions, up to 0.83.")] = None,
-    grains: Annotated[int | None, typer.Option(help="Grains of a replica.")] = None,
+    grains: Annotated[
+        str | None, typer.Option(help="Grains of a replica, or a list that adds a dimension: 256,1000,4000.")
+    ] = None,
     seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
     timestep: Annotated[
         str | None,
         typer.Option(help="Time step of the sample, in 1/shear rate, auto, or a list that adds a dimension."),
     ] = None,
     equilibrate: Annotated[float | None, typer.Option(help="Strain before the sample. [default: until steady]")] = None,
-    strain: Annotated[float | None, typer.Option(help="Sampled strain of each seed.")] = None,
+    strain: Annotated[
+        float | None, typer.Option(help="Sampled strain of each seed. [default: six memories of each flow]")
+    ] = None,
     error: RelativeError = None,
     tolerance: Annotated[
         str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
@@ -70,33 +83,39 @@ def map_command(
     """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
     if scheduler is not None and workers is not None:
         raise InputError("--scheduler and --workers exclude each other: give one of them.")
+    require_one(strain, error)
     given = {
         "restitution": None if restitution is None else number_list(restitution, "restitution"),
         "packing_fraction": None if packing_fraction is None else number_list(packing_fraction, "packing_fraction"),
-        "grains": grains,
+        "grains": whole_numbers(grains, "grains"),
         "seeds": seeds,
         "timestep": numbers_or_auto(timestep, "timestep"),
         "equilibrate": equilibrate,
-        "strain": first_strain(strain, error),
+        "strain": strain,
         "error": error,
         "tolerance": numbers_or_auto(tolerance, "tolerance"),
         "solver": solver,
         "activation": activation,
         "engine": engine,
     }
-    chosen = (PRESETS[preset] if like is None else _like(like)) | {
-        name: value for name, value in given.items() if value is not None
-    }
+    given = {name: value for name, value in given.items() if value is not None}
+    chosen = kept_choices(PRESETS[preset] if like is None else _like(like), given) | chosen_for(error) | given
     figures = ["jaxgran.plotting.map_figures"]
     data, interrupted = measured(
         chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler, load=figures
     )
 
+    from jaxgran.maps.schema import parts, shear_stress_ratio
     from jaxgran.plotting.map_figures import save_figures
 
     pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
-    for part in by_timestep(data):
-        print_table(_ratio_table(part))
+    for part in parts(data):
+        print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
+        print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
+    if "grains" in data.dims:
+        for part in parts(data.isel(grains=-1)):
+            print_table(_large_system_table(part))
+    print_budget(data)
     finish(data, [output, *pictures], interrupted, can_resume=True)
 
 
@@ -127,17 +146,49 @@ def _like(file: Path) -> dict[str, Any]:
     return chosen
 
 
-def _ratio_table(data) -> Table:
-    """The force ratio of a map with standard errors; * marks a bad status."""
+def kept_choices(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a preset or a file that still hold beside those that are given."""
+    replaced = {"error": ("seeds", "strain"), "strain": ("error",)}
+    left_out = {name for option in replaced.keys() & given.keys() for name in replaced[option]}
+    kept = {name: value for name, value in start.items() if name not in left_out}
+    if "grains_by_point" in kept and given.keys() & {"grains", "restitution", "packing_fraction", "timestep", "error"}:
+        del kept["grains_by_point"]
+        kept["grains"] = "auto"  # chosen again, for the points that are given
+    return kept
+
+
+def _ratio_table(data, name: str, ratio, stderr) -> Table:
+    """A ratio of a map with standard errors; * marks a bad status."""
     timestep, rule = data.attrs["timestep"], data.attrs["activation"]
-    title = f"Force ratio at dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
+    size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
+    title = f"{name} at {size}dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
     table = Table(title=title, box=box.SIMPLE, title_justify="left")
     table.add_column("packing fraction")
     for alpha in data.restitution.values:
         table.add_column(f"{alpha:g}", justify="right", no_wrap=True)
     for nu in data.packing_fraction.values:
-        row = data.sel(packing_fraction=nu)
-        marks = ["" if status == 0 else " *" for status in row.status.values]
-        cells = zip(row.force_ratio.values, row.force_ratio_stderr.values, marks, strict=True)
+        row = {"packing_fraction": nu}
+        marks = ["" if status == 0 else " *" for status in data.status.sel(row).values]
+        cells = zip(ratio.sel(row).values, stderr.sel(row).values, marks, strict=True)
         table.add_row(f"{nu:g}", *(with_error(value, error) + mark for value, error, mark in cells))
+    return table
+
+
+def _large_system_table(data) -> Table:
+    """The estimates for a large system, a row for each point."""
+    from jaxgran.maps.large_system import BOUNDS, LIMIT_SEEN
+
+    title = f"Large systems at dt = {data.attrs['timestep']:g} / shear rate; ± bounds the error of sampling and size"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left")
+    for name in ("packing fraction", "restitution", *BOUNDS):
+        table.add_column(name.replace("_", " "), justify="right")
+    for nu in data.packing_fraction.values:
+        for alpha in data.restitution.values:
+            point = data.sel(packing_fraction=nu, restitution=alpha)
+            cells = []
+            for name in BOUNDS:
+                value, error = float(point[f"{name}_large_system"]), float(point[f"{name}_large_system_error"])
+                no_limit = int(point[f"{name}_limit_seen"]) == LIMIT_SEEN["no_limit_seen"]
+                cells.append("no limit seen" if no_limit else with_error(value, error))
+            table.add_row(f"{nu:g}", f"{alpha:g}", *cells)
     return table

@@ -1,5 +1,6 @@
 """Runs a map or a single flow: progress, checkpoint, dataset, and the messages at the end."""
 
+import math
 import os
 import shlex
 import sys
@@ -11,14 +12,18 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Literal
 
+from rich import box
+from rich.table import Table
+
 from jaxgran.cli.progress import progress
-from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, say, say_written, stop
+from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, print_table, say, say_written, stop
 from jaxgran.environment import usable_cores
 
+_BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 _MEANING_OF_STATUS = {
     "iteration_limit": "some contact solve ended above the tolerance",
-    "not_steady": "temperature and pressure still drifted when the sample began, take more grains",
-    "deep_overlap": "some grains overlapped by more than 1e-2 diameters, take a shorter time step",
+    "not_steady": "temperature or pressure still drifted, sample a longer strain or prepare longer with --equilibrate",
+    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
@@ -126,22 +131,17 @@ def _say_resumed(checkpoint, count: int) -> None:
         say(f"damaged and computed anew: {', '.join(checkpoint.damaged)}.")
 
 
-def by_timestep(data) -> list:
-    """The parts of a map, one for each time step; the attribute ``timestep`` of a part is its time step."""
-    if "timestep" not in data.dims:
-        return [data]
-    return [data.sel(timestep=dt).assign_attrs(timestep=dt) for dt in data.timestep.values.tolist()]
-
-
 def _bad_points(data) -> dict[str, list[str]]:
     """The points with a bad status, in words, by the name of the status."""
+    from jaxgran.maps.schema import parts
+
     names = dict(
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
     )
     bad: dict[str, list[str]] = {}
-    parts = by_timestep(data)
-    for part in parts:
-        which = f", time step {part.attrs['timestep']:g}" if len(parts) > 1 else ""
+    for part in parts(data):
+        which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
+        which += f", time step {part.attrs['timestep']:g}" if "timestep" in data.dims else ""
         for nu in part.packing_fraction.values:
             for alpha in part.restitution.values:
                 name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
@@ -151,17 +151,61 @@ def _bad_points(data) -> dict[str, list[str]]:
 
 
 def _say_imprecise(data) -> None:
-    """Print the largest relative error beside its target, and the sampled strains, if a target was given."""
+    """Print the largest whole error beside its target, and the sampled strains, if a target was given."""
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
         return
-    worst = max(float((data[f"{name}_stderr"] / abs(data[name])).max()) for name in ERROR_OBSERVABLES)
+    worst = max(float((data[f"{name}_error"] / abs(data[name])).max()) for name in ERROR_OBSERVABLES)
     strain = data.strain_by_seed
     say(
-        f"relative standard errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
+        f"whole relative errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
         f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
     )
+
+
+def _say_short(data, points: list[str]) -> None:
+    """Print which samples are shorter than a few memories, and the strain that would do."""
+    from jaxgran.sampling.memory import FEWEST_MEMORIES
+
+    if not points:
+        return
+    code = data.status.attrs["flag_meanings"].split().index("short_sample")
+    short = data.status == data.status.attrs["flag_values"][code]
+    enough = FEWEST_MEMORIES * float(data.memory.where(short).max())
+    which = "" if data.status.size == 1 else f" at {', '.join(points)}"
+    say(
+        f"short sample{which}: it lasts less than {FEWEST_MEMORIES:g} memories of the flow, so its errors may be too "
+        f"small. Add --strain {math.ceil(enough)}."
+    )
+
+
+def print_budget(data) -> None:
+    """Print the parts of the whole error: those of each point, or their median and largest over a map."""
+    from jaxgran.maps.schema import relative_parts
+
+    title = f"Whole error, 95 %, relative to a large system{'' if data.status.size == 1 else ': median (largest)'}"
+    table = Table(title=title, box=box.SIMPLE, title_justify="left")
+    for name in ("observable", "sampling", "time step", "size", "tolerance", "together"):
+        table.add_column(name, justify="left" if name == "observable" else "right")
+    for name in _BUDGETED:
+        parts = relative_parts(data, name)
+        ordered = (parts[part] for part in ("sampling", "timestep", "size", "tolerance", "error"))
+        cells = [_percent(part) for part in ordered]
+        cells[1] = "at its dt" if name == "force_ratio" else cells[1]
+        table.add_row(name.replace("_", " "), *cells)
+    print_table(table)
+
+
+def _percent(part) -> str:
+    """The median of a part of the error over the points, and the largest one if there are several."""
+    import numpy as np
+
+    known = part[np.isfinite(part)]
+    if known.size == 0:
+        return ""
+    median, largest = (f"{100 * x:.2g}" for x in (np.median(known), known.max()))
+    return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
 
 
 def _say_retried(data) -> None:
@@ -180,6 +224,7 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
     _say_imprecise(data)
     _say_retried(data)
     bad = _bad_points(data)
+    _say_short(data, bad.pop("short_sample", []))
     if interrupted:
         missing = len(bad.get("not_run", []))
         saved = "; what is done is saved" if written else ""

@@ -9,14 +9,15 @@ import typer
 from rich import box
 from rich.table import Table
 
-from jaxgran.cli.arguments import RelativeError, first_strain, numbers_or_auto
-from jaxgran.cli.measure import finish, measured
+from jaxgran.cli.arguments import RelativeError, chosen_for, numbers_or_auto, require_one
+from jaxgran.cli.measure import finish, measured, print_budget
 from jaxgran.cli.progress import counted
 from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
 from jaxgran.model.checks import InputError, require_number, shown
 from jaxgran.model.choices import Engine
 
 MOST_RECORDED = 100_000  # frames of a trajectory
+_RECORDED_STRAIN = 5.0  # sampled strain where frames are kept and none is given
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
@@ -29,15 +30,19 @@ RUN_EXAMPLES = {
 def run_command(
     restitution: Annotated[float, typer.Option(help="Restitution, 0 to 1.")],
     packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
-    grains: Annotated[int, typer.Option(help="Number of grains.")] = 256,
-    strain: Annotated[float | None, typer.Option(help="Sampled strain. [default: 5]")] = None,
+    grains: Annotated[int | None, typer.Option(help="Number of grains. [default: 256]")] = None,
+    strain: Annotated[
+        float | None, typer.Option(help="Sampled strain. [default: six memories of the flow, 5 where frames are kept]")
+    ] = None,
     error: RelativeError = None,
-    timestep: Annotated[str, typer.Option(help="Time step of the sample, in 1/shear rate, or auto.")] = "1e-3",
+    timestep: Annotated[
+        str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or auto. [default: 1e-3]")
+    ] = None,
     engine: Annotated[Engine, typer.Option(help="Program that advances the flow.")] = "auto",
     trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
     every: Annotated[
         float | None,
-        typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.04 with --error]"),
+        typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.05 with --error]"),
     ] = None,
     movie: Annotated[
         Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
@@ -49,21 +54,23 @@ def run_command(
     step = numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
-    first = first_strain(strain, error)
+    require_one(strain, error)
+    if strain is None and error is None and (trajectory is not None or movie is not None):
+        strain = _RECORDED_STRAIN
+    given = {"grains": grains, "timestep": step, "strain": strain, "error": error}
     chosen = {
         "restitution": (restitution,),
         "packing_fraction": (packing_fraction,),
-        "grains": grains,
         "seeds": 1,
-        "timestep": step,
-        "strain": 5.0 if first is None else first,
-        "error": error,
         "engine": engine,
+        **chosen_for(error),
+        **{name: value for name, value in given.items() if value is not None},
     }
-    recorder, frames = _recorder(trajectory, movie, every, chosen["strain"])
+    recorder, frames = _recorder(trajectory, movie, every, strain or _RECORDED_STRAIN)
     record = None if recorder is None else recorder.recording
     data, interrupted = measured(chosen, "auto", 1, output, quiet, record=record)
     print_table(_summary_table(data))
+    print_budget(data)
     if recorder is not None and recorder.frames:
         if trajectory is not None:
             say(f"wrote {trajectory}: {recorder.frames} frames")
@@ -112,6 +119,7 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 
 def _summary_table(data) -> Table:
     """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
+    from jaxgran.maps.schema import shear_stress_ratio
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
     title = f"Engine {data.attrs['engine']}, solver {data.attrs['solver']}"
@@ -132,4 +140,6 @@ def _summary_table(data) -> Table:
             theory = number(f"theory_{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
             table.add_row(name.replace("_", " "), value, "" if unit == "1" else unit, *texts)
+        if name == "force_ratio":
+            table.add_row("shear-stress ratio", with_error(*map(float, shear_stress_ratio(point))))
     return table

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from scipy.optimize import brentq
 
 from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, excess_terms, require_jamming, stress_terms
-from jaxgran.maps.schema import require_map
+from jaxgran.maps.schema import finest, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
@@ -41,7 +41,8 @@ def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
     ================  ===============================  ==============================================================
     data              (packing_fraction, restitution)  `pressure`, `macroscopic_friction` and `force_ratio` with
                                                        `_stderr`, and `status`; fitted are points with status ok
-                                                       and α < 1, at the shortest of several time steps
+                                                       and α < 1, at the largest of several numbers of
+                                                       grains and the shortest of several time steps
     jamming_fraction  ()                               ν_J, above 0.83; by default that of a random quench of the
                                                        size distribution of maps
     returns           Closure
@@ -103,7 +104,7 @@ def closure_points(data: xr.Dataset, fewest: int = FEWEST_POINTS) -> Points:
         logs=np.log(values),
         errors=np.maximum(errors / values, _LEAST_ERROR),
         theory=np.log(np.stack([pressure, shear_stress / pressure], axis=1)),
-        timestep=float(data.timestep if "timestep" in data.coords else data.attrs.get("timestep", np.nan)),
+        timestep=float(data.attrs.get("timestep", np.nan)),
     )
 
 
@@ -203,11 +204,6 @@ def _least_squares(start: Array, terms: Array, logs: Array, errors: Array) -> Ar
 
     change = jnp.zeros(terms.shape[1], terms.dtype)
     return jax.lax.while_loop(unfinished, iterate, (change, solver.init(change), change + jnp.inf, 0))[0]
-
-
-def finest(data: xr.Dataset) -> xr.Dataset:
-    """The map at its shortest time step."""
-    return data.sortby("timestep").isel(timestep=0) if "timestep" in data.dims else data
 
 
 def table(data: xr.Dataset, names: list[str]) -> np.ndarray:

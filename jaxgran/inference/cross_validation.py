@@ -12,13 +12,12 @@ from jaxgran.inference.closure_fit import (
     FEWEST_POINTS,
     Points,
     closure_points,
-    finest,
     fit_points,
     require_enough,
     table,
 )
 from jaxgran.inference.stress_inversion import estimate_restitution
-from jaxgran.maps.schema import require_map
+from jaxgran.maps.schema import finest, require_map
 from jaxgran.sampling.timestep import JAMMING
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.schema import require_map
+from jaxgran.maps.schema import finest, require_map
 from jaxgran.model.checks import InputError, require_number
 from jaxgran.model.status import Status
 
@@ -96,8 +96,9 @@ def friction_law(
 
     =========================  ===============================  =====================================================
     data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
-                                                                `_stderr`, and `status`; the shortest of several time
-                                                                steps is fitted
+                                                                `_stderr`, and `status`; the largest of several
+                                                                numbers of grains and the shortest of several time
+                                                                steps are fitted
     largest_inertial_number    ()                               of a dense point
     smallest_packing_fraction  ()                               of a dense point; it excludes nearly elastic flows,
                                                                 which have a small I because they are hot, although
@@ -144,8 +145,7 @@ def dense_points(
     smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
 ) -> xr.Dataset:
     """The points that :func:`friction_law` fits, along one dimension ``point``."""
-    if "timestep" in data.dims:
-        data = data.sortby("timestep").isel(timestep=0)
+    data = finest(data)
     dense = is_dense(data, largest_inertial_number, smallest_packing_fraction)
     points = data[list(NEEDED)].assign(dense=dense)
     points = points.stack(point=("packing_fraction", "restitution"), create_index=False)

@@ -171,7 +171,8 @@ class Checkpoint:
                 point, seed, status = row.tolist()
                 strain, area, shear_rate = numbers
                 tallies = tally_from_flat(tally, dtype)
-                sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), self.settings.grains)
+                grains = self.settings.flows()[point].grains
+                sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), grains)
                 self.done[point, seed] = Replica(sample, status, float(strain))
 
     def _arrays(self, path: Path) -> dict[str, np.ndarray] | None:

@@ -4,7 +4,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,15 @@ import xarray as xr
 
 from jaxgran import environment
 from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.error_variables import error_variables
+from jaxgran.maps.large_system import BOUNDS, large_system_variables
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings import MapSettings, stack_of_any_size
+from jaxgran.model.choices import Engine
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import stack
+from jaxgran.sampling.budget import BUDGET
+from jaxgran.sampling.drift import is_drifting
+from jaxgran.sampling.memory import memory_strain
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.sample import correlation_strains, estimates
@@ -25,6 +30,7 @@ NOT_RUN = -1  # status of a replica without a result
 THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted as theory_NAME
 _TENSOR_AXES = ("axis_a", "axis_b")
 _AXES = {
+    "grains": {"long_name": "number of grains", "units": "1"},
     "timestep": {"long_name": "time step of the sample", "units": "1 / shear rate"},
     "packing_fraction": {"long_name": "packing fraction", "units": "1"},
     "restitution": {"long_name": "restitution", "units": "1"},
@@ -41,17 +47,27 @@ def map_dataset(
     ============================  ====================  =============================================================
     NAME                          point                 average over all seeds, for each of ``OBSERVABLES``
     NAME_stderr                   point                 its standard error
+    NAME_error_PART               point                 its errors of PART timestep, size and tolerance, for the names
+                                                        in ``BUDGET``
+    NAME_error                    point                 its whole error, half the width of an interval of 95 %
+    point_grains                  point                 number of grains, if it was chosen by point
     NAME_correlation_strain       point                 strain of one independent sample, for averages of scalars
     NAME_by_seed                  (point, seed)         average of each seed
     theory_NAME                   point                 prediction of kinetic theory, for the names in ``THEORY``
     status, status_by_seed        point, (point, seed)  worst status
+    memory                        point                 strain over which the flow remembers
     strain_by_seed                (point, seed)         sampled strain
     timestep_by_seed              (point, seed)         time step of the sample
     equilibration_strain_by_seed  (point, seed)         strain before the sample
+    NAME_large_system             point without grains  estimate for a large system, for the names in ``BOUNDS``
+    NAME_large_system_error       point without grains  bound on its error
+    NAME_limit_seen               point without grains  whether the average has a limit at large numbers of grains
     ============================  ====================  =============================================================
 
-    A point is (packing_fraction, restitution), or (timestep, packing_fraction, restitution) if the settings have a list
-    of time steps. Tensors have the dimensions (axis_a, axis_b) last. Attributes of the variables give their units.
+    A point is (packing_fraction, restitution). If the settings have a list of numbers of grains or of time steps, the
+    dimensions grains and timestep come before these. Only a map with the dimension grains has the last three kinds of
+    variables, see ``large_system_estimate``. Tensors have the dimensions (axis_a, axis_b) last. Attributes of the
+    variables give their units.
 
     Args:
       settings: the map.
@@ -62,6 +78,8 @@ def map_dataset(
     count, seeds = math.prod(shape), settings.seeds
     values = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
     errors = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
+    memory, drifting = np.full(count, np.nan), np.zeros(count, bool)
+    flows = settings.flows()
     scalar_averages = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
     correlation = {name: np.full(count, np.nan) for name in scalar_averages}
     by_seed = {name: np.full((count, seeds, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
@@ -83,6 +101,10 @@ def map_dataset(
             value, error = estimates(samples)
             for name in OBSERVABLES:
                 values[name][point], errors[name][point] = value[name], error[name]
+            grains, spread = flows[point].grains, float(flows[point].polydispersity)
+            mass = grains * (1 + spread**2 / 3)
+            memory[point] = memory_strain(value, grains, mass, samples[0].area, samples[0].shear_rate)
+            drifting[point] = is_drifting(samples, memory[point])
             independent = correlation_strains(samples)
             for name in scalar_averages:
                 correlation[name][point] = independent[name]
@@ -92,7 +114,7 @@ def map_dataset(
         tensor_dims = _TENSOR_AXES if name in TENSORS else ()
         dims = point_dims + tensor_dims
         attrs = {"long_name": long_name, "units": units}
-        variables[name] = (dims, values[name].reshape(*shape, *_tensor_shape(name)), attrs)
+        variables[name] = (dims, values[name].reshape(*shape, *_tensor_shape(name)), dict(attrs))
         spread = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
         about = {"long_name": f"{spread} of {long_name}", "units": units}
         variables[f"{name}_stderr"] = (dims, errors[name].reshape(*shape, *_tensor_shape(name)), about)
@@ -101,17 +123,25 @@ def map_dataset(
             variables[f"{name}_correlation_strain"] = (dims, correlation[name].reshape(shape), about)
         seed_dims = (*point_dims, "seed", *tensor_dims)
         variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tensor_shape(name)), attrs)
+    variables |= error_variables(settings, point_dims, values, errors, OBSERVABLES)
+    for name in BUDGET:
+        linked = (f"{name}_stderr", f"{name}_error", "status")
+        variables[name][2]["ancillary_variables"] = " ".join(linked)
+    if "grains" in settings.axes:
+        averages = {name: (values[name].reshape(shape), errors[name].reshape(shape)) for name in BOUNDS}
+        variables |= large_system_variables(point_dims[1:], settings.sizes, averages, OBSERVABLES)
     predictions = _predictions(settings)
     for name in THEORY:
         long_name, units = OBSERVABLES[name]
         about = {"long_name": f"kinetic theory's prediction of the {long_name}", "units": units, "theory": _THEORY_NAME}
         variables[f"theory_{name}"] = (point_dims, predictions[name].reshape(shape), about)
     flags = {
-        "long_name": "worst status of a point",
+        "long_name": "worst status of a point, over all seeds and of their samples together",
         "flag_values": np.array([NOT_RUN, *Status], np.int8),
         "flag_meanings": " ".join(["not_run", *(s.name for s in Status)]),
     }
-    variables["status"] = (point_dims, _worst(status).reshape(shape), flags)
+    worst = np.maximum(_worst(status), np.where(drifting, Status.not_steady, NOT_RUN)).astype(np.int8)
+    variables["status"] = (point_dims, worst.reshape(shape), flags)
     variables["status_by_seed"] = (
         (*point_dims, "seed"),
         status.reshape(*shape, seeds),
@@ -130,6 +160,11 @@ def map_dataset(
             "units": "1 / shear rate",
         },
     )
+    variables["memory"] = (
+        point_dims,
+        memory.reshape(shape),
+        {"long_name": "strain over which the flow remembers, that of one independent sample", "units": "1"},
+    )
     variables["strain_by_seed"] = (
         (*point_dims, "seed"),
         strain.reshape(*shape, seeds),
@@ -146,7 +181,7 @@ def map_dataset(
 
 def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
     """Prediction of kinetic theory at every point; NaN where it has no steady state, as at α = 1."""
-    flows = stack(settings.flows())
+    flows = stack_of_any_size(settings.flows())
     theory = kinetic_theory(flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity)
     with np.errstate(invalid="ignore"):
         values = {name: getattr(theory, name) for name in THEORY}
@@ -167,26 +202,28 @@ def _worst(status: np.ndarray) -> np.ndarray:
 def run_attributes(settings: MapSettings) -> dict[str, Any]:
     """All parameters of the run, in types that NetCDF can store.
 
-    ``engine`` and ``solver`` are those that run. ``engine_asked`` and ``solver_asked`` are those of the settings.
+    ``engine`` and ``solver`` are those that run; numbers of grains may have different ones on a GPU. ``engine_asked``
+    and ``solver_asked`` are those of the settings.
     """
     parameters = asdict(settings)
-    equilibrate, error = parameters.pop("equilibrate"), parameters.pop("error")
-    if error is not None:
-        parameters["error"] = error
+    equilibrate = parameters.pop("equilibrate")
+    if settings.error is not None:
         del parameters["strain"]  # it differs between seeds: see ``strain_by_seed``
+    parameters = {name: value for name, value in parameters.items() if value is not None}
     flow = settings.flows()[0]
-    engine = select_engine(flow)
+    engines: list[Engine] = [select_engine(replace(flow, grains=grains)) for grains in settings.sizes]
+    solvers = [solver_in_use(engine, settings.solver) for engine in engines]
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": "CF-1.11",
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
-        "engine": engine,
-        "solver": solver_in_use(engine, settings.solver),
+        "engine": ", ".join(dict.fromkeys(engines)),
+        "solver": ", ".join(dict.fromkeys(solvers)),
         "engine_asked": settings.engine,
         "solver_asked": settings.solver,
         "equilibrate": "until steady" if equilibrate is None else equilibrate,
         "timestep_unit": "1 / shear rate",
-        "strain_meaning": "sampled strain of each seed; where an error is given, see strain_by_seed",
+        "strain_meaning": "sampled strain of each seed; where none is given, see strain_by_seed",
         "shear_rate": flow.shear_rate,
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",

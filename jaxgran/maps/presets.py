@@ -9,7 +9,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "grains": 256,
         "seeds": 2,
         "timestep": 1e-3,
-        "strain": 8.0,
     },
     "paper": {
         "restitution": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98),

@@ -52,15 +52,18 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
     try:
         for field in fields(MapSettings):
             attribute = next((name for name in (f"{field.name}_asked", field.name) if name in data.attrs), None)
-            if field.name in data.dims:
-                chosen[field.name] = tuple(data[field.name].values.tolist())
+            if field.name in data.coords:  # one number where one of a list was selected
+                values = data[field.name].values.tolist()
+                chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.name not in ("strain", "error", "engine"):  # a file has either strain or error
+            elif field.name not in ("strain", "error", "engine", "grains_by_point"):  # a file has not all of them
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         return chosen | {
-            name: tuple(np.atleast_1d(chosen[name]).tolist()) for name in ("restitution", "packing_fraction")
+            name: tuple(np.atleast_1d(chosen[name]).tolist())
+            for name in ("restitution", "packing_fraction", "grains_by_point")
+            if name in chosen
         }
     except KeyError as missing:
         raise InputError(f"this dataset does not contain the {missing.args[0]} of its map.") from None

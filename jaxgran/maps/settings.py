@@ -1,18 +1,21 @@
 """MapSettings: all parameters that the numbers of a ratio map depend on, checked before the run."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from jaxgran.dynamics.engine import select_engine
 from jaxgran.model.checks import InputError, require_number, require_whole, shown, two_digits
-from jaxgran.model.choices import MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, Solver
+from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, Solver
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
+from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
+from jaxgran.sampling.memory import LEAST_SAMPLE
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
@@ -27,16 +30,17 @@ class MapSettings:
 
     restitution: tuple[float, ...]
     packing_fraction: tuple[float, ...]
-    grains: int = 256
+    grains: int | tuple[int, ...] = 256
     seeds: int = 2
     timestep: float | tuple[float, ...] = 1e-3
     equilibrate: float | None = None
-    strain: float = 10.0
+    strain: float | None = None
     error: float | None = None
     tolerance: float = 1e-4
     solver: Solver = "barzilai-borwein"
     activation: Activation = "midpoint"
     engine: Engine = "auto"
+    grains_by_point: tuple[int, ...] | None = None  # in the order of ``flows``; ``grains`` is then the largest
 
     def __post_init__(self):
         for name, values in self.axes.items():
@@ -56,7 +60,8 @@ class MapSettings:
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
             raise InputError(f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.")
-        require_number("strain", self.strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+        if self.strain is not None:
+            require_number("strain", self.strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
         if self.error is not None:
             require_number("error", self.error, lambda x: (x >= 1e-3) & (x <= 0.5), "between 1e-3 and 0.5")
         if self.equilibrate is not None:
@@ -65,7 +70,7 @@ class MapSettings:
         if not isinstance(self.timestep, tuple):
             require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
         require_number("tolerance", self.tolerance, lambda x: x > 0, "between 1e-12 and 0.1")
-        flows = stack(self._checked_flows())
+        flows = stack_of_any_size(self._checked_flows())
         if self.engine != "auto":
             select_engine(flows)
         shortest, longest = min(self._timesteps), max(self._timesteps)
@@ -74,9 +79,10 @@ class MapSettings:
                 f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear rate, or the steps of a run would be too "
                 f"many to count, not {shortest:g}."
             )
-        if self.strain > MAX_STEPS * shortest:
+        strain = LEAST_SAMPLE if self.strain is None else self.strain
+        if strain > MAX_STEPS * shortest:
             raise InputError(
-                f"strain must be at most {MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}, not {self.strain:g}."
+                f"strain must be at most {MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}, not {strain:g}."
             )
         limits = longest_timestep(_temperature(flows), flows.packing_fraction, self.activation)
         excess = np.asarray(flows.timestep) / limits
@@ -86,17 +92,28 @@ class MapSettings:
                 f"timestep must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)}, or grains "
                 "would overlap deeply; auto chooses one."
             )
-        if round(self.strain / longest) < _FEWEST_STEPS:
+        if round(strain / longest) < _FEWEST_STEPS:
             raise InputError(
                 f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * longest:g}, "
-                f"not {self.strain:g}."
+                f"not {strain:g}."
             )
 
     @property
     def axes(self) -> dict[str, tuple[float, ...]]:
-        """Values of the dimensions of a map by name, outermost first; ``timestep`` is one of them if it is a list."""
-        steps = {"timestep": self.timestep} if isinstance(self.timestep, tuple) else {}
-        return {**steps, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
+        """Values of the dimensions of a map by name, outermost first.
+
+        ``grains`` and ``timestep`` are among them if they are lists.
+        """
+        further = {"grains": self.grains, "timestep": self.timestep}
+        lists = {name: values for name, values in further.items() if isinstance(values, tuple)}
+        return {**lists, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The numbers of grains, at least one."""
+        if self.grains_by_point is not None:
+            return tuple(sorted(set(self.grains_by_point)))
+        return self.grains if isinstance(self.grains, tuple) else (self.grains,)
 
     @property
     def _timesteps(self) -> tuple[float, ...]:
@@ -108,9 +125,14 @@ class MapSettings:
 
     def _checked_flows(self) -> list[ShearFlow]:
         """New flows for all points; InputError if a number is out of range."""
+        points = list(product(self._timesteps, self.packing_fraction, self.restitution))
+        if self.grains_by_point is None:
+            numbers = [(grains, *point) for grains in self.sizes for point in points]
+        else:
+            numbers = [(grains, *point) for grains, point in zip(self.grains_by_point, points, strict=True)]
         return [
             ShearFlow(
-                grains=self.grains,
+                grains=grains,
                 restitution=alpha,
                 packing_fraction=nu,
                 timestep=dt,
@@ -119,9 +141,7 @@ class MapSettings:
                 activation=self.activation,
                 engine=self.engine,
             )
-            for dt in self._timesteps
-            for nu in self.packing_fraction
-            for alpha in self.restitution
+            for grains, dt, nu, alpha in numbers
         ]
 
 
@@ -131,18 +151,47 @@ def _flows(settings: MapSettings) -> tuple[ShearFlow, ...]:
     return tuple(settings._checked_flows())
 
 
+def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
+    """The flows as one batch at their largest number of grains, for what does not depend on this number."""
+    largest = max(flow.grains for flow in flows)
+    return stack([flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows])
+
+
 def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str, Any], str]:
     """The parameters of a map with numbers in place of "auto", and a sentence about these numbers, or "".
 
     Args:
-      choices: keyword arguments of ``MapSettings``; ``timestep`` and ``tolerance`` may be "auto".
-      target_error: largest accepted relative error of pressure and shear stress.
+      choices: keyword arguments of ``MapSettings``; ``grains``, ``timestep`` and ``tolerance`` may be "auto". The
+        grains are then chosen by point, for the ``error`` of the map.
+      target_error: largest accepted relative error of pressure and shear stress from the time step. A given ``error``
+        sets it.
     """
     require_number("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
     chosen, words = dict(choices), []
+    error = chosen.get("error")
+    if error is not None:
+        MapSettings(**{**chosen, "grains": 256, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4})  # checks the lists
+        target_error = SHARES["timestep"] * error
+    if isinstance(chosen.get("grains"), str):
+        if error is None:
+            raise InputError("grains may be auto only with a given error, which they are chosen for.")
+        grid = [(alpha, nu) for nu, alpha in product(chosen["packing_fraction"], chosen["restitution"])]
+        grains = [fewest_grains(*point, SHARES["size"] * error) for point in grid]
+        if max(grains) > MAX_GRAINS:
+            surely = MAX_GRAINS / 2**0.5  # numbers of grains are chosen in steps of √2
+            least = max(float(size_error(*point, surely)) for point in grid) / SHARES["size"]
+            raise InputError(
+                f"error must be at least {two_digits(least, up=True)} at these points, not {error:g}: it would "
+                f"need more than {MAX_GRAINS} grains."
+            )
+        steps = len(chosen["timestep"]) if isinstance(chosen.get("timestep"), tuple) else 1
+        chosen |= {"grains": max(grains), "grains_by_point": tuple(grains) * steps}
+        chosen.setdefault("seeds", 1)  # a longer sample is cheaper than a second preparation
+        sizes = " to ".join(str(size) for size in sorted({min(grains), max(grains)}))
+        words.append(f"{sizes} grains, {chosen['seeds']} seed{'s' if chosen['seeds'] > 1 else ''}")
     auto = {name for name in ("timestep", "tolerance") if isinstance(chosen.get(name), str) and chosen[name] == "auto"}
     if "timestep" in auto:
-        flows = stack(
+        flows = stack_of_any_size(
             MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4, "strain": 1.0}).flows()
         )
         steps = automatic_timestep(
@@ -154,7 +203,8 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
     if "tolerance" in auto:
         chosen["tolerance"] = float(two_digits(automatic_tolerance(target_error), up=False))
         words.append(f"tolerance {chosen['tolerance']:g}")
-    return chosen, f"{'; '.join(words)}: for an error of {target_error:g} in the stresses." if words else ""
+    aim = f"{target_error:g} from the time step" if error is None else f"{error:g}"
+    return chosen, f"{'; '.join(words)}: for an error of {aim} in the stresses." if words else ""
 
 
 def _temperature(flows: ShearFlow) -> np.ndarray:

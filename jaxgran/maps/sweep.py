@@ -1,8 +1,9 @@
 """The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as an xarray.Dataset.
 
-A list of time steps adds an axis to the grid. Every point and seed is a replica. Replicas of similar cost form a batch.
-The most expensive batches run first, so that no core waits long at the end. The random numbers of a replica depend on
-its seed and its point only. So results do not depend on the batches, their order or the number of workers.
+A list of numbers of grains or of time steps adds an axis to the grid. Every point and seed is a replica. Replicas of
+one number of grains and of similar cost form a batch. The most expensive batches run first, so that no core waits long
+at the end. The random numbers of a replica depend on its seed and its point only. So results do not depend on the
+batches, their order or the number of workers.
 """
 
 import math
@@ -33,6 +34,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.programs import kept_jit
 from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, in_lockstep, reporting, stack
+from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
@@ -52,11 +54,11 @@ def ratio_map(
     restitution: Sequence[float],
     packing_fraction: Sequence[float],
     *,
-    grains: int = 256,
+    grains: int | Sequence[int] | Literal["auto"] = 256,
     seeds: int = 2,
     timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
     equilibrate: float | None = None,
-    strain: float = 10.0,
+    strain: float | None = None,
     error: float | None = None,
     tolerance: float | Literal["auto"] = 1e-4,
     target_error: float = 0.02,
@@ -72,14 +74,17 @@ def ratio_map(
     Args:
       restitution: values of α in [0, 1], sorted.
       packing_fraction: values of ν in (0, 0.83], sorted.
-      grains: number of grains of a replica.
+      grains: number of grains of a replica. A sorted list adds a dimension to the map, and estimates for a large
+        system.
       seeds: replicas of each point.
       timestep: dt of the sample in units of 1/γ̇. A sorted list adds a dimension to the map. "auto" is the longest one
         with a stress error within ``target_error`` at every point.
       equilibrate: strain before the sample, or None to shear until the flow is steady.
-      strain: sampled strain of each seed.
-      error: target for the relative standard error of force ratio, pressure and shear stress at every point. The strain
-        of a seed is doubled until its share of the error is reached, up to a strain of 256. None keeps ``strain``.
+      strain: sampled strain of each seed, or None for six memories of each flow and at least 8.
+      error: target for the whole relative error of force ratio, pressure and shear stress at every point, half the
+        width of an interval of 95 %, see ``error_budget``. Grains, time step and tolerance that are "auto" are chosen
+        for it. The strain of a seed is doubled until its share of the error of sampling is reached, up to 256 or 32
+        memories. None keeps ``strain``.
       tolerance: relative residual of a contact solve, or "auto".
       target_error: relative error of pressure and shear stress for "auto".
       solver: projected method of the contact solve, see ``projected_methods``.
@@ -92,9 +97,9 @@ def ratio_map(
       report: called with the replica-steps done since the last call.
 
     Returns:
-      The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), or on
-      (timestep, packing_fraction, restitution) for a list of time steps, with standard errors and values by seed. It
-      also has the status of each point, and all parameters as attributes.
+      The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with standard
+      errors and values by seed. Lists of numbers of grains and of time steps add the dimensions grains and timestep in
+      front. It also has the status of each point, and all parameters as attributes.
 
     Raises:
       InputError: (a ValueError) a parameter is out of range; the message says what is accepted.
@@ -113,7 +118,9 @@ def ratio_map(
         "activation": activation,
         "engine": engine,
     }
-    numbers, automatic_choice = automatic({name: _plain(x) for name, x in choices.items()}, target_error)
+    numbers, automatic_choice = automatic(
+        {name: _plain(x, name == "grains") for name, x in choices.items()}, target_error
+    )
     settings = MapSettings(**numbers)
     check_batches(batch, workers)
     if report is not None and not callable(report):
@@ -198,26 +205,31 @@ def replicas(
             yield from outcome
 
 
-def _plain(value: Any) -> Any:
-    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks all other values."""
+def _plain(value: Any, whole: bool = False) -> Any:
+    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks all other values.
+
+    Whole numbers of a list stay whole if ``whole``.
+    """
     try:
         if isinstance(value, np.ma.MaskedArray) or (isinstance(value, Sequence) and len(value) > MAX_REPLICAS):
             return value
         array = np.asarray(value)
     except (TypeError, ValueError):  # a random key, or lists of different lengths
         return value
-    plain = array.astype(float).tolist() if array.ndim and array.dtype.kind in "iu" else array.tolist()
+    real = array.ndim and array.dtype.kind in "iu" and not whole
+    plain = array.astype(float).tolist() if real else array.tolist()
     return tuple(plain) if isinstance(plain, list) else plain
 
 
 def predicted_cost(flow: ShearFlow) -> float:
     """Relative cost of a unit of strain of a flow, a fit to measured times.
 
-    Dense and dissipative flows form contact networks; the first factor is their cost at dt = 1e-3. Steps without a
-    contact are jumped over, so ten times as many steps cost little more than twice as much.
+    The cost is proportional to the number of grains. Dense and dissipative flows form contact networks; the second
+    factor is their cost at dt = 1e-3. Steps without a contact are jumped over, so ten times as many steps cost little
+    more than twice as much.
     """
     alpha, nu, dt = (float(x) for x in (flow.restitution, flow.packing_fraction, flow.timestep))
-    return (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
+    return flow.grains * (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
 
 
 def _remaining(
@@ -234,19 +246,24 @@ def _remaining(
 def _tasks(
     settings: MapSettings, batch: int | Literal["auto"], workers: int, without: Container[Key] = ()
 ) -> list[list[Key]]:
-    """The replicas in batches of similar cost, the most expensive first."""
-    costs = [predicted_cost(flow) for flow in settings.flows()]
+    """The replicas in batches of one number of grains and of similar cost, the most expensive first."""
+    flows = settings.flows()
+    costs = [predicted_cost(flow) for flow in flows]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
-    keys = [(point, seed) for point in order for seed in range(settings.seeds) if (point, seed) not in without]
-    size = _batch_size(settings.grains, len(keys), workers) if batch == "auto" and keys else batch
     lockstep = in_lockstep(settings.engine)
     tasks: list[list[Key]] = []
-    for key in keys:
-        full = not tasks or len(tasks[-1]) == size
-        if full or (lockstep and costs[key[0]] < costs[tasks[-1][0][0]] / _LARGEST_COST_RATIO):
-            tasks.append([])
-        tasks[-1].append(key)
-    return tasks
+    for grains in {flow.grains: None for flow in flows}:
+        points = [point for point in order if flows[point].grains == grains]
+        keys = [(point, seed) for point in points for seed in range(settings.seeds) if (point, seed) not in without]
+        size = _batch_size(grains, len(keys), workers) if batch == "auto" and keys else batch
+        batches: list[list[Key]] = []
+        for key in keys:
+            full = not batches or len(batches[-1]) == size
+            if full or (lockstep and costs[key[0]] < costs[batches[-1][0][0]] / _LARGEST_COST_RATIO):
+                batches.append([])
+            batches[-1].append(key)
+        tasks += batches
+    return sorted(tasks, key=lambda task: -costs[task[0][0]])
 
 
 def _batch_size(grains: int, count: int, workers: int) -> int:
@@ -275,7 +292,8 @@ def _points(settings: MapSettings, task: Sequence[Key]) -> str:
     """The points of a batch in words, each once."""
     flows = settings.flows()
     points = dict.fromkeys((float(flows[p].restitution), float(flows[p].packing_fraction)) for p, _ in task)
-    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g})" for alpha, nu in points)
+    size = f", {flows[task[0][0]].grains} grains" if "grains" in settings.axes else ""  # one for the whole batch
+    return ", ".join(f"(restitution {alpha:g}, packing fraction {nu:g}{size})" for alpha, nu in points)
 
 
 def _run_task(
@@ -332,7 +350,7 @@ def _measured(
     keys = jnp.asarray(np.stack([_key(seed, point, refinement) for point, seed in task]))
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     strain_before = batch.strain
-    error = None if settings.error is None else settings.error * math.sqrt(settings.seeds)
+    error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)
     return [
         (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(strain_before[k])))
