@@ -22,6 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxgran.maps.schema import FINEST
 from jaxgran.model.checks import InputError, shown
 
 LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
@@ -31,6 +32,7 @@ SMALL_SIZE = 7.0  # points, font of legends and captions
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
+RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
 _MARKERS = "os^DvP<X>ph*"
 _LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
@@ -48,22 +50,15 @@ _RING: dict[str, Any] = {
 
 
 def ordered(data: xr.Dataset, *names: str) -> xr.Dataset:
-    """Return force ratio, status and the named variables, with errors, as ([timestep,] packing_fraction, restitution).
+    """Return force ratio, status and the named variables, with errors, as (..., packing_fraction, restitution).
 
-    The values of all axes increase. Variables that the map does not have are left out.
+    Numbers of grains and time steps, if there are several, come first. The values of all axes increase. Variables that
+    the map does not have are left out.
     """
     values = ("force_ratio", *names)
     kept = [name for name in (*values, *(f"{name}_stderr" for name in values), "status") if name in data]
-    dims = [name for name in ("timestep", "packing_fraction", "restitution") if name in data.dims]
+    dims = [name for name in (*FINEST, "packing_fraction", "restitution") if name in data.dims]
     return data[kept].sortby(dims).transpose(*dims, ...).assign_attrs({"seeds": data.sizes.get("seed")} | data.attrs)
-
-
-def finest(data: xr.Dataset) -> xr.Dataset:
-    """Return an ordered map at its shortest time step, which becomes its attribute `timestep`."""
-    if "timestep" not in data.coords:
-        return data
-    data = data.isel(timestep=0) if "timestep" in data.dims else data
-    return data.assign_attrs(timestep=float(data.timestep))
 
 
 def is_plane(data: xr.Dataset) -> bool:
@@ -253,8 +248,12 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
 
 
 def _run_description(attrs: dict) -> str:
-    """Return in one line the parameters on which a force ratio depends; several time steps are shown by an axis."""
-    parts = [f"$N={attrs['grains']}$"] if "grains" in attrs else []
+    """Return in one line the parameters on which a force ratio depends; what has several values is shown by an axis."""
+    parts = []
+    if "grains_by_point" in attrs:
+        parts.append(f"$N={np.min(attrs['grains_by_point'])}$ to ${np.max(attrs['grains_by_point'])}$")
+    elif np.ndim(attrs.get("grains", ())) == 0:
+        parts.append(f"$N={attrs['grains']}$")
     if attrs.get("seeds") is not None:
         parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
     if np.ndim(attrs.get("timestep", ())) == 0:

@@ -23,7 +23,7 @@ from jaxgran.inference.friction_law import (
     friction_law,
     is_dense,
 )
-from jaxgran.maps.schema import RATIO, require_map, what_lacks
+from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
 from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     NU_LABEL,
@@ -33,7 +33,6 @@ from jaxgran.plotting.drawing import (
     curve_styles,
     draw_points,
     empty_figure,
-    finest,
     finish,
     missing_note,
     ordered,

@@ -9,8 +9,10 @@ import xarray as xr
 from jaxgran.maps.schema import RATIO, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.drawing import is_plane, writable_stem, write
+from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
+from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 
 
@@ -25,8 +27,10 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     `{stem}_curves.png`     always
     `{stem}_contours.png`   at least two restitutions and two packing fractions
     `{stem}_timestep.png`   at least two time steps
+    `{stem}_size.png`       at least two numbers of grains
     `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
     `{stem}_clusters.png`   the shares of the clusters
+    `{stem}_errors.png`     a plane, and the error budget of its points
     `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
     ======================= ==================================================================
 
@@ -43,8 +47,10 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
         "curves": (True, ratio_curves),
         "contours": (is_plane(data), ratio_contours),
         "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
+        "size": (data.sizes.get("grains", 1) >= 2, averages_against_grains),
         "theory": (is_plane(data) and has_theory(data), theory_errors),
         "clusters": (has_clusters(data), cluster_shares),
+        "errors": (is_plane(data) and has_errors(data), dominating_errors),
         "rheology": (has_friction_law(data), friction_figure),
     }
     drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}

@@ -1,9 +1,10 @@
-"""The figures of a ratio map: curves of the force ratio, contours of its excess over one, and the effect of dt.
+"""The figures of a ratio map: curves of its ratios, contours of the excess over one, and the effect of dt.
 
 All are drawn from the dataset of :func:`jaxgran.ratio_map`. Curves and contours follow Figures 1 and 2 of Lois,
-Lemaître and Carlson, *Momentum transport in granular flows*. They show the shortest time step of a map that has
-several. The third figure shows the effect of the time step. The force ratio is ⟨F⟩/⟨F_bc⟩ and the excess is
-⟨F⟩/⟨F_bc⟩ − 1. :func:`save_figures` also writes the figures of :mod:`jaxgran.plotting.theory` and
+Lemaître and Carlson, *Momentum transport in granular flows*. They show the largest number of grains and the shortest
+time step of a map that has several. The third figure shows the effect of the time step. The force ratio is ⟨F⟩/⟨F_bc⟩
+and the excess is ⟨F⟩/⟨F_bc⟩ − 1. The shear-stress ratio is that of the contact stress to the binary stress, component
+xy. :func:`save_figures` also writes the figures of :mod:`jaxgran.plotting.size`, :mod:`jaxgran.plotting.theory` and
 :mod:`jaxgran.plotting.friction`.
 """
 
@@ -21,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from jaxgran.maps.schema import RATIO, require_map
+from jaxgran.maps.schema import RATIO, finest, require_map, shear_stress_ratio, what_lacks
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
@@ -40,13 +41,13 @@ from jaxgran.plotting.drawing import (
     ALPHA_TITLE,
     LABEL_SIZE,
     NU_LABEL,
+    RATIO_LABEL,
     TICK_SIZE,
     add_curve_legend,
     curve_key,
     curve_styles,
     draw_points,
     empty_figure,
-    finest,
     finish,
     fix_layout,
     missing_note,
@@ -58,37 +59,47 @@ from jaxgran.plotting.drawing import (
     suspect,
 )
 
-_MOST_TOGETHER = 8  # curves in one panel of the figure against the time step
+MOST_TOGETHER = 8  # curves in one panel of the figures against the time step and the number of grains
 _LOG_SPAN = 2.5  # largest over smallest force ratio at and above which the axis is logarithmic
-_RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
+_SHEAR_LABEL = r"shear-stress ratio $\Sigma^{xy}/\Sigma^{xy}_{\mathrm{bc}}$"
 _BAND = "#e08214"
 
 
 def ratio_curves(data: xr.Dataset) -> Figure:
-    """Return the force ratio against the packing fraction, one curve per restitution (Figure 1).
+    """Return force ratio and shear-stress ratio against the packing fraction, one curve per restitution (Figure 1).
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) `force_ratio`, `force_ratio_stderr` (dimensionless)
-                                             and, where present, the CF flag variable `status`;
-                                             the shortest of several time steps is drawn
-    returns  Figure                          error bars are one standard error; a point whose
+                                             and, where present, the CF flag variable `status` and
+                                             `stress_ratio`, `stress_ratio_stderr`; the largest of
+                                             several numbers of grains and the shortest of several
+                                             time steps are drawn
+    returns  Figure                          two panels with one scale; a map without
+                                             `stress_ratio` has the panel of the force ratio alone;
+                                             error bars are one standard error; a point whose
                                              status is not `ok` is an open symbol in a ring
     ======== =============================== =====================================================
     """
     require_map(data, *RATIO)
-    data = finest(ordered(data))
-    figure = empty_figure(width=5.0, height=3.5)
-    axes = figure.add_subplot()
-    axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
-    styles = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
-    handles = [
-        _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}")
-        for value, style in styles
-    ]
-    _set_ratio_scale(axes, data.force_ratio.values)
-    axes.set_xlim(padded(data.packing_fraction.values))
-    axes.set_xlabel(NU_LABEL, fontsize=LABEL_SIZE)
-    axes.set_ylabel(_RATIO_LABEL, fontsize=LABEL_SIZE)
+    data = _with_shear_stress_ratio(finest(ordered(data, "stress_ratio")))
+    labels = {"force_ratio": RATIO_LABEL}
+    if "shear_stress_ratio" in data:
+        labels = {"force_ratio": f"(a) {RATIO_LABEL}", "shear_stress_ratio": f"(b) {_SHEAR_LABEL}"}
+    figure = empty_figure(width=2.3 + 2.7 * len(labels), height=3.5)
+    grid = figure.subplots(1, len(labels), sharey=True, squeeze=False)[0]
+    handles: list[Line2D] = []
+    for axes, (name, label) in zip(grid, labels.items(), strict=True):
+        axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
+        styles = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
+        handles = [
+            _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}", name)
+            for value, style in styles
+        ]
+        axes.set_xlim(padded(data.packing_fraction.values))
+        axes.set_xlabel(NU_LABEL, fontsize=LABEL_SIZE)
+        axes.set_ylabel(label, fontsize=LABEL_SIZE)
+        axes.tick_params(labelleft=True)
+    _set_ratio_scale(grid[0], np.concatenate([data[name].values for name in labels]))
     add_curve_legend(figure, data, handles, ALPHA_TITLE)
     measured = np.isfinite(data.force_ratio.values)
     finish(figure, data, measured, [status_note(data), missing_note(measured)])
@@ -156,8 +167,8 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
         raise InputError(
             f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
         )
-    data = ordered(data)
-    panels, title = _timestep_panels(data)
+    data = finest(ordered(data), "grains")
+    panels, title = point_panels(data)
     columns = math.ceil(math.sqrt(len(panels)))
     rows = math.ceil(len(panels) / columns)
     width, height = (5.0, 3.5) if len(panels) == 1 else (1.0 + 1.9 * columns, 1.0 + 1.6 * rows)
@@ -176,7 +187,7 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
         axes.tick_params(labelbottom=True)
         axes.set_xlabel(r"time step $\dot{\gamma}\,\mathrm{d}t$", fontsize=LABEL_SIZE)
     _set_timestep_scale(grid[0], data.timestep.values)
-    figure.supylabel(_RATIO_LABEL, fontsize=LABEL_SIZE)
+    figure.supylabel(RATIO_LABEL, fontsize=LABEL_SIZE)
     add_curve_legend(figure, data, handles, title)
     measured = np.isfinite(data.force_ratio.values)
     finish(figure, data, measured, [status_note(data), missing_note(measured)])
@@ -186,9 +197,20 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
 # --------------------------------------------------------------------------------------------- curves
 
 
-def _draw_curve(axes: Axes, curve: xr.Dataset, along: str, style: dict, label: str) -> Line2D:
-    """Draw one curve along a coordinate with its error bars and suspect points; return its legend entry."""
-    ratio, stderr = curve.force_ratio.values, curve.force_ratio_stderr.values
+def _with_shear_stress_ratio(data: xr.Dataset) -> xr.Dataset:
+    """Return the map with component xy of the stress ratio as `shear_stress_ratio`, if it has the tensor."""
+    names = ("stress_ratio", "stress_ratio_stderr")
+    if what_lacks(data, *names) or not {"axis_a", "axis_b"} <= set(data.stress_ratio.dims):
+        return data
+    value, stderr = shear_stress_ratio(data)
+    return data.assign(shear_stress_ratio=value, shear_stress_ratio_stderr=stderr)
+
+
+def _draw_curve(
+    axes: Axes, curve: xr.Dataset, along: str, style: dict, label: str, name: str = "force_ratio"
+) -> Line2D:
+    """Draw a ratio along a coordinate with its error bars and suspect points; return its legend entry."""
+    ratio, stderr = curve[name].values, curve[f"{name}_stderr"].values
     draw_points(axes, curve[along].values, ratio, suspect(curve), style, yerr=stderr)
     return curve_key(style, label)
 
@@ -210,10 +232,10 @@ def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
 # ----------------------------------------------------------------------------------------- time steps
 
 
-def _timestep_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.Dataset]]]], str]:
+def point_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.Dataset]]]], str]:
     """Return the panels and the title of the legend; a panel is a name and its curves with their labels."""
     alphas, nus = data.restitution.values, data.packing_fraction.values
-    if len(alphas) * len(nus) <= _MOST_TOGETHER:
+    if len(alphas) * len(nus) <= MOST_TOGETHER:
         curves = [
             (f"{alpha:.4g}, {nu:.4g}", data.sel(packing_fraction=nu, restitution=alpha))
             for nu in nus

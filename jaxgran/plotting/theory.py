@@ -1,7 +1,8 @@
 """Figures that explain the force ratio: the errors of kinetic theory and their causes, and the share of clusters.
 
-The figures show the shortest time step of a map that has several. The excess is ⟨F⟩/⟨F_bc⟩ − 1, that of the force ratio
-over one. In the plane of 1 − α and ν its contours are drawn on top of each figure.
+The figures show the largest number of grains and the shortest time step of a map that has several. The excess is
+⟨F⟩/⟨F_bc⟩ − 1, that of the force ratio over one. In the plane of 1 − α and ν its contours are drawn on top of each
+figure.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxgran.maps.schema import RATIO, require_map, what_lacks
+from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
     add_plane_legend,
@@ -38,7 +39,6 @@ from jaxgran.plotting.drawing import (
     curve_key,
     curve_styles,
     empty_figure,
-    finest,
     finish,
     fix_layout,
     is_plane,

@@ -1,0 +1,113 @@
+"""The effect of the number of grains: averages of a map against N, relative to those at its largest N."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
+
+from jaxgran.maps.schema import RATIO, finest, require_map
+from jaxgran.model.checks import InputError
+from jaxgran.plotting.drawing import (
+    LABEL_SIZE,
+    RATIO_LABEL,
+    TICK_SIZE,
+    add_curve_legend,
+    curve_key,
+    curve_styles,
+    draw_points,
+    empty_figure,
+    finish,
+    missing_note,
+    ordered,
+    status_note,
+    suspect,
+)
+from jaxgran.plotting.ratio import MOST_TOGETHER, point_panels
+
+_MOST_NUMBERS = 5  # at the axis of N, or one more
+_QUANTITIES = {
+    "pressure": r"pressure $p$",
+    "shear_stress": r"shear stress $\tau$",
+    "granular_temperature": "granular temperature $T$",
+    "force_ratio": RATIO_LABEL,
+}
+
+
+def averages_against_grains(data: xr.Dataset) -> Figure:
+    """Return pressure, shear stress, granular temperature and force ratio against the number of grains.
+
+    Each average is divided by its value at the largest number of grains N. Every restitution and packing fraction has a
+    curve. Up to eight curves share the panels. With more, each packing fraction has a row of panels, with at most eight
+    restitutions, evenly chosen.
+
+    ======== ======================================= =====================================================
+    data     (grains, packing_fraction, restitution) `force_ratio` and any of `pressure`, `shear_stress`
+                                                     and `granular_temperature`, with `_stderr`, and
+                                                     `status`; the shortest of several time steps is drawn
+    returns  Figure                                  error bars are one standard error of the value at
+                                                     each N; a point whose status is not `ok` is an open
+                                                     symbol in a ring
+    raises   ValueError                              fewer than two numbers of grains
+    ======== ======================================= =====================================================
+    """
+    require_map(data, *RATIO)
+    sizes = data.sizes.get("grains", 1)
+    if sizes < 2:
+        raise InputError(f"this figure needs at least two numbers of grains, and this map has {sizes}.")
+    data, left_out = _with_few_restitutions(finest(ordered(data, *_QUANTITIES), "timestep"))
+    names = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
+    panels, title = point_panels(data)
+    figure = empty_figure(
+        1.2 + 2.0 * len(names), (1.2 + 2.2 * len(panels)) if len(panels) == 1 else 1 + 1.7 * len(panels)
+    )
+    grid = figure.subplots(len(panels), len(names), sharex=True, squeeze=False)
+    handles: list[Line2D] = []
+    for row, (words, curves) in zip(grid, panels, strict=True):
+        styles = curve_styles(len(curves))
+        handles = [curve_key(style, label) for (label, _), style in zip(curves, styles, strict=True)]
+        for axes, name in zip(row, names, strict=True):
+            axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
+            for (_, curve), style in zip(curves, styles, strict=True):
+                _draw_curve(axes, curve, name, style)
+        row[0].set_ylabel(words, fontsize=LABEL_SIZE)
+    for axes, name in zip(grid[0], names, strict=True):
+        axes.set_title(_QUANTITIES[name], fontsize=TICK_SIZE)
+    for axes in grid[-1]:
+        axes.set_xlabel("number of grains $N$", fontsize=LABEL_SIZE)
+    _set_size_scale(grid[0, 0], data.grains.values)
+    figure.supylabel(f"value / value at $N={data.grains.values[-1]}$", fontsize=LABEL_SIZE)
+    add_curve_legend(figure, data, handles, title)
+    measured = np.isfinite(data.force_ratio.values)
+    finish(figure, data, measured, [left_out, status_note(data), missing_note(measured)])
+    return figure
+
+
+def _with_few_restitutions(data: xr.Dataset) -> tuple[xr.Dataset, str]:
+    """Return a map with at most eight restitutions, and a line that tells how many there were if some are left out."""
+    count = data.sizes["restitution"]
+    if count <= MOST_TOGETHER:
+        return data, ""
+    chosen = np.linspace(0, count - 1, MOST_TOGETHER).round().astype(int)
+    return data.isel(restitution=chosen), f"{MOST_TOGETHER} of {count} restitutions"
+
+
+def _draw_curve(axes: Axes, curve: xr.Dataset, name: str, style: dict) -> None:
+    """Draw one average over its value at the largest number of grains, with error bars and suspect points."""
+    reference = curve[name].values[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value, stderr = curve[name].values / reference, curve[f"{name}_stderr"].values / abs(reference)
+    draw_points(axes, curve.grains.values, value, suspect(curve), style, yerr=stderr)
+
+
+def _set_size_scale(axes: Axes, grains: np.ndarray) -> None:
+    """Make the axis of the number of grains logarithmic, with the sizes of the map as its numbers."""
+    axes.set_xscale("log")
+    margin = (grains[-1] / grains[0]) ** 0.08
+    axes.set_xlim(grains[0] / margin, grains[-1] * margin)
+    axes.xaxis.set_major_locator(FixedLocator(grains.tolist(), nbins=_MOST_NUMBERS))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
