@@ -62,7 +62,7 @@ BENCHMARKS = (
         "quick_map",
         "What does `jaxgran map` draw when it is given no option?",
         (0.5, 0.4),
-        ("quick_curves.png",),
+        ("quick_curves.png", "quick_errors.png"),
     ),
     Benchmark(
         "dense_rheology",
@@ -184,6 +184,29 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "size_study",
+        "What does the number of grains do to stresses, temperature and force ratio?",
+        (200, 1),
+        ("size_study.json", "size_study.png", "size_study_waves.png", "size_study_profiles.png"),
+        (
+            Option("--largest", "leaves out flows of more grains", int),
+            Option("--folder", "where the flows that are done are kept", Path),
+        ),
+    ),
+    Benchmark(
+        "preparation",
+        "Do hot and cold starts end in the same steady state?",
+        (3, 1),
+        ("preparation.json", "preparation.png"),
+    ),
+    Benchmark(
+        "coverage",
+        "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
+        (6, 0.5),
+        ("coverage.json", "coverage.png"),
+        one_core=True,
+    ),
+    Benchmark(
         "stability",
         "What fails first as the time step grows and the packing becomes dense?",
         (12, 0.5),
@@ -214,6 +237,7 @@ BENCHMARKS = (
         "mutants",
         "Do the tests find mistakes of one word, made in a copy of the code?",
         (20, 2),
-        options=(Option("--only", "one mistake alone, by its name; writes nothing"),),
+        ("mutants.json",),
+        (Option("--only", "one mistake alone, by its name; writes nothing"),),
     ),
 )

@@ -26,6 +26,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
+from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.prediction import predicted
@@ -156,6 +157,8 @@ def cell(variant: str, alpha: float, nu: float, crossing: float, state: jg.State
         state, tally = advance(flow, state, jnp.int32(steps))
         whole = tally if whole is None else whole + tally
         now = jg.Status(int(tally.status)).name
+        if tally.status <= jg.Status.deep_overlap and tally.largest_overlap > DEEP_OVERLAP:
+            now = "deep_overlap"
         if gains(tally, energy(state) - before, GAIN[precision.name] * (before + energy(state))):
             now = max(now, "energy_gain", key=list(OUTCOMES).index)
         if outcome == "ok" and now != "ok":
