@@ -51,8 +51,8 @@ print(f"{int(good.sum())} of {good.size} points without remarks")
 print(f"largest standard error of the force ratio: {float((data.force_ratio_stderr / data.force_ratio).max()):.1%}")
 
 # %% [markdown]
-# The force ratio against the packing fraction, a curve for each restitution. It depends on the time step, which the
-# figure names: isolated collisions become binary as dt → 0.
+# The force ratio (a) and the shear-stress ratio (b) against the packing fraction, a curve for each restitution. They
+# depend on the time step, which the figure names: isolated collisions become binary as dt → 0.
 
 # %%
 jg.ratio_curves(data)
