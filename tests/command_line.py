@@ -64,7 +64,7 @@ def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseExce
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
             report(100.0)
-            replica = random_replica(rng, settings, status)
+            replica = random_replica(rng, settings, status, key[0])
             if checkpoint is not None:
                 checkpoint.add({key: replica})
             yield key, replica

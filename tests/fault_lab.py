@@ -24,7 +24,7 @@ MARKS = [
 ]
 DRIVER = Path(__file__).with_name("fault_driver.py")
 FLOWS = ["--restitution", "0.3,0.7", "--packing-fraction", "0.6", "--grains", "32", "--seeds", "2"]
-STRAINS = ["--timestep", "1e-3", "--equilibrate", "0.5", "--strain", "10"]
+STRAINS = ["--timestep", "1e-3", "--equilibrate", "3", "--strain", "10"]
 MAP = ["map", *FLOWS, *STRAINS, "--batch", "2"]
 PATIENCE = 120.0
 

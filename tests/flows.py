@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from jaxgran.dynamics.tally import Tally
+from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
+
+OF_INSTANTS = tuple(name for name, row in TABLE.items() if row["kind"] == INSTANT)  # those of the end of an advance
 
 # Not the same where impulses agree to rounding only: what measures how well a network was solved.
 OF_THE_SOLVER = ("residual_counts", "worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")

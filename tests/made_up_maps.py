@@ -78,6 +78,21 @@ def with_timesteps(data: xr.Dataset, *timesteps: float) -> xr.Dataset:
     return several.assign_attrs(data.attrs | {"timestep": list(timesteps)})
 
 
+def with_grains(data: xr.Dataset, *grains: int, noise: float = 0.01) -> xr.Dataset:
+    """Return a map of several numbers of grains, whose averages grow by different shares for a factor of four."""
+    random, dims, parts = np.random.default_rng(0), data.force_ratio.dims, []
+    growth = {"pressure": 0.10, "shear_stress": 0.08, "granular_temperature": 0.15, "force_ratio": 0.02}
+    for size in grains:
+        part = data
+        for name, share in growth.items():
+            value = data.force_ratio.values * (1.0 + share * np.log(size / grains[0]) / np.log(4.0))
+            value = value * (1.0 + noise * random.normal(size=value.shape))
+            part = part.assign({name: (dims, value), f"{name}_stderr": (dims, noise * value)})
+        parts.append(part.assign(status=data.status.copy(deep=True)))
+    several = xr.concat(parts, xr.Variable("grains", list(grains)))
+    return several.assign_attrs(data.attrs | {"grains": list(grains)})
+
+
 def power(number: np.ndarray, law: tuple[float, float, float]) -> np.ndarray:
     return law[0] + law[1] * number ** law[2]
 

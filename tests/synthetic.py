@@ -25,13 +25,14 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
         values[name] = rng.gamma(20.0, 1.0, (*shape, *tail))
         if name in counts:
             values[name] = np.ceil(values[name])
+    values["deep_contacts"] = np.zeros(shape)
     return Tally(**{**values, "status": np.full(shape, status, np.int32)})
 
 
-def random_replica(rng: np.random.Generator, settings: MapSettings, status: int = Status.ok) -> Replica:
+def random_replica(rng: np.random.Generator, settings: MapSettings, status: int = Status.ok, point: int = 0) -> Replica:
     """Return a replica of a map with random sums, the same area for all and a strain of 3 before the sample."""
-    tally = random_tally(rng, BLOCKS, status=status)
-    return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), settings.grains), int(status), 3.0)
+    tally, grains = random_tally(rng, BLOCKS, status=status), settings.flows()[point].grains
+    return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), grains), int(status), 3.0)
 
 
 def one_sentence(message: str) -> bool:

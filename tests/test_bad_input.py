@@ -20,7 +20,7 @@ import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_maps import ratio_dataset, with_timesteps
+from made_up_maps import ratio_dataset, with_grains, with_timesteps
 from matplotlib.figure import Figure
 from synthetic import one_sentence, snapshot_of
 
@@ -287,6 +287,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),
     "contours of a line": (lambda: jg.ratio_contours(ratio_dataset(alphas=1)), "at least two restitutions"),
     "one time step": (lambda: jg.ratio_against_timestep(ratio_dataset()), "at least two time steps"),
+    "one number of grains": (lambda: jg.averages_against_grains(ratio_dataset()), "at least two numbers of grains"),
     "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory_pressure"),
     "no clusters": (lambda: jg.cluster_shares(ratio_dataset()), "it has no cluster_pressure_share"),
     "no friction": (lambda: jg.friction_figure(ratio_dataset()), "it has no inertial_number"),
@@ -453,6 +454,7 @@ NO_MAPS: dict[str, xr.Dataset] = {
     "repetition on an axis": ratio_dataset(alphas=2).assign_coords(restitution=[0.5, 0.5]),
     "not a number on an axis": ratio_dataset(alphas=2).assign_coords(restitution=[0.5, np.nan]),
     "repeated time steps": with_timesteps(ratio_dataset(), 1e-3, 1e-3),
+    "repeated numbers of grains": with_grains(ratio_dataset(), 64, 64),
     "status without meanings": ratio_dataset().assign(status=ratio_dataset().status.drop_attrs()),
     "status with too few meanings": ratio_dataset().assign(
         status=ratio_dataset().status.assign_attrs(flag_meanings="ok")

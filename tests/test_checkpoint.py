@@ -61,6 +61,17 @@ def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
     assert list(output.parent.iterdir()) == []
 
 
+def test_replicas_of_every_number_of_grains_come_back(output: Path) -> None:
+    settings, rng = replace(SETTINGS, grains=(64, 128)), np.random.default_rng(0)
+    run = Checkpoint(output, settings, resume=False)
+    run.add({(point, 0): random_replica(rng, settings, Status.ok, point) for point in (0, 5)})
+    run.close(finished=False)
+    resumed = Checkpoint(output, settings, resume=True)
+    assert_same_bits(resumed.done, run.done)
+    assert [resumed.done[point, 0].sample.grains for point in (0, 5)] == [64, 128]
+    resumed.close(finished=False)
+
+
 def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     cut_off(output)
     with pytest.raises(InputError, match="continue it with --resume") as refused:

@@ -26,17 +26,19 @@ from synthetic import one_sentence, random_replica
 
 from jaxgran.cli import app
 from jaxgran.cli import map as map_module
-from jaxgran.cli.arguments import FIRST_STRAIN, number_list
+from jaxgran.cli.arguments import number_list
 from jaxgran.cli.terminal import print_table
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import sweep
 from jaxgran.maps.dataset import NOT_RUN
-from jaxgran.maps.results import read_dataset, write_dataset
+from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import movie
+from jaxgran.sampling.budget import sampling_error
+from jaxgran.sampling.memory import LEAST_SAMPLE
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "
@@ -44,7 +46,7 @@ SMALL_MAP = (
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
 SAME += ("solver", "engine", "solver_asked", "engine_asked")
-PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters")}
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters", "errors")}
 FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "64", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
@@ -111,7 +113,7 @@ MISTAKES = {
     "map --packing-fraction 0.5,0.84": "--packing-fraction must be above 0 and at most 0.83",
     "map --packing-fraction 0.7,0.5,0.6": "--packing-fraction must be sorted",
     "map --grains 15": "grains must be a whole number of at least 16",
-    "map --grains 20.5": "--grains",
+    "map --grains 20.5": "--grains must be a whole number",
     "map --seeds 0": "seeds must be a whole number of at least 1",
     "map --timestep 0": "timestep must be a positive number",
     "map --timestep -1e-3": "timestep must be a positive number",
@@ -191,8 +193,12 @@ MISTAKES = {
     "map -x 3": "there is no option -x: see jaxgran map --help",
     "map map.nc": "'map.nc' stands alone",
     "map --restitution 0.1 0.5 0.9": "'0.5 0.9' stands alone, and values follow their options; a list has commas",
-    "map --grains 1e3": "--grains must be a whole number, not '1e3'",
-    "map --grains=many": "--grains must be a whole number, not 'many'",
+    "map --grains 1e3": "--grains must be a whole number or a list like 256,1000,4000, not '1e3'",
+    "map --grains=many": "--grains must be a whole number or a list like 256,1000,4000, not 'many'",
+    "map --grains 64,": "--grains must be a whole number or a list like 256,1000,4000, not '64,'",
+    "map --grains 64,1000,256": "--grains must be sorted",
+    "map --grains 15,64": "--grains must be a whole number of at least 16, not 15",
+    "run --restitution 0.5 --packing-fraction 0.7 --grains=many": "--grains must be a whole number, not 'many'",
     "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
     "map --seeds": "'--seeds' requires an argument",
     "map --preset fast": "--preset must be one of 'quick', 'paper', not 'fast'",
@@ -269,15 +275,16 @@ def test_map_writes_a_dataset_and_its_figures(small_map) -> None:
     assert data.attrs["replica_steps_per_second"] > 0
 
 
-def test_map_prints_the_table_and_the_progress_apart(small_map) -> None:
+def test_map_prints_the_tables_and_the_progress_apart(small_map) -> None:
     folder, (_, out, err) = small_map
     data = read_dataset(folder / "small.nc")
     assert "dt = 0.001 / shear rate, midpoint activation" in " ".join(out.split())
     for nu in (0.5, 0.6):
-        (row,) = (line for line in out.splitlines() if line.split()[:1] == [str(nu)])
-        for alpha in (0.5, 0.9):
-            value = data.force_ratio.sel(packing_fraction=nu, restitution=alpha)
-            assert f"{float(value):.4g} ±" in row
+        rows = [line for line in out.splitlines() if line.split()[:1] == [str(nu)]]
+        ratios = data.force_ratio, data.stress_ratio.sel(axis_a="x", axis_b="y")
+        for row, ratio in zip(rows, ratios, strict=True):
+            for alpha in (0.5, 0.9):
+                assert f"{float(ratio.sel(packing_fraction=nu, restitution=alpha)):.4g} ±" in row
     assert "points" not in out
     assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
     for name in ("small.nc", *PICTURES):
@@ -336,10 +343,21 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert outcome.out.split("\n")[0].startswith(f"Engine machine_code, solver {data.attrs['solver']}")
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
     data = data.isel(restitution=0, packing_fraction=0)
+    averages, budget = outcome.out.split("Whole error")
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
-        (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
+        (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
         assert f"{float(data[name]):.4g} ± {float(data[f'{name}_stderr']):.2g}" in row
-    (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("pressure"))
+    (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("shear-stress ratio  "))
+    value, error = (float(data[name][0, 1]) for name in ("stress_ratio", "stress_ratio_stderr"))
+    assert f"{value:.4g} ± {error:.2g}" in row
+    (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
+    parts = [
+        1.96 * data.pressure_stderr,
+        *(data[f"pressure_error_{part}"] for part in ("timestep", "size", "tolerance")),
+    ]
+    shown = [f"{100 * float(part / data.pressure):.2g}" for part in (*parts, data.pressure_error)]
+    assert [word for word in row.split()[1:] if word != "%"] == shown
+    (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
     samples = data.strain_by_seed.sum().item() / data.pressure_correlation_strain.item()
     assert row.split()[4:] == ["m", "/", "t^2", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
 
@@ -350,10 +368,9 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     data = read_dataset(tmp_path / "flow.nc")
     assert data.attrs["error"] == 0.1
     for name in ("force_ratio", "pressure", "shear_stress"):
-        assert np.all(data[f"{name}_stderr"] <= 0.1 * data[name])
-    strain = data.strain_by_seed.item()
-    assert np.log2(strain / FIRST_STRAIN) == pytest.approx(round(np.log2(strain / FIRST_STRAIN)), abs=1e-3)
-    assert "relative standard errors: 0.1 asked for" in outcome.err
+        assert np.all(data[f"{name}_stderr"] <= sampling_error(0.1) * data[name])
+    assert data.strain_by_seed.item() >= LEAST_SAMPLE
+    assert "whole relative errors: 0.1 asked for" in outcome.err
 
 
 def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
@@ -600,7 +617,8 @@ def test_completion_completes(line: str, expected: set[str], tmp_path: Path, mon
 def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colour_is_asked_for(
     small_map, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    table = map_module._ratio_table(read_dataset(small_map[0] / "small.nc"))
+    data = read_dataset(small_map[0] / "small.nc")
+    table = map_module._ratio_table(data, "Force ratio", data.force_ratio, data.force_ratio_stderr)
 
     class Terminal(StringIO):
         def isatty(self) -> bool:
@@ -640,6 +658,19 @@ def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeyp
     assert outcome.err.strip() == "jaxgran: interrupted."
 
 
+def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
+    """Grains by point hold for the points of the file only, and either a strain or an error holds."""
+    chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1, "seeds": 1}
+    assert map_module.kept_choices(chosen, {}) == chosen
+    assert map_module.kept_choices(chosen, {"restitution": (0.2, 0.5)}) == {
+        **{name: value for name, value in chosen.items() if name != "grains_by_point"},
+        "grains": "auto",
+    }
+    assert "grains_by_point" not in map_module.kept_choices(chosen, {"grains": 256})
+    assert map_module.kept_choices(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"}
+    assert map_module.kept_choices({"strain": 4.0, "seeds": 4, "grains": 400}, {"error": 0.1}) == {"grains": 400}
+
+
 def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--quiet")
@@ -659,18 +690,24 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
     for k, status in points.items():
         alpha = 0.9 * k / (len(points) - 1)
         named = f"{status.name.replace('_', ' ')}: (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
-        assert named == (status != Status.ok), status
-    (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("0.6"))
-    assert row.count("*") == len(points) - 1
+        assert named == (status not in (Status.ok, Status.short_sample)), status
+    assert "short sample at (restitution" in outcome.err and "Add --strain" in outcome.err
+    rows = [line for line in outcome.out.splitlines() if line.strip().startswith("0.6")]
+    assert [row.count("*") for row in rows] == [len(points) - 1] * 2  # force ratio and shear-stress ratio
+
+
+def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> None:
+    """A map has made-up replicas, of which the last has a bad status, and its figures are not drawn."""
+    leave_out_layout(monkeypatch)
+    write_without_drawing(monkeypatch)
+    statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
 
 
 def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_theirs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    leave_out_layout(monkeypatch)
-    write_without_drawing(monkeypatch)
-    statuses = {(point, 0): Status.deep_overlap if point == 3 else Status.ok for point in range(4)}
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
+    last_point_overlaps_deeply(monkeypatch, points=4)
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--timestep", "1e-3,1e-4")
     assert outcome.status == 3
     assert "deep overlap: (restitution 0.9, packing fraction 0.6, time step 0.0001)." in outcome.err
@@ -679,14 +716,37 @@ def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_
     assert "wrote jaxgran_map_timestep.png" in outcome.err
     data = read_dataset(tmp_path / "jaxgran_map.nc")
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
-    tables = " ".join(outcome.out.split()).split("Force ratio at dt = ")[1:]
-    assert len(tables) == 2
-    for table, dt in zip(tables, (1e-3, 1e-4), strict=True):
+    values = {"Force": data.force_ratio, "Shear-stress": data.stress_ratio.sel(axis_a="x", axis_b="y")}
+    _, *tables = re.split("(Force|Shear-stress) ratio at dt = ", " ".join(outcome.out.split()))
+    assert tables[::2] == ["Force", "Shear-stress"] * 2
+    for name, table, dt in zip(tables[::2], tables[1::2], (1e-3, 1e-3, 1e-4, 1e-4), strict=True):
         assert table.startswith(f"{dt:g} / shear rate, midpoint activation")
         for alpha in (0.5, 0.9):
-            value = data.force_ratio.sel(timestep=dt, packing_fraction=0.6, restitution=alpha)
+            value = values[name].sel(timestep=dt, packing_fraction=0.6, restitution=alpha)
             assert f"{float(value):.4g} ±" in table
         assert table.count("*") == (dt == 1e-4)
+
+
+def test_several_numbers_of_grains_have_a_table_each_estimates_and_a_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    last_point_overlaps_deeply(monkeypatch, points=8)
+    words = [*POINTS, "--seeds", "1", "--grains", "64,128", "--timestep", "1e-3,1e-4"]
+    outcome = jaxgran(tmp_path, "map", *words)
+    assert outcome.status == 3
+    assert "deep overlap: (restitution 0.9, packing fraction 0.6, 128 grains, time step 0.0001)." in outcome.err
+    pictures = ("_curves.png", "_timestep.png", "_size.png", "_clusters.png")
+    assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", *pictures)}
+    data = read_dataset(tmp_path / "jaxgran_map.nc")
+    assert data.force_ratio.dims == ("grains", "timestep", "packing_fraction", "restitution")
+    assert data.attrs["grains"].tolist() == data.grains.values.tolist() == [64, 128]
+    out = " ".join(outcome.out.split())
+    titles = [f"Force ratio at {n} grains, dt = {dt:g} / shear rate" for n in (64, 128) for dt in (1e-3, 1e-4)]
+    titles += [f"Large systems at dt = {dt:g} / shear rate" for dt in (1e-3, 1e-4)]
+    assert [out.index(title) for title in titles] == sorted(out.index(title) for title in titles)
+    for value in data.pressure_large_system.values.flat:
+        assert f"{value:.4g} ±" in out
+    assert (choices_of(data)["grains"], choices_of(data)["timestep"]) == ((64, 128), (1e-3, 1e-4))
 
 
 def test_single_time_step_is_a_number_and_no_dimension(

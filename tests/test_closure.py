@@ -205,10 +205,11 @@ def test_points_of_bad_status_or_without_a_value_are_neither_fitted_nor_predicte
     assert set(range(30)) - set(closure_points(data).place.tolist()) == {0, 6}
 
 
-def test_shortest_time_step_is_fitted() -> None:
+def test_shortest_time_step_and_largest_number_of_grains_are_fitted() -> None:
     data = made_up_map()
     other = data.assign(pressure=2 * data.pressure)
     several = xr.concat([other, data], xr.Variable("timestep", [1e-3, 1e-4]))
+    several = xr.concat([several, several.assign(pressure=3 * several.pressure)], xr.Variable("grains", [1000, 256]))
     found = fit_closure(several)
     np.testing.assert_array_equal(found.pressure.coefficients, fit_closure(data).pressure.coefficients)
     assert found.timestep == 1e-4

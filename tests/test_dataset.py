@@ -11,9 +11,10 @@ from synthetic import one_sentence, random_replica
 from jaxgran.maps.dataset import NOT_RUN, THEORY, map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import read_dataset, write_dataset
+from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
+from jaxgran.sampling.budget import error_budget, size_error
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
@@ -276,3 +277,34 @@ def test_checking_the_output_leaves_the_folder_as_it_was(tmp_path: Path) -> None
     check_output(tmp_path / "new.nc")
     assert [p.name for p in tmp_path.iterdir()] == ["old.nc"]
     assert old.read_bytes() == b"old"
+
+
+def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
+    for nu in NUS:
+        for alpha in ALPHAS:
+            point = data.sel(packing_fraction=nu, restitution=alpha)
+            numbers = {name: float(point[name]) for name in data.data_vars if point[name].ndim == 0}
+            errors = {name: numbers.get(f"{name}_stderr", np.nan) for name in numbers}
+            budget = error_budget(numbers, errors, alpha, nu, settings.grains, settings.timestep, settings.tolerance)
+            for name, parts in budget.items():
+                for part, ending in (("timestep", "error_timestep"), ("size", "error_size"), ("error", "error")):
+                    assert numbers[f"{name}_{ending}"] == pytest.approx(float(getattr(parts, part)), nan_ok=True)
+                assert f"{name}_error" in data[name].attrs["ancillary_variables"].split()
+
+
+def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: Path) -> None:
+    chosen = MapSettings(
+        ALPHAS, NUS, grains=1024, seeds=1, timestep=5e-4, error=0.1, grains_by_point=(64, 256, 256, 1024)
+    )
+    assert [flow.grains for flow in chosen.flows()] == [64, 256, 256, 1024]
+    rng = np.random.default_rng(0)
+    found = map_dataset(chosen, {(point, 0): random_replica(rng, chosen, Status.ok) for point in range(4)}, RUN)
+    np.testing.assert_array_equal(found.point_grains, [[64, 256], [256, 1024]])
+    for k, grains in enumerate((64, 256, 256, 1024)):
+        alpha, nu = ALPHAS[k % 2], NUS[k // 2]
+        point = found.sel(packing_fraction=nu, restitution=alpha)
+        size = float(size_error(alpha, nu, grains))
+        expected = size / (1 - size)
+        assert float(point.pressure_error_size / abs(point.pressure)) == pytest.approx(expected)
+    write_dataset(found, tmp_path / "map.nc")
+    assert MapSettings(**choices_of(read_dataset(tmp_path / "map.nc"))) == chosen

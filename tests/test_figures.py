@@ -30,9 +30,9 @@ def bands_of_contours(figure: Figure) -> list[np.ndarray]:
     return [s.get_paths()[0].vertices for s in sets if s.filled and list(s.levels) == [-1.0, 1.0]]
 
 
-def error_bars(figure: Figure) -> list[np.ndarray]:
+def error_bars(figure: Figure, panel: int = 0) -> list[np.ndarray]:
     """Return the lower and upper ends of the error bars, an array (points, 2) for each curve."""
-    containers = [c for c in figure.axes[0].containers if isinstance(c, ErrorbarContainer)]
+    containers = [c for c in figure.axes[panel].containers if isinstance(c, ErrorbarContainer)]
     return [np.array([s[:, 1] for s in c.lines[2][0].get_segments() if len(s)]) for c in containers]
 
 
@@ -49,6 +49,13 @@ def no_value(data: xr.Dataset, *points: tuple[int, int]) -> xr.Dataset:
         data.force_ratio[point] = data.force_ratio_stderr[point] = np.nan
         data.status[point] = 6
     return data
+
+
+def with_stress_ratio(data: xr.Dataset) -> xr.Dataset:
+    """Return the map with a ratio of the stresses whose excess is twice that of the force ratio in component xy."""
+    factors = xr.DataArray([[1.0, 2.0], [2.0, 1.0]], dims=("axis_a", "axis_b"))
+    ratio, error = 1.0 + (data.force_ratio - 1.0) * factors, data.force_ratio_stderr * factors
+    return data.assign(stress_ratio=ratio, stress_ratio_stderr=error)
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(5, 6), (10, 12), (2, 2)])
@@ -116,6 +123,25 @@ def test_error_bars_have_the_length_of_the_standard_error() -> None:
         curve = data.sel(restitution=alpha)
         expected = curve.force_ratio.values[:, None] + curve.force_ratio_stderr.values[:, None] * [-1.0, 1.0]
         np.testing.assert_allclose(ends, expected, rtol=1e-12)
+
+
+def test_curves_of_the_shear_stress_ratio_have_a_panel_on_the_scale_of_the_force_ratio() -> None:
+    data = with_stress_ratio(ratio_dataset())
+    data.status[5, 0] = 1
+    figure = ratio_curves(data.transpose(..., "restitution", "packing_fraction"))
+    assert [axes.get_ylabel()[:3] for axes in figure.axes] == ["(a)", "(b)"]
+    assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
+    assert error_bars(figure)[0].max() < data.stress_ratio[-1, 0, 0, 1] < figure.axes[0].get_ylim()[1]
+    for k, ends in enumerate(error_bars(figure, panel=1)):
+        shear, error = data.stress_ratio[:, k, 0, 1].values, data.stress_ratio_stderr[:, k, 0, 1].values
+        np.testing.assert_allclose(ends, shear[:, None] + error[:, None] * [-1.0, 1.0], rtol=1e-12)
+    ring = [line.get_xydata() for line in figure.axes[1].lines if line.get_markersize() > 8]
+    np.testing.assert_allclose(ring, [[[data.packing_fraction[5], data.stress_ratio[5, 0, 0, 1]]]])
+
+
+def test_curves_of_a_map_without_stresses_are_those_of_the_force_ratio_alone() -> None:
+    assert len(ratio_curves(ratio_dataset()).axes) == 1
+    assert len(ratio_curves(with_stress_ratio(ratio_dataset()).drop_vars("stress_ratio_stderr")).axes) == 1
 
 
 def test_a_notebook_shows_a_figure_though_no_plotting_state_exists() -> None:
@@ -293,10 +319,10 @@ def test_panels_of_time_steps_do_not_overlap(page, alphas: int, nus: int) -> Non
 def test_nothing_overlaps_on_the_page(page) -> None:
     data = ratio_dataset()
     data.status[5, 0] = 1
-    for figure in (ratio_curves(data), ratio_contours(no_value(data, (5, 2)))):
+    for figure in (ratio_curves(with_stress_ratio(data)), ratio_contours(no_value(data, (5, 2)))):
         figure.canvas.draw()
-        axes, text = figure.axes[0].get_tightbbox(), figure._supxlabel.get_window_extent()
-        boxes = [axes, text, *(legend.get_window_extent() for legend in figure.legends)]
+        axes, text = [axes.get_tightbbox() for axes in figure.axes], figure._supxlabel.get_window_extent()
+        boxes = [*axes, text, *(legend.get_window_extent() for legend in figure.legends)]
         for k, box in enumerate(boxes):
             assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
             assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])

@@ -23,7 +23,7 @@ places = jnp.stack(jnp.meshgrid(jnp.arange(4.0), jnp.arange(4.0)), axis=-1).resh
 places = places.at[1, 0].add(-0.75)  # overlaps its neighbour by 0.05
 state = jg.State(grains, places, jnp.zeros((16, 2)).at[1, 0].set(-1.0), jnp.asarray(6.8), jnp.asarray(0.0))
 _, tally = jg.advance(flow, state, jnp.int32(1))
-print(jg.Status(int(tally.status)).name, float(tally.overlap))
+print(jg.Status(int(tally.outcome)).name, float(tally.overlap))
 """
 
 

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import OF_INSTANTS
 from synthetic import one_sentence, random_tally
 
 from jaxgran.dynamics.tally import EXTREMES
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.model.status import Status
+from jaxgran.model.status import DEEP_SHARE, Status
 from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS, Sample, _sample, check_precision, sample
@@ -67,7 +68,7 @@ def test_blocks_add_up_to_the_whole(batch, measured) -> None:
     end, whole = advance_batch(batch.flow, batch.state, steps)
     tally, whole = measured[1].tally, replica(whole, 0)
     for name in vars(tally):
-        if name not in (*EXTREMES, "residual_counts"):
+        if name not in (*EXTREMES, *OF_INSTANTS, "residual_counts"):
             np.testing.assert_allclose(np.sum(getattr(tally, name), axis=0), getattr(whole, name), rtol=1e-5, atol=1e-9)
     assert np.sum(tally.residual_counts) == np.sum(tally.solves)
     assert np.max(tally.largest_overlap) == pytest.approx(float(whole.largest_overlap), rel=1e-5)
@@ -120,8 +121,19 @@ def test_averages_are_those_of_all_blocks_together() -> None:
 
 def test_worst_status_of_the_blocks_wins() -> None:
     tally = random_tally(np.random.default_rng(1), BLOCKS)
-    tally.status[3], tally.status[7] = Status.deep_overlap, Status.iteration_limit
-    assert Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS).status == Status.deep_overlap
+    tally.status[3], tally.status[7] = Status.capacity, Status.iteration_limit
+    assert Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS).status == Status.capacity
+
+
+def test_deep_overlaps_are_judged_by_their_share_of_all_contacts_of_a_sample() -> None:
+    tally = random_tally(np.random.default_rng(1), BLOCKS)
+    one = Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS)
+    tally.deep_contacts[0] = 0.99 * DEEP_SHARE * tally.contacts.sum()  # all in one block
+    assert one.status == Status.ok
+    tally.deep_contacts[0] *= 1.03
+    assert one.status == Status.deep_overlap
+    tally.status[3] = Status.capacity
+    assert one.status == Status.capacity
 
 
 def test_every_average_has_an_error() -> None:

@@ -254,7 +254,7 @@ def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_r
     places = 1.05 * np.stack(np.divmod(np.arange(GRAINS), row), axis=-1) + 0.5
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)))
-    assert native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3)[1].status == Status.deep_overlap
+    assert native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3)[1].outcome == Status.deep_overlap
 
 
 def test_a_solve_of_nothing_has_no_residual(native_run) -> None:

@@ -13,7 +13,8 @@ DATASET_NAMES = """
     force_ratio contact_force binary_force force_second_moment
     pressure contact_pressure binary_pressure kinetic_pressure
     shear_stress contact_shear_stress binary_shear_stress kinetic_shear_stress
-    granular_temperature bagnold_pressure bagnold_shear_stress cluster_pressure_share cluster_shear_share
+    granular_temperature local_granular_temperature wave_share bagnold_pressure bagnold_shear_stress
+    cluster_pressure_share cluster_shear_share
     coordination_number macroscopic_friction inertial_number collision_rate iterations
     median_residual worst_residual unconverged_share mean_overlap max_overlap
     momentum_drift energy_balance_error complementarity_power
@@ -58,6 +59,9 @@ def tally(microscopic) -> Tally:
         binary_moment=moment("binary"),
         cluster_moment=0.3 * moment("impulses"),
         kinetic_moment=kinetic,
+        local_kinetic=np.float64(0.7 * steps * TIMESTEP),
+        wave_kinetic=np.float64(2.1 * steps * TIMESTEP),
+        deep_contacts=np.float64(0),
         dissipation=np.float64(0.3),
         complementarity=np.float64(0.02),
         energy_change=np.float64(-0.1),

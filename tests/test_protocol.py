@@ -17,7 +17,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling import steady_state, timestep
 from jaxgran.sampling.batch import advance_batch, reporting, stack
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.sample import relative_error
+from jaxgran.sampling.sample import BLOCKS, relative_error
 from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
 from jaxgran.sampling.timestep import check_timestep
 
@@ -114,11 +114,11 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(steady_state, "_chunk", chunk)
     monkeypatch.setattr(steady_state, "_averages", averages)
+    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
-    theory: Any = SimpleNamespace(granular_temperature=np.full(5, 1.0), shear_stress=np.full(5, 0.2))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
-    end = steady_state._until_steady(Batch(flow, start, status, np.zeros(5)), theory, None)
+    end = steady_state._until_steady(Batch(flow, start, status, np.zeros(5), np.full(5, 3.2)), None)
     bad = Status.not_steady
     np.testing.assert_array_equal(end.status, [Status.ok, bad, bad, bad, Status.nonfinite])
     strain = np.array(sheared)
@@ -126,8 +126,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     np.testing.assert_allclose(end.strain, strain.sum(axis=0))
     assert 9 <= np.count_nonzero(strain[:, 0]) < 30
     assert np.all(strain[:, 1] > 0)
-    # A chunk is at least half the strain in which the shear would heat the grains to their temperature, n T / τ.
-    assert strain[0, 0] == pytest.approx(GRAINS / 100 * 1.0 / 0.2 / 2)
+    assert strain[0, 0] == 0.8  # a chunk is a quarter of the memory
 
 
 def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,7 +139,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     monkeypatch.setattr(steady_state, "_sheared", sheared)
     flow, coarse = with_timesteps(1e-5, 2e-4), with_timesteps(1e-3, 1e-3)
     state: Any = SimpleNamespace(side=jnp.full(2, 10.0))
-    end = steady_state._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2)), flow, None)
+    end = steady_state._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
     timesteps, strains = np.array([dt for dt, _ in record]), np.array([strain for _, strain in record])
     ladder = np.vstack([coarse.timestep, timesteps])
     np.testing.assert_allclose(ladder[1:, 0] / ladder[:-1, 0], 10**-0.5, rtol=1e-6)
@@ -151,7 +150,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert end.flow is flow
 
     record.clear()
-    steady_state._shortened(Batch(flow, state, np.zeros(2), np.zeros(2)), flow, None)
+    steady_state._shortened(Batch(flow, state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
     assert record == []
 
 
@@ -181,12 +180,10 @@ def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch: pytest
     )
     flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
     state: Any = SimpleNamespace(side=np.array([6.0]))
-    theory = predicted(flow)
-    batch = Batch(flow, state, np.zeros(1, int), np.zeros(1))
-    end = steady_state._until_steady(batch, theory, None)
-    chunk = max(0.75, steady_state._memory(batch, theory)[0] / 2)
+    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
+    end = steady_state._until_steady(Batch(flow, state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None)
     assert end.status[0] == Status.ok
-    assert end.strain[0] == pytest.approx(15 * chunk)
+    assert end.strain[0] == pytest.approx(15 * 1.0)
 
 
 def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
@@ -235,18 +232,10 @@ def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identica
     assert_same_bits(replica(broken_measured, 0), replica(measured, 0))
 
 
-def test_sample_that_drifts_is_not_steady() -> None:
-    rng = np.random.default_rng(4)
-    noise = 0.05 * rng.normal(size=(200, 16))
-    assert not any(steady_state._drifts(one) for one in noise)
-    assert all(steady_state._drifts(one) for one in noise + 0.5 * (np.arange(16) > 7))
-    assert not any(steady_state._drifts(one) for one in 0.1 * noise + 0.15 * (np.arange(16) > 7))  # small
-    assert steady_state._drifts(np.full(16, np.nan))
-
-
 def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch, monkeypatch) -> None:
     """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 2.56)
+    monkeypatch.setattr(steady_state, "LONGEST_MEMORIES", 0)
     _, short = sample_batch(batch, 0.64)
     errors = [relative_error(replica(short, k)) for k in (0, 1)]
     target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
@@ -262,6 +251,7 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch
 
 def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -> None:
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
+    monkeypatch.setattr(steady_state, "LONGEST_MEMORIES", 0)
     _, grown = sample_batch(batch, 0.32, error=1e-9)
     _, whole = sample_batch(batch, 0.64)
     np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)
@@ -273,3 +263,25 @@ def test_report_is_told_every_replica_step(batch) -> None:
     told = []
     sample_batch(batch, 1.6, reporting(advance_batch, told.append))
     assert sum(told) == 2 * round(1.6 / TIMESTEP)
+
+
+def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
+    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
+    ready = batch._replace(status=np.zeros(2, int), memory=np.array([0.2, 0.4]))
+    _, long = sample_batch(ready, None)
+    steps = BLOCKS * np.round(np.array([1.2, 2.4]) / BLOCKS / TIMESTEP)  # whole ones in each block
+    np.testing.assert_allclose(np.sum(long.tally.duration, axis=1), steps * TIMESTEP)
+    end, _ = sample_batch(ready, 1.0)
+    assert (end.status[0] == Status.short_sample, end.status[1] >= Status.short_sample) == (False, True)
+
+
+def test_a_preparation_shorter_than_the_memory_is_not_steady(batch) -> None:
+    assert np.all(batch.memory > 0.5) and np.all(batch.status == Status.not_steady)  # it took a strain of 0.5
+
+
+def test_hot_and_cold_starts_begin_at_their_share_of_the_expected_temperature() -> None:
+    keys = jax.random.split(jax.random.key(0), 2)
+    starts = [prepare_batch(stack(FLOWS), keys, equilibrate=0.0, heat=heat).state for heat in (0.1, 10.0)]
+    cold, hot = (np.sum(np.asarray(one.grains.masses)[..., None] * np.asarray(one.velocities) ** 2) for one in starts)
+    assert hot == pytest.approx(100 * cold)

@@ -10,6 +10,8 @@ from synthetic import one_sentence
 
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError
+from jaxgran.model.choices import MAX_GRAINS
+from jaxgran.sampling.budget import size_error
 
 GOOD: dict[str, Any] = {
     "restitution": (0.5, 0.9),
@@ -34,6 +36,14 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"packing_fraction": (0.7, 0.6, 0.65)}, "sorted"),
     ({"grains": 15}, "at least 16"),
     ({"grains": 64.0}, "a whole number"),
+    ({"grains": ()}, "at least one number"),
+    ({"grains": (256, 64, 1000)}, "sorted"),
+    ({"grains": (64, 64)}, "without repetition"),
+    ({"grains": ("many",)}, "a list of numbers"),
+    ({"grains": (15, 64)}, "at least 16"),
+    ({"grains": (64, 10**8)}, "at most 10000000"),
+    ({"grains": (64.0, 256.0)}, "a whole number"),
+    ({"grains": [64, 256]}, "a whole number"),  # a list is for ratio_map; settings are tuples
     ({"seeds": 0}, "at least 1"),
     ({"seeds": True}, "a whole number"),
     ({"timestep": 0.0}, "a positive number"),
@@ -101,6 +111,24 @@ def test_time_step_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
     assert some.flows()[:2] == one.flows()
 
 
+def test_number_of_grains_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
+    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)})
+    assert (one.sizes, some.sizes) == ((64,), (64, 256))
+    assert list(some.axes) == ["grains", "timestep", "packing_fraction", "restitution"]
+    points = [(flow.grains, flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
+    assert points == list(product(*some.axes.values()))
+    assert some.flows()[:2] == one.flows()
+
+
+def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
+    choices = {**GOOD, "timestep": "auto"}
+    several = {**choices, "grains": (64, 1024)}
+    assert automatic(several, 0.02) == (
+        {**automatic(choices, 0.02)[0], "grains": (64, 1024)},
+        automatic(choices, 0.02)[1],
+    )
+
+
 def test_automatic_choices_are_accepted_and_finer_for_a_smaller_error() -> None:
     choices = {**GOOD, "restitution": (0.1, 0.9), "timestep": "auto", "tolerance": "auto"}
     found = []
@@ -129,3 +157,27 @@ def test_target_error_out_of_range_is_one_sentence(target_error) -> None:
 def test_time_steps_may_fall_as_well_as_rise() -> None:
     for timesteps in ((1e-3, 1e-4), (1e-4, 1e-3), (1e-3,)):
         assert MapSettings(**{**GOOD, "timestep": timesteps}).axes["timestep"] == timesteps
+
+
+def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
+    given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2}
+    numbers, said = automatic({**given, **dict.fromkeys(("grains", "timestep", "tolerance"), "auto")}, 0.02)
+    settings = MapSettings(**numbers)
+    for flow in settings.flows():
+        assert size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains) <= 0.6 * 0.2
+    assert len({flow.grains for flow in settings.flows()}) > 1 and settings.seeds == 1
+    assert f"{settings.grains} grains, 1 seed" in said and "for an error of 0.2" in said
+
+
+def test_automatic_grains_need_an_error() -> None:
+    with pytest.raises(InputError, match="grains may be auto only with a given error"):
+        automatic({"restitution": (0.5,), "packing_fraction": (0.6,), "grains": "auto"}, 0.02)
+
+
+def test_an_error_that_needs_too_many_grains_is_one_sentence_with_the_smallest_one() -> None:
+    given = {"restitution": (0.2,), "packing_fraction": (0.6,), "error": 1e-3, "grains": "auto"}
+    with pytest.raises(InputError, match="error must be at least") as caught:
+        automatic(given, 0.02)
+    assert one_sentence(str(caught.value))
+    least = float(str(caught.value).split("at least ")[1].split()[0])
+    assert automatic({**given, "error": least}, 0.02)[0]["grains"] <= MAX_GRAINS

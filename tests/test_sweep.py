@@ -15,6 +15,7 @@ from synthetic import random_replica
 from jaxgran.maps import sweep
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.sweep import predicted_cost, ratio_map, replicas
 from jaxgran.model.flow import ShearFlow
@@ -61,19 +62,30 @@ numbers = st.floats(0.0, 1.0)
 
 
 @given(
-    points=st.lists(st.tuples(numbers, st.floats(0.01, 0.83), st.sampled_from([1e-3, 1e-5])), min_size=1, max_size=12),
+    points=st.lists(
+        st.tuples(st.sampled_from([64, 1000]), numbers, st.floats(0.01, 0.83), st.sampled_from([1e-3, 1e-5])),
+        min_size=1,
+        max_size=12,
+    ),
     seeds=st.integers(1, 5),
     batch=st.one_of(st.just("auto"), st.integers(1, 20)),
     workers=st.integers(1, 4),
 )
-def test_every_replica_runs_once_and_the_most_expensive_first(points, seeds: int, batch, workers: int) -> None:
-    flows = [ShearFlow(64, alpha, nu, dt) for alpha, nu, dt in points]
-    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, grains=64, engine="auto")
+def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_number_of_grains(
+    points, seeds: int, batch, workers: int
+) -> None:
+    flows = [ShearFlow(*point) for point in points]
+    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, engine="auto")
     tasks = sweep._tasks(settings, batch, workers)
     keys = [key for task in tasks for key in task]
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
-    costs = [predicted_cost(flows[point]) for point, _ in keys]
-    assert costs == sorted(costs, reverse=True)
+    assert all(len({flows[point].grains for point, _ in task}) == 1 for task in tasks)
+    for first in (
+        [task[0] for task in tasks],
+        *([key for key in keys if flows[key[0]].grains == n] for n in (64, 1000)),
+    ):
+        costs = [predicted_cost(flows[point]) for point, _ in first]
+        assert costs == sorted(costs, reverse=True)
     if batch == "auto":
         assert len(tasks) >= min(workers, len(keys))  # no worker is idle
     else:
@@ -86,6 +98,7 @@ def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_num
 
     assert cost(0.1, 0.8) > cost(0.5, 0.8) > cost(0.5, 0.6) > cost(0.9, 0.6)
     assert cost(0.5, 0.6) < cost(0.5, 0.6, 1e-4) < 10 * cost(0.5, 0.6)
+    assert predicted_cost(ShearFlow(640, 0.5, 0.6, 1e-3)) == pytest.approx(10 * cost(0.5, 0.6))
 
 
 def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> None:
@@ -198,6 +211,32 @@ def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settin
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
     xr.testing.assert_equal(data.isel(timestep=0, drop=True), alone)
     assert not np.any(data.force_ratio_by_seed[0] == data.force_ratio_by_seed[1])
+
+
+def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
+    """The larger one has an area that is larger in proportion, and both stand at their place in the dataset."""
+    several = {**SETTINGS, "grains": [32, 64], "seeds": 1}
+    data = ratio_map(**several)
+    assert data.force_ratio.dims == ("grains", "packing_fraction", "restitution")
+    assert data.grains.values.tolist() == data.attrs["grains"] == [32, 64] and data.grains.dtype.kind == "i"
+    assert {"long_name", "units"} <= set(data.grains.attrs)
+    alone = map_dataset(replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, {})
+    variables = [name for name in alone.data_vars if name in data]
+    xr.testing.assert_equal(data[variables].isel(grains=0, drop=True), alone[variables])
+    assert not np.any(data.pressure[0] == data.pressure[1])
+    np.testing.assert_array_equal(data.pressure_large_system, data.pressure[1])
+    assert np.all(data.pressure_large_system_error > data.pressure_stderr[1])
+    assert set(choices_of(data)["grains"]) == {32, 64} and choices_of(data.sel(grains=64))["grains"] == 64
+
+
+@pytest.mark.parametrize("grains", [[64, 128], (64, 128), np.array([64, 128])], ids=["list", "tuple", "array"])
+def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", lambda *_: iter(()))
+    data = ratio_map(**{**SETTINGS, "grains": grains, "timestep": [1e-3, 5e-4]})
+    assert data.force_ratio.dims == ("grains", "timestep", "packing_fraction", "restitution")
+    assert data.pressure_large_system.dims == ("timestep", "packing_fraction", "restitution")
+    assert data.attrs["grains"] == data.grains.values.tolist() == [64, 128]
+    assert "grains" not in ratio_map(**SETTINGS).variables
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxgran.contact.law import contact_terms
 from jaxgran.dynamics.tally import CONTACT, EXTREMES, LAYOUT, NUMBERS, TABLE, Tally, empty_tally, span_of
-from jaxgran.model.status import Status
+from jaxgran.model.status import DEEP_OVERLAP, Status
 
 
 def random_tally(seed: int) -> Tally:
@@ -71,6 +71,7 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "collisions": 3,
         "overlap": overlap,
         "squared_impulse": p * p,
+        "deep_contacts": overlap > DEEP_OVERLAP,
     }
     begin = span_of(CONTACT).start
     assert len(terms) == span_of(CONTACT).stop - begin

@@ -1,0 +1,46 @@
+"""A point is steady if its seeds together do not drift; what one seed does for itself is noise."""
+
+from dataclasses import replace
+
+import numpy as np
+from synthetic import random_tally
+
+from jaxgran.sampling.drift import drifts, is_drifting
+from jaxgran.sampling.sample import BLOCKS, Sample
+
+LATE = np.arange(BLOCKS) >= BLOCKS // 2
+
+
+def sample_of(seed: int, growth: float) -> Sample:
+    """A sample whose pressure and temperature are larger by a factor in the second half."""
+    tally = random_tally(np.random.default_rng(seed), BLOCKS)
+    factor = np.where(LATE, growth, 1.0)[:, None, None]
+    even = np.broadcast_to(np.array([[40.0, -10.0], [-10.0, 40.0]]), (BLOCKS, 2, 2))
+    noise = np.exp(0.05 * np.random.default_rng(seed).normal(size=(BLOCKS, 1, 1)))
+    moments = {name: factor * noise * even for name in ("contact_moment", "kinetic_moment")}
+    tally = replace(tally, duration=np.full(BLOCKS, 1.0), **moments)
+    return Sample(tally, np.float64(100.0), np.float64(1.0), 64)
+
+
+def test_a_drift_that_all_seeds_share_is_one() -> None:
+    assert is_drifting([sample_of(seed, 1.6) for seed in range(4)], memory=1.0)
+    assert is_drifting([sample_of(0, 1.6)], memory=1.0)
+    assert not is_drifting([sample_of(seed, 1.1) for seed in range(4)], memory=1.0)  # less than is accepted
+
+
+def test_seeds_that_drift_against_each_other_are_steady_together() -> None:
+    opposite = [sample_of(seed, growth) for seed, growth in enumerate((1.6, 1 / 1.6, 1.6, 1 / 1.6))]
+    assert all(is_drifting([one], memory=1.0) for one in opposite)
+    assert not is_drifting(opposite, memory=1.0)
+
+
+def test_a_flow_that_remembers_long_may_wander() -> None:
+    assert not is_drifting([sample_of(0, 1.3)], memory=100.0)
+
+
+def test_a_series_drifts_by_the_difference_of_its_halves() -> None:
+    noise = 0.05 * np.random.default_rng(4).normal(size=(200, 16))
+    assert not any(drifts(one) for one in noise)
+    assert all(drifts(one) for one in noise + 0.5 * (np.arange(16) > 7))
+    assert not any(drifts(one) for one in 0.1 * noise + 0.15 * (np.arange(16) > 7))  # small
+    assert drifts(np.full(16, np.nan))

@@ -1,0 +1,52 @@
+"""The figure of errors shows the whole error of every point, and its largest part."""
+
+import numpy as np
+import pytest
+from drawn import caption, legend_texts
+from made_up_maps import ratio_dataset
+
+from jaxgran.model.checks import InputError
+from jaxgran.plotting.errors import dominating_errors
+
+pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
+
+PARTS = ("timestep", "size", "tolerance")
+
+
+def with_budget(largest: str | None):
+    """A map whose largest part of the error is the named one, or sampling."""
+    data = ratio_dataset(4, 3)
+    dims, value = data.force_ratio.dims, data.force_ratio.values
+    for name in ("force_ratio", "pressure", "granular_temperature"):
+        stderr = (0.001 if largest else 0.1) * value
+        data = data.assign(
+            {name: (dims, value), f"{name}_stderr": (dims, stderr), f"{name}_error": (dims, 0.2 * value)}
+        )
+        for part in PARTS:
+            data[f"{name}_error_{part}"] = (dims, (0.19 if part == largest else 0.001) * value)
+    return data
+
+
+@pytest.mark.parametrize("largest", [None, *PARTS])
+def test_each_point_has_the_mark_of_its_largest_part_and_its_whole_error(largest: str | None) -> None:
+    figure = dominating_errors(with_budget(largest))
+    shown = (None, *PARTS).index(largest)
+    for axes in figure.axes:
+        counts = [len(marks.get_offsets()) for marks in axes.collections]
+        assert counts == [12 if k == shown else 0 for k in range(4)]
+        assert {text.get_text() for text in axes.texts} == {"20"}
+        assert "20 % (median), 20 % (largest)" in axes.get_title()
+    assert legend_texts(figure) == ["sampling", "time step", "number of grains", "tolerance"]
+    assert "N=256" in caption(figure)
+
+
+def test_a_point_without_a_value_has_no_mark() -> None:
+    data = with_budget("size")
+    data.pressure[0, 1] = np.nan
+    marks = dominating_errors(data).axes[1].collections
+    assert sum(len(one.get_offsets()) for one in marks) == 11
+
+
+def test_a_map_without_a_budget_is_refused_in_a_sentence() -> None:
+    with pytest.raises(InputError, match="no error budget"):
+        dominating_errors(ratio_dataset())

@@ -1,0 +1,27 @@
+"""The memory of a flow: the longer of heating by the shear and of a sound wave across the cell."""
+
+import numpy as np
+import pytest
+
+from jaxgran.sampling.memory import RELAXATION_STRAIN, memory_strain
+
+
+def memory(temperature=1.0, pressure=1.0, shear_stress=1.0, grains=400, side=20.0, shear_rate=1.0):
+    averages = {"granular_temperature": temperature, "pressure": pressure, "shear_stress": shear_stress}
+    return memory_strain(averages, grains, grains, side**2, shear_rate)
+
+
+def test_memory_is_the_longer_of_heating_and_waves():
+    assert memory(temperature=30.0, shear_stress=2.0, pressure=100.0) == pytest.approx(15.0)
+    assert memory(temperature=1e-3, pressure=0.25) == pytest.approx(0.35 * 20 * 2)
+
+
+def test_memory_of_a_faster_shear_is_the_same():
+    """Bagnold: stresses and temperature grow as the square of the shear rate."""
+    slow = memory(2.0, 0.5, 0.3)
+    assert memory(2.0 * 9, 0.5 * 9, 0.3 * 9, shear_rate=3.0) == pytest.approx(float(slow))
+
+
+def test_memory_is_never_below_that_of_the_contact_network():
+    assert memory(temperature=0.0, pressure=1e9) == RELAXATION_STRAIN
+    np.testing.assert_array_equal(memory(temperature=np.full(2, np.nan), pressure=np.nan), RELAXATION_STRAIN)

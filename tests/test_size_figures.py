@@ -1,0 +1,130 @@
+"""The figure of the number of grains shows every average over its value at the largest N; other figures show that N."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from drawn import caption, legend_texts, write_without_drawing
+from made_up_maps import dense_map, ratio_dataset, with_grains, with_timesteps
+from matplotlib.figure import Figure
+
+from jaxgran.inference.friction_law import dense_points
+from jaxgran.maps.schema import finest, parts
+from jaxgran.plotting.map_figures import save_figures
+from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
+from jaxgran.plotting.size import averages_against_grains
+
+pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
+
+SIZES = (256, 1000, 4000)
+NAMES = ("pressure", "shear_stress", "granular_temperature", "force_ratio")
+
+
+def curves_of(figure: Figure) -> list:
+    return [container for axes in figure.axes for container in axes.containers]
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(2, 2), (1, 1), (4, 3)])
+def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(alphas: int, nus: int) -> None:
+    data = with_grains(ratio_dataset(alphas, nus), *SIZES)
+    figure = averages_against_grains(data.isel(grains=[1, 2, 0]))
+    rows = nus if alphas * nus > 8 else 1
+    assert len(figure.axes) == rows * len(NAMES)
+    assert all(axes.get_xscale() == "log" for axes in figure.axes)
+    points = [(nu, alpha) for nu in data.packing_fraction.values for alpha in data.restitution.values]
+    of_a_row = len(points) // rows
+    expected = [
+        (name, *point)
+        for row in range(rows)
+        for name in NAMES
+        for point in points[row * of_a_row : (row + 1) * of_a_row]
+    ]
+    for container, (name, nu, alpha) in zip(curves_of(figure), expected, strict=True):
+        point = data.sel(packing_fraction=nu, restitution=alpha)
+        reference = point[name].values[-1]
+        np.testing.assert_allclose(container.lines[0].get_xydata(), np.stack([SIZES, point[name] / reference], -1))
+        ends = np.array([segment[:, 1] for segment in container.lines[2][0].get_segments()])
+        np.testing.assert_allclose(np.diff(ends)[:, 0], 2 * point[f"{name}_stderr"] / reference)
+    assert r"\mathrm{d}t" in caption(figure) and "N=" not in caption(figure)
+    assert figure.get_supylabel() == "value / value at $N=4000$"
+
+
+def test_a_panel_has_at_most_eight_curves_and_the_figure_says_what_is_left_out() -> None:
+    figure = averages_against_grains(with_grains(ratio_dataset(11, 2), *SIZES))
+    assert [len(axes.containers) for axes in figure.axes] == [8] * 8
+    assert "8 of 11 restitutions" in caption(figure)
+    assert legend_texts(figure)[0] == "0.1" and legend_texts(figure)[-1] == "0.9"
+
+
+def test_curves_against_the_number_of_grains_are_told_apart_without_colour() -> None:
+    lines = [c.lines[0] for c in averages_against_grains(with_grains(ratio_dataset(4, 2), *SIZES)).axes[0].containers]
+    assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 8
+
+
+def test_bad_status_and_missing_values_are_marked_at_their_number_of_grains() -> None:
+    data = with_grains(ratio_dataset(2, 2), *SIZES)
+    data.status[0, 1, 0] = 1
+    for name in NAMES:
+        data[name][2, 0, 0] = np.nan
+    figure = averages_against_grains(data)
+    for axes, name in zip(figure.axes, NAMES, strict=True):
+        rings = [line.get_xydata() for line in axes.lines if line.get_markersize() > 8]
+        np.testing.assert_allclose(np.concatenate(rings), [[256, data[name][0, 1, 0] / data[name][2, 1, 0]]])
+    assert "status not ok" in legend_texts(figure)
+    assert "Status not ok: iteration limit (1)" in caption(figure) and "1 of 12 points without" in caption(figure)
+
+
+def test_axis_has_the_numbers_of_grains_and_everything_is_on_the_page(page) -> None:
+    figure = averages_against_grains(with_grains(ratio_dataset(3, 2), *SIZES))
+    figure.canvas.draw()
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["256", "1000", "4000"]
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    boxes += [figure._supxlabel.get_window_extent(), figure._supylabel.get_window_extent()]
+    boxes += [legend.get_window_extent() for legend in figure.legends]
+    for k, box in enumerate(boxes):
+        assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
+        assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
+
+
+def test_one_number_of_grains_is_nothing_to_draw_against() -> None:
+    for data in (ratio_dataset(), with_grains(ratio_dataset(), 256)):
+        with pytest.raises(ValueError, match="at least two numbers of grains, and this map has 1"):
+            averages_against_grains(data)
+
+
+@pytest.mark.parametrize("draw", [ratio_curves, ratio_contours, ratio_against_timestep])
+def test_other_figures_show_the_largest_number_of_grains_and_name_it(draw) -> None:
+    several = with_timesteps(with_grains(ratio_dataset(), *SIZES), 1e-3, 1e-4)
+    expected = draw(several.sel(grains=4000, drop=True).assign_attrs(grains=4000))
+    for same in (several, several.isel(grains=[1, 2, 0]), several.sel(grains=4000)):
+        figure = draw(same)
+        assert caption(figure) == caption(expected) and "$N=4000$" in caption(figure)
+        for line, other in zip(figure.axes[0].lines, expected.axes[0].lines, strict=True):
+            np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
+
+
+def test_laws_of_dense_flow_are_fitted_at_the_largest_number_of_grains() -> None:
+    data = dense_map()
+    larger = data.assign(macroscopic_friction=2 * data.macroscopic_friction)
+    several = xr.concat([larger, data], xr.Variable("grains", [4000, 256]))
+    np.testing.assert_array_equal(dense_points(several).macroscopic_friction, dense_points(larger).macroscopic_friction)
+
+
+def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
+    data = ratio_dataset(2, 2)
+    several = with_timesteps(with_grains(data, *SIZES), 1e-3, 1e-4)
+    found = [(part.attrs["grains"], part.attrs["timestep"]) for part in parts(several)]
+    assert found == [(n, dt) for n in SIZES for dt in (1e-3, 1e-4)]
+    assert all(set(part.sizes) == {"packing_fraction", "restitution"} for part in parts(several))
+    assert parts(data)[0].identical(data)
+    assert finest(several).identical(parts(several)[-1])
+    assert set(finest(several, "grains").sizes) == {"timestep", "packing_fraction", "restitution"}
+
+
+def test_several_numbers_of_grains_have_a_file_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_without_drawing(monkeypatch)
+    written = save_figures(with_timesteps(with_grains(ratio_dataset(2, 2), 64, 256), 1e-3, 1e-4), tmp_path / "map")
+    assert [path.name for path in written] == [f"map_{name}.png" for name in ("curves", "contours", "timestep", "size")]
+    one = save_figures(with_grains(ratio_dataset(1, 2), 256), tmp_path / "one")
+    assert [path.name for path in one] == ["one_curves.png"]

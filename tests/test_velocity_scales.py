@@ -1,0 +1,76 @@
+"""Velocity scales: which part of the granular temperature is local, and which stands in the longest waves."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.dynamics.velocity_scales import local_temperature, wave_temperature
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
+
+COUNT, SIDE = 900, 30.0
+
+
+def state_of(velocities, positions=None, tilt=0.3, masses=None) -> State:
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0, SIDE, (COUNT, 2)) if positions is None else positions
+    grains = Grains(jnp.full(COUNT, 0.5), jnp.ones(COUNT) if masses is None else jnp.asarray(masses))
+    return State(grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(SIDE), jnp.asarray(tilt))
+
+
+def places() -> np.ndarray:
+    return np.random.default_rng(5).uniform(0, SIDE, (COUNT, 2))
+
+
+def wave(positions: np.ndarray, number: tuple[int, int], tilt: float) -> np.ndarray:
+    """The phase of a wave that fits into the sheared cell."""
+    x, y = positions.T / SIDE
+    return 2 * np.pi * (number[0] * (x - tilt * y) + number[1] * y)
+
+
+def test_uncorrelated_velocities_have_one_temperature_at_all_lengths():
+    rng = np.random.default_rng(1)
+    masses = rng.uniform(0.5, 2, COUNT)
+    drawn = [rng.normal(size=(COUNT, 2)) * np.sqrt(3 / masses)[:, None] for _ in range(200)]
+    states = [state_of(velocities, masses=masses) for velocities in drawn]
+    local = np.array([local_temperature(one) for one in states])
+    waves = np.array([wave_temperature(one) for one in states])
+    for measured in (local, waves):
+        assert abs(measured.mean() - 3) < 4 * measured.std() / np.sqrt(len(measured))
+
+
+def test_a_uniform_velocity_in_each_box_is_no_local_temperature():
+    """With 900 grains there are 6 × 6 boxes."""
+    tilt = -0.4
+    x, y = places().T / SIDE
+    column, row = np.floor(((x - tilt * y) % 1) * 6), np.floor(y * 6)
+    velocities = np.stack([np.sin(column) + row, np.cos(row * column)], axis=1)
+    assert local_temperature(state_of(velocities, tilt=tilt)) < 1e-28
+    assert local_temperature(state_of(velocities, tilt=tilt + 0.1)) > 1e-3
+
+
+@pytest.mark.parametrize("number", [(1, 0), (0, 1), (1, 1), (1, -1), (2, 0)])
+def test_a_wave_of_the_sheared_cell_is_counted_if_it_is_one_of_the_longest(number):
+    tilt = 0.3
+    even = np.stack(np.meshgrid(np.arange(30), np.arange(30)), axis=-1).reshape(-1, 2) + 0.5
+    positions = even + np.stack([tilt * even[:, 1], np.zeros(COUNT)], axis=1)
+    velocities = np.stack([np.zeros(COUNT), np.cos(wave(positions, number, tilt))], axis=1)
+    expected = COUNT / 4 / 8  # |Σ cos²|²/N = N/4, in one of four waves and one of two components
+    found = wave_temperature(state_of(velocities, positions, tilt))
+    np.testing.assert_allclose(found, 0 if number == (2, 0) else expected, atol=1e-9)
+
+
+def test_neither_depends_on_the_image_of_a_grain_or_on_the_cell_that_describes_the_lattice():
+    rng = np.random.default_rng(3)
+    velocities, one = rng.normal(size=(COUNT, 2)), places()
+    image = one + rng.integers(-2, 3, (COUNT, 1)) * np.array([SIDE, 0.0]) + np.array([0.3 * SIDE, SIDE])
+    for measure in (local_temperature, wave_temperature):
+        np.testing.assert_allclose(measure(state_of(velocities, image)), measure(state_of(velocities, one)), rtol=1e-9)
+
+
+def test_few_grains_are_one_box():
+    velocities = np.random.default_rng(2).normal(size=(16, 2))
+    grains = Grains(jnp.full(16, 0.5), jnp.ones(16))
+    positions = jnp.asarray(np.random.default_rng(4).uniform(0, 5, (16, 2)))
+    state = State(grains, positions, jnp.asarray(velocities), jnp.asarray(5.0), jnp.asarray(0.0))
+    np.testing.assert_allclose(local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * 16 / 15)
