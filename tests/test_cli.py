@@ -10,6 +10,7 @@ from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NoReturn
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -775,6 +776,25 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
     assert "1 points missing; what is done is saved" in outcome.err
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
+
+
+def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python functions that C calls back end in a SystemError, whose cause is Ctrl-C."""
+    leave_out_layout(monkeypatch)
+    write_without_drawing(monkeypatch)
+
+    class Inside(SystemError):
+        __cause__ = KeyboardInterrupt()
+
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
+    assert outcome.status == 130 and outcome.err.rstrip().endswith("--output half.nc --resume")
+    monkeypatch.setattr("jaxgran.maps.results.read_dataset", Mock(side_effect=Inside))
+    outcome = jaxgran(tmp_path, "plot", "half.nc")
+    assert (outcome.status, outcome.err.strip()) == (130, "jaxgran: interrupted.")
+    monkeypatch.setattr("jaxgran.maps.results.read_dataset", Mock(side_effect=SystemError))
+    with pytest.raises(SystemError):
+        jaxgran(tmp_path, "plot", "half.nc")
 
 
 def test_map_interrupted_before_its_first_replica_keeps_the_old_file(

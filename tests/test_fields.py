@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from scipy.integrate import quad
@@ -159,7 +159,11 @@ coordinates = st.floats(-3, 3).map(lambda x: round(x, 6))
     length=st.floats(0.05, 2),
     width=st.floats(0.3, 2),
 )
+@example(middle=(0.0, 1.0), angle=6e-3, length=1.0, width=1.0)  # it nearly grazes the disc
 def test_line_integral_is_that_of_the_function(name, middle, angle, length, width) -> None:
+    """Except where the line grazes a disc: its chord there is the root of a difference of rounded numbers."""
+    across = (np.cos(angle) * middle[1] - np.sin(angle) * middle[0]) / width
+    assume(name != "heaviside" or abs(across**2 - 1) > 1e-6)
     graining = KERNELS[name](width)
     expected = by_quadrature(name, width, middle, angle, length)
     assert segment(graining, middle, angle, length) == pytest.approx(expected, rel=1e-9, abs=1e-10)

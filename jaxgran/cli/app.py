@@ -16,7 +16,7 @@ from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
 from jaxgran.cli.mistakes import UsageError, by_option, in_words
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
-from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, stop
+from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, is_interruption, stop
 from jaxgran.model.checks import InputError
 
 EXAMPLES = {
@@ -69,6 +69,10 @@ def main() -> None:
         status = INTERRUPTED
     except OSError as error:
         stop(f"stopped by the file system, {error.strerror or error}.", NO_FILE)
+    except Exception as error:
+        if not is_interruption(error):
+            raise
+        status = INTERRUPTED
     if status == INTERRUPTED:  # typer returns this status after Ctrl-C
         stop("interrupted.", INTERRUPTED)
     raise SystemExit(status)

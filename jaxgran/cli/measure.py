@@ -16,7 +16,17 @@ from rich import box
 from rich.table import Table
 
 from jaxgran.cli.progress import progress
-from jaxgran.cli.terminal import BAD_STATUS, INTERRUPTED, NO_FILE, configured_jax, print_table, say, say_written, stop
+from jaxgran.cli.terminal import (
+    BAD_STATUS,
+    INTERRUPTED,
+    NO_FILE,
+    configured_jax,
+    is_interruption,
+    print_table,
+    say,
+    say_written,
+    stop,
+)
 from jaxgran.environment import usable_cores
 
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
@@ -86,7 +96,9 @@ def measured(
                 for key, replica in running:
                     results[key] = replica
                     meter.replica(key[0])
-            except KeyboardInterrupt:
+            except BaseException as error:
+                if not is_interruption(error):
+                    raise
                 interrupted = True
             finally:
                 running.close()

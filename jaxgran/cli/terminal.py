@@ -60,6 +60,13 @@ def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
     raise SystemExit(status)
 
 
+def is_interruption(error: BaseException | None) -> bool:
+    """Whether Ctrl-C led to the error: compiled code that Python interrupts raises an error of its own instead."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 def with_error(value: float, error: float) -> str:
     """A value and its standard error as text."""
     return f"{value:.4g} ± {error:.2g}"
