@@ -210,7 +210,7 @@ def _half_width(posterior: _Posterior) -> np.ndarray:
     half = np.sqrt(np.sum(weight * ((quantile * width) ** 2 + shift**2), axis=0))
     for _ in range(_NEWTON_STEPS):
         z = np.stack([half - shift, half + shift]) / width
-        place = z / np.sqrt(freedom + z**2)
+        place = z / np.hypot(np.sqrt(freedom), z)  # a series of equal values has a z whose square overflows
         excess = np.sum(weight * np.interp(place, places, probability), axis=(0, 1)) - 1 - _LEVEL
         slope = np.sum(weight / width * np.interp(place, places, density), axis=(0, 1))
         half = np.clip(half - excess / slope, half / 2, 2 * half)

@@ -242,6 +242,14 @@ def test_error_of_a_constant_is_zero_and_that_of_an_unknown_value_unknown() -> N
     assert np.isnan(error_of_mean(np.ones((1, 1))))
 
 
+def test_values_that_differ_by_rounding_have_an_error_of_that_size() -> None:
+    """Where two seeds are equal to the last bit the posterior has no width. Warnings are errors here."""
+    for rng in map(np.random.default_rng, range(40)):
+        under = np.ones((2, 40, 20))
+        _, error = standard_errors(ratio, {"over": under + 1e-15 * rng.normal(size=under.shape), "under": under})
+        assert np.all(error["ratio"] < 1e-14)
+
+
 def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
     ones = np.ones((2, 8))
     assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
