@@ -355,7 +355,7 @@ MAP_OPTIONS += [
     "scheduler",
     "preset",
 ]
-MAP_OPTIONS += ["output", "like"]
+MAP_OPTIONS += ["output", "like", "snapshots"]
 RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "engine", "output"]
 RUN_OPTIONS += ["trajectory", "trajectory=x.gsd --every"]
 ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]

@@ -68,6 +68,12 @@ def map_command(
     ] = None,
     engine: Annotated[Engine | None, typer.Option(help="Program that advances the flows. [default: auto]")] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
+    snapshots: Annotated[
+        bool | None,
+        typer.Option(
+            "--snapshots/--no-snapshots", help="Keep one instant of every point: its grains, and their forces."
+        ),
+    ] = None,
     batch: Annotated[str, typer.Option(help="Replicas that run together, or auto.")] = "auto",
     workers: Annotated[int | None, typer.Option(help="Processes. [default: one per core on a CPU]")] = None,
     scheduler: Annotated[
@@ -97,6 +103,7 @@ def map_command(
         "solver": solver,
         "activation": activation,
         "engine": engine,
+        "snapshots": snapshots,
     }
     given = {name: value for name, value in given.items() if value is not None}
     chosen = kept_choices(PRESETS[preset] if like is None else _like(like), given) | chosen_for(error) | given

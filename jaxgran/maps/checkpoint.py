@@ -28,6 +28,7 @@ import numpy as np
 
 from jaxgran.dynamics.tally import flat_tally, tally_from_flat
 from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
+from jaxgran.maps.instants import as_arrays, from_arrays
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
@@ -156,6 +157,7 @@ class Checkpoint:
         tallies = np.stack([flat_tally(sample.tally, np.shape(sample.tally.steps)) for sample in samples])
         numbers = [(r.strain, r.sample.area, r.sample.shear_rate) for r in replicas.values()]
         arrays = {"keys": np.array(keys, np.int64), "tallies": tallies, "numbers": np.array(numbers, np.float64)}
+        arrays |= as_arrays([replica.instant for replica in replicas.values()])
         write_arrays(self.folder / f"done-{self._name(list(replicas))}.nc", arrays, {})
 
     def _read(self) -> None:
@@ -167,13 +169,14 @@ class Checkpoint:
             if path.name != f"done-{self._name([(point, seed) for point, seed, _ in arrays['keys'].tolist()])}.nc":
                 path.unlink(missing_ok=True)
                 continue
-            for row, tally, numbers in zip(arrays["keys"], arrays["tallies"], arrays["numbers"], strict=True):
+            columns = arrays["keys"], arrays["tallies"], arrays["numbers"], from_arrays(arrays)
+            for row, tally, numbers, instant in zip(*columns, strict=True):
                 point, seed, status = row.tolist()
                 strain, area, shear_rate = numbers
                 tallies = tally_from_flat(tally, dtype)
                 grains = self.settings.flows()[point].grains
                 sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), grains)
-                self.done[point, seed] = Replica(sample, status, float(strain))
+                self.done[point, seed] = Replica(sample, status, float(strain), instant)
 
     def _arrays(self, path: Path) -> dict[str, np.ndarray] | None:
         """The content of a file; a damaged file is removed, its name noted, and the result is None."""

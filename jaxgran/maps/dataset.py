@@ -13,6 +13,7 @@ import xarray as xr
 from jaxgran import environment
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.error_variables import error_variables
+from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import BOUNDS, large_system_variables
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
@@ -63,6 +64,8 @@ def map_dataset(
     NAME_large_system_error       point without grains  bound on its error
     NAME_limit_seen               point without grains  whether the average has a limit at large numbers of grains
     ============================  ====================  =============================================================
+
+    Settings with ``snapshots`` add snapshot_NAME, see ``instant_variables``.
 
     A point is (packing_fraction, restitution). If the settings have a list of numbers of grains or of time steps, the
     dimensions grains and timestep come before these. Only a map with the dimension grains has the last three kinds of
@@ -130,6 +133,8 @@ def map_dataset(
     if "grains" in settings.axes:
         averages = {name: (values[name].reshape(shape), errors[name].reshape(shape)) for name in BOUNDS}
         variables |= large_system_variables(point_dims[1:], settings.sizes, averages, OBSERVABLES)
+    if settings.snapshots:
+        variables |= instant_variables(point_dims, shape, first_of_points(results))
     predictions = _predictions(settings)
     for name in THEORY:
         long_name, units = OBSERVABLES[name]
@@ -217,6 +222,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": "CF-1.11",
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
+        "snapshots": int(settings.snapshots),  # NetCDF has no True and False
         "engine": ", ".join(dict.fromkeys(engines)),
         "solver": ", ".join(dict.fromkeys(solvers)),
         "engine_asked": settings.engine,

@@ -41,6 +41,7 @@ class MapSettings:
     activation: Activation = "midpoint"
     engine: Engine = "auto"
     grains_by_point: tuple[int, ...] | None = None  # in the order of ``flows``; ``grains`` is then the largest
+    snapshots: bool = False
 
     def __post_init__(self):
         for name, values in self.axes.items():
@@ -57,6 +58,8 @@ class MapSettings:
             ):
                 raise InputError(f"{name} must be sorted and without repetition, not {shown(list(values))}.")
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
+        if not isinstance(self.snapshots, bool):
+            raise InputError(f"snapshots must be True or False, not {shown(self.snapshots)}.")
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
             raise InputError(f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.")

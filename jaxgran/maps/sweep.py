@@ -24,6 +24,7 @@ from jaxtyping import Array, UInt32
 from jaxgran.io.atomic import Damaged
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
+from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.pool import Died, run_tasks, send
 from jaxgran.maps.replica import Key, Replica
@@ -65,6 +66,7 @@ def ratio_map(
     solver: Solver = "barzilai-borwein",
     activation: Activation = "midpoint",
     engine: Engine = "auto",
+    snapshots: bool = False,
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
     report: Report | None = None,
@@ -91,6 +93,8 @@ def ratio_map(
       activation: "midpoint" or "touching".
       engine: program that advances the flows, see ``ShearFlow``. "auto" selects it for the backend, precision and
         solver. "jax" advances the replicas of a batch in lockstep by ``vmap``, also on a processor.
+      snapshots: whether to keep one instant of every point, see ``instant_variables``: its grains after the sample, and
+        the forces between them over a strain of 0.002.
       batch: replicas that run together, or "auto".
       workers: number of processes; more than one only on a CPU. A script with more than one must have its main part
         under ``if __name__ == "__main__":``.
@@ -117,6 +121,7 @@ def ratio_map(
         "solver": solver,
         "activation": activation,
         "engine": engine,
+        "snapshots": snapshots,
     }
     numbers, automatic_choice = automatic(
         {name: _plain(x, name == "grains") for name, x in choices.items()}, target_error
@@ -352,7 +357,9 @@ def _measured(
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)
+    instants = first_instants(batch, task) if settings.snapshots else [None] * len(task)
+    numbers = zip(batch.status.tolist(), strain_before.tolist(), instants, strict=True)
     return [
-        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), int(batch.status[k]), float(strain_before[k])))
-        for k, key in enumerate(task)
+        (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), *one))
+        for k, (key, one) in enumerate(zip(task, numbers, strict=True))
     ]

@@ -1,0 +1,172 @@
+"""The instants that a map keeps with ``snapshots``: one of every point, taken after its sample.
+
+A replica is advanced from its last state by a short strain, and every time step of it is a snapshot. This is after the
+sample, so the numbers of a map are the same with and without instants.
+
+Of each point the first good replica counts. A batch cannot see other batches, so it takes an instant of the first good
+replica of each of its points. The first good one of all is then among them.
+"""
+
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgran.analysis.instant import Instant, averaged, instant_of
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
+from jaxgran.model.status import Status
+from jaxgran.sampling.batch import advance_batch
+from jaxgran.sampling.recorder import Recorder
+from jaxgran.sampling.steady_state import Batch
+
+WINDOW = 0.002
+"""Strain over which the forces of an instant are averaged."""
+
+_MOST_STEPS = 1000  # of the window, where the time step is very short
+_BITS = 12  # binary digits that a file keeps of a number; the zeros after them need no space
+_POSITION_BITS = 18  # the same for positions, which are compared with a radius and may be 50 times as large
+_PACKED = {"zlib": True, "shuffle": True, "complevel": 4}
+_NO_GRAIN = -1
+_GRAIN, _PAIR = ("snapshot_grain",), ("snapshot_pair",)
+_MEANINGS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "x": ("position of a grain along the flow, from the centre of the sheared cell", "sigma", _GRAIN),
+    "y": ("position of a grain along the gradient, from the centre of the sheared cell", "sigma", _GRAIN),
+    "radius": ("radius of a grain", "sigma", _GRAIN),
+    "speed": ("peculiar speed of a grain", "sigma / t", _GRAIN),
+    "pair_i": ("first grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
+    "pair_j": ("second grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
+    "force": ("mean force between the grains of a pair over the window", "m sigma / t^2", _PAIR),
+    "clustered": ("whether most of the force of a pair acts within clusters of three or more grains", "1", _PAIR),
+    "side": ("side of the cell", "sigma", ()),
+    "tilt": ("offset of the image row above, in sides of the cell", "1", ()),
+    "window": ("strain over which forces are averaged", "1", ()),
+}
+
+
+def first_instants(batch: Batch, task: Sequence[Key]) -> list[Instant | None]:
+    """The instant of the first good replica of every point of a sampled batch; None for the other replicas."""
+    found: list[Instant | None] = [None] * len(task)
+    done = set()
+    for k, (point, _) in enumerate(task):
+        if point not in done and batch.status[k] < Status.infeasible:
+            found[k] = _taken(*jax.tree.map(lambda x, k=k: x[k : k + 1], (batch.flow, batch.state)))
+            done |= {point} if found[k] is not None else set()
+    return found
+
+
+def first_of_points(results: Mapping[Key, Replica]) -> dict[int, Instant]:
+    """The instant of the first good seed of every point that has one."""
+    kept = {key: one.instant for key, one in results.items() if one.status < Status.infeasible}
+    return {point: one for (point, _), one in sorted(kept.items(), reverse=True, key=itemgetter(0)) if one is not None}
+
+
+def _taken(flow: ShearFlow, state: State) -> Instant | None:
+    """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
+    steps = _steps((np.asarray(flow.timestep) * np.asarray(flow.shear_rate)).item())
+    found: list[Instant] = []
+    drive = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
+    drive(flow, state, jnp.array([steps - 1], jnp.int32))  # a snapshot has the forces of the step that it begins
+    return averaged(found) if len(found) == steps else None
+
+
+def _steps(timestep: float) -> int:
+    """The number of time steps of the window."""
+    return min(max(1, round(WINDOW / timestep)), _MOST_STEPS)
+
+
+def as_arrays(instants: Sequence[Instant | None]) -> dict[str, np.ndarray]:
+    """The instants of replicas as a few arrays for a file, one after the other; ``from_arrays`` is the inverse."""
+    there = [one for one in instants if one is not None]
+    sizes = [(0, 0) if one is None else (len(one.radii), len(one.force)) for one in instants]
+    grains = [np.column_stack([one.positions, one.radii, one.speed]) for one in there]
+    forces = [np.column_stack([one.force, one.clustered]) for one in there]
+    return {
+        "instant_sizes": np.array(sizes, np.int64),
+        "instant_cells": np.array([(one.side, one.tilt, one.window) for one in there]).reshape(-1, 3),
+        "instant_grains": np.concatenate([np.zeros((0, 4)), *grains]),
+        "instant_pairs": np.concatenate([np.zeros((0, 2), np.int64), *(one.pairs for one in there)]),
+        "instant_forces": np.concatenate([np.zeros((0, 2)), *forces]),
+    }
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[Instant | None]:
+    """The instants of ``as_arrays``, one or None for each replica."""
+    found: list[Instant | None] = []
+    grain, pair, cells = 0, 0, iter(arrays["instant_cells"].tolist())
+    for grains, pairs in arrays["instant_sizes"].tolist():
+        if grains == 0:
+            found.append(None)
+            continue
+        of_grains = arrays["instant_grains"][grain : grain + grains]
+        forces = arrays["instant_forces"][pair : pair + pairs]
+        of_pairs = arrays["instant_pairs"][pair : pair + pairs]
+        found.append(
+            Instant(
+                of_grains[:, :2],
+                of_grains[:, 2],
+                of_grains[:, 3],
+                of_pairs,
+                forces[:, 0],
+                forces[:, 1] > 0,
+                *next(cells),
+            )
+        )
+        grain, pair = grain + grains, pair + pairs
+    return found
+
+
+def instant_variables(
+    dims: tuple[str, ...], shape: tuple[int, ...], instants: Mapping[int, Instant]
+) -> dict[str, tuple[Any, ...]]:
+    """The variables snapshot_NAME of a map, packed.
+
+    Points have different numbers of pairs, and may have different numbers of grains. Behind the last one, numbers of
+    grains are −1 and all other numbers NaN. A point without an instant has none.
+
+    Args:
+      dims, shape: names and sizes of the dimensions of a point.
+      instants: instants by the number of the point.
+    """
+    count = int(np.prod(shape))
+    grains = max((len(one.radii) for one in instants.values()), default=0)
+    pairs = max((len(one.force) for one in instants.values()), default=0)
+    of_grains, of_pairs = (count, grains), (count, pairs)
+    values = {
+        "x": np.full(of_grains, np.nan, np.float32),
+        "y": np.full(of_grains, np.nan, np.float32),
+        "radius": np.full(of_grains, np.nan, np.float32),
+        "speed": np.full(of_grains, np.nan, np.float32),
+        "pair_i": np.full(of_pairs, _NO_GRAIN, np.int32),
+        "pair_j": np.full(of_pairs, _NO_GRAIN, np.int32),
+        "force": np.full(of_pairs, np.nan, np.float32),
+        "clustered": np.zeros(of_pairs, np.int8),
+        "side": np.full(count, np.nan),
+        "tilt": np.full(count, np.nan),
+        "window": np.full(count, np.nan),
+    }
+    for point, one in instants.items():
+        n, p = len(one.radii), len(one.force)
+        values["x"][point, :n], values["y"][point, :n] = _rounded(one.positions.T, _POSITION_BITS)
+        values["radius"][point, :n], values["speed"][point, :n] = _rounded(one.radii), _rounded(one.speed)
+        values["pair_i"][point, :p], values["pair_j"][point, :p] = one.pairs.T
+        values["force"][point, :p], values["clustered"][point, :p] = _rounded(one.force), one.clustered
+        for name in ("side", "tilt", "window"):
+            values[name][point] = getattr(one, name)
+    variables = {}
+    for name, (long_name, units, further) in _MEANINGS.items():
+        tail = values[name].shape[1:]
+        about = {"long_name": long_name, "units": units}
+        packed = (about, _PACKED) if tail else (about,)
+        variables[f"snapshot_{name}"] = ((*dims, *further), values[name].reshape(*shape, *tail), *packed)
+    return variables
+
+
+def _rounded(values: np.ndarray, bits: int = _BITS) -> np.ndarray:
+    """The values with some binary digits each."""
+    digits, exponents = np.frexp(values)
+    return np.ldexp(np.round(digits * 2.0**bits), exponents - bits)

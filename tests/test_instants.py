@@ -1,0 +1,166 @@
+"""The instants of a map are those of its flows, cost its numbers nothing, and survive every file."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic import random_replica, snapshot_of
+
+from jaxgran.analysis.instant import Instant, averaged, instant_of
+from jaxgran.maps import instants, sweep
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.instants import first_of_points, instant_variables
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.results import choices_of, read_dataset, write_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.sweep import replicas
+from jaxgran.model.cell import minimum_image
+from jaxgran.model.status import Status
+from jaxgran.plotting.flow import scene_of
+
+SETTINGS = MapSettings((0.5, 0.9), (0.8,), grains=32, seeds=2, timestep=5e-4, equilibrate=0.5, strain=1.6)
+
+
+def made_up(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
+    rng = np.random.default_rng(seed)
+    return Instant(
+        positions=rng.uniform(-5, 5, (grains, 2)),
+        radii=rng.uniform(0.3, 0.7, grains),
+        speed=rng.gamma(2.0, 1.0, grains),
+        pairs=np.sort(rng.permuted(np.tile(np.arange(grains), (pairs, 1)), axis=1)[:, :2], axis=1),
+        force=rng.gamma(1.0, 30.0, pairs),
+        clustered=rng.random(pairs) < 0.5,
+        side=10.0,
+        tilt=0.2,
+        window=0.002,
+    )
+
+
+def test_instant_of_a_series_is_what_a_picture_of_it_shows() -> None:
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(0, 10, (5, 8, 2))
+    contacts = [[(0, 1, 2.0)], [(1, 0, 1.0), (1, 2, 3.0)], [], [(5, 4, 1.0)], [(0, 1, 4.0), (6, 7, 1.0), (7, 5, 2.0)]]
+    seen = snapshot_of(positions, contacts, rng.normal(size=(5, 8, 2)), side=10.0, tilt=0.3)
+    found = averaged([instant_of(jax.tree.map(lambda x, k=k: x[k], seen)) for k in range(5)])
+    scene = scene_of(seen)
+    for name, expected in (("positions", scene.centres), ("radii", scene.radii), ("speed", scene.speed)):
+        np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-12)
+    np.testing.assert_allclose(found.force, scene.force, rtol=1e-12)
+    np.testing.assert_array_equal(found.clustered, scene.clustered)
+    i, j = found.pairs.T
+    np.testing.assert_allclose(
+        minimum_image(found.positions[i] - found.positions[j], 10.0, 0.3), scene.branches, atol=1e-12
+    )
+    assert (found.side, found.tilt, found.window) == (scene.side, scene.tilt, 5.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def window() -> Iterator[float]:
+    """A window in which some of these few grains collide."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(instants, "WINDOW", 0.02)
+        yield instants.WINDOW
+
+
+@pytest.fixture(scope="module")
+def with_instants(window) -> dict[Key, Replica]:
+    return dict(replicas(replace(SETTINGS, snapshots=True), batch=2))
+
+
+def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_instants) -> None:
+    plain = dict(replicas(SETTINGS, batch=2))
+    assert all(replica.instant is None for replica in plain.values())
+    for key, replica in with_instants.items():
+        jax.tree.map(np.testing.assert_array_equal, replica._replace(instant=None), plain[key])
+
+
+def test_first_good_seed_of_every_point_has_an_instant_in_any_batch(with_instants) -> None:
+    assert {key for key, replica in with_instants.items() if replica.instant} == {(0, 0), (1, 0)}
+    alone = sweep._run_task(replace(SETTINGS, snapshots=True), [(1, 0)])
+    jax.tree.map(np.testing.assert_array_equal, dict(alone)[1, 0], with_instants[1, 0])
+
+
+def test_instant_is_a_packing_of_the_flow_whose_forces_act_between_grains_that_touch(with_instants, window) -> None:
+    for point, found in first_of_points(with_instants).items():
+        assert np.pi * np.sum(found.radii**2) / found.side**2 == pytest.approx(0.8)
+        assert found.window == pytest.approx(window)
+        i, j = found.pairs.T
+        apart = np.hypot(*minimum_image(found.positions[i] - found.positions[j], found.side, found.tilt).T)
+        near = found.radii[i] + found.radii[j] + window * (found.speed[i] + found.speed[j] + 2)
+        assert len(found.force) > 0 and np.all(found.force > 0) and np.all(apart < near), point
+
+
+def test_bad_replicas_give_no_instant(with_instants) -> None:
+    found = {key: replica for key, replica in with_instants.items()}
+    found[0, 0] = found[0, 0]._replace(status=int(Status.nonfinite))
+    found[0, 1] = found[0, 1]._replace(instant=made_up(3))
+    assert first_of_points(found)[0].side == 10.0
+    found[0, 1] = found[0, 1]._replace(status=int(Status.infeasible))
+    assert set(first_of_points(found)) == {1}
+
+
+def kept(settings: MapSettings) -> dict[Key, Replica]:
+    """Made-up replicas of a map; one point has no instant, and they have different numbers of grains and pairs."""
+    rng = np.random.default_rng(0)
+    found = {(point, 0): made_up(point, 20 + point, 3 * point) for point in (0, 1, 3)}
+    return {(p, s): random_replica(rng, settings)._replace(instant=found.get((p, s))) for p in range(4) for s in (0, 1)}
+
+
+def test_checkpoint_gives_back_the_instants(tmp_path: Path) -> None:
+    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
+    written = kept(settings)
+    run = Checkpoint(tmp_path / "map.nc", settings, resume=False)
+    run.add(written)
+    run.close(finished=False)
+    resumed = Checkpoint(tmp_path / "map.nc", settings, resume=True)
+    resumed.close(finished=True)
+    assert set(resumed.done) == set(written)
+    for key, replica in written.items():
+        jax.tree.map(np.testing.assert_array_equal, resumed.done[key], replica)
+
+
+def test_dataset_has_the_instant_of_each_point_and_keeps_it_through_a_file_and_a_selection(tmp_path: Path) -> None:
+    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
+    written = kept(settings)
+    whole = map_dataset(settings, written, {})
+    names = [name for name in whole if str(name).startswith("snapshot_")]
+    write_dataset(whole[["force_ratio", "force_ratio_stderr", "status", *names]], tmp_path / "map.nc")
+    data = read_dataset(tmp_path / "map.nc")
+    assert data.snapshot_x.dims == ("packing_fraction", "restitution", "snapshot_grain")
+    assert data.snapshot_force.dims == ("packing_fraction", "restitution", "snapshot_pair")
+    assert len(names) == 11 and all(data[name].attrs["long_name"] and data[name].attrs["units"] for name in names)
+    for point, found in first_of_points(written).items():
+        here = data.isel(packing_fraction=point // 2, restitution=point % 2)
+        grains, pairs = int((here.snapshot_radius > 0).sum()), int((here.snapshot_pair_i >= 0).sum())
+        assert (grains, pairs) == (len(found.radii), len(found.force))
+        np.testing.assert_allclose(here.snapshot_x[:grains], found.positions[:, 0], atol=2e-5)
+        np.testing.assert_allclose(here.snapshot_y[:grains], found.positions[:, 1], atol=2e-5)
+        for name, values in (("radius", found.radii), ("speed", found.speed)):
+            np.testing.assert_allclose(here[f"snapshot_{name}"][:grains], values, rtol=2.0**-12)
+        np.testing.assert_allclose(here.snapshot_force[:pairs], found.force, rtol=2.0**-12)
+        np.testing.assert_array_equal(np.stack([here.snapshot_pair_i, here.snapshot_pair_j], -1)[:pairs], found.pairs)
+        np.testing.assert_array_equal(here.snapshot_clustered[:pairs], found.clustered)
+        assert (float(here.snapshot_side), float(here.snapshot_tilt)) == (10.0, 0.2)
+    empty = data.isel(packing_fraction=1, restitution=0)
+    assert np.isnan(empty.snapshot_side) and np.isnan(empty.snapshot_x).all() and (empty.snapshot_pair_i == -1).all()
+    assert MapSettings(**choices_of(data)) == settings
+    assert "snapshot_x" not in map_dataset(replace(settings, snapshots=False), written, {})
+    data.attrs.pop("snapshots")  # as in an older file
+    assert MapSettings(**choices_of(data)) == replace(settings, snapshots=False)
+
+
+def test_map_of_120_points_of_a_thousand_grains_has_less_than_three_megabytes(tmp_path: Path) -> None:
+    """A quarter of it is written. The rest of the dataset takes half a megabyte."""
+    variables = instant_variables(("point",), (30,), {k: made_up(k, 1000, 900) for k in range(30)})
+    write_dataset(xr.Dataset(variables), tmp_path / "map.nc")
+    assert 4 * (tmp_path / "map.nc").stat().st_size < 2.4e6
+
+
+def test_window_has_at_least_one_time_step_and_at_most_a_thousand(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instants, "WINDOW", 0.002)
+    assert [instants._steps(timestep) for timestep in (0.01, 1e-3, 1e-5, 1e-8)] == [1, 2, 200, 1000]
