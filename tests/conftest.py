@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache, partial
 
 import compiled_programs
+import hypothesis
 import pytest
 
 compiled_programs.set_up()
@@ -20,6 +21,9 @@ compiled_programs.configure_jax()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # the same examples at any speed
+hypothesis.settings.load_profile("tests")
 
 from jaxgran.contact.solver import solve  # noqa: E402
 from jaxgran.dynamics import advance as public  # noqa: E402
