@@ -1,4 +1,4 @@
-"""Standard errors of estimates from sums over blocks, the correlation of blocks, and the drift of a series.
+"""Standard errors of estimates from sums over blocks, correlations of errors and of blocks, the drift of a series.
 
 ``standard_errors`` infers how long the blocks remember from the blocks themselves. Its intervals hold where a seed is
 several memories long. ``jackknife`` assumes that merged blocks are independent. Its errors are too small where few
@@ -76,6 +76,22 @@ def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> 
     if influence.shape[0] * influence.shape[1] < 2:
         return named(whole), named(np.full_like(whole, np.nan))
     return named(whole), named(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
+
+
+def error_correlation(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> np.ndarray:
+    """Correlation (n, n) of the errors of n scalar estimates: that of the influences of the blocks on them.
+
+    Args:
+      estimate, sums: as in ``standard_errors``.
+
+    Returns:
+      The matrix in the order of the estimates; NaN where an estimate does not vary.
+    """
+    _, influence, _, _ = _influences(estimate, sums)
+    flat = influence.reshape(-1, influence.shape[-1])
+    with np.errstate(invalid="ignore"):
+        unit = flat / np.sqrt(np.sum(flat**2, axis=0))
+    return unit.T @ unit
 
 
 def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:

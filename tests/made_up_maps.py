@@ -98,24 +98,33 @@ def power(number: np.ndarray, law: tuple[float, float, float]) -> np.ndarray:
 
 
 def dense_map(
-    seed: int | None = 0, noise: float = 0.02, alphas: tuple[float, ...] = (0.2, 0.5), nus: int = 8, shift: float = 0.0
+    seed: int | None = 0,
+    noise: float = 0.02,
+    alphas: tuple[float, ...] = (0.2, 0.5),
+    nus: int = 8,
+    shift: float = 0.0,
+    correlation: float = 0.0,
 ) -> xr.Dataset:
-    """Return a map that obeys both laws, with Gaussian errors; each next restitution has `shift` more friction."""
+    """Return a map that obeys both laws, with Gaussian errors; each next restitution has `shift` more friction.
+
+    The errors of inertial number and friction have the given correlation.
+    """
     nu = np.linspace(0.75, 0.836, nus)
     number = np.repeat((((FRACTION[0] - nu) / -FRACTION[1]) ** (1 / FRACTION[2]))[:, None], len(alphas), axis=1)
     friction = power(number, FRICTION) + shift * np.arange(len(alphas))
     errors = noise * number, noise * friction
     if seed is not None:
         random = np.random.default_rng(seed)
-        number, friction = (
-            x + e * random.normal(size=x.shape) for x, e in zip((number, friction), errors, strict=True)
-        )
+        first, other = random.normal(size=(2, *number.shape))
+        second = correlation * first + np.sqrt(1 - correlation**2) * other
+        number, friction = number + errors[0] * first, friction + errors[1] * second
     dims = ("packing_fraction", "restitution")
     variables = {
         "inertial_number": (dims, number),
         "inertial_number_stderr": (dims, errors[0]),
         "macroscopic_friction": (dims, friction),
         "macroscopic_friction_stderr": (dims, errors[1]),
+        "friction_error_correlation": (dims, np.full(number.shape, correlation)),
         "status": (dims, np.zeros(number.shape, int)),
     }
     return xr.Dataset(variables, {"packing_fraction": nu, "restitution": list(alphas)})

@@ -23,11 +23,12 @@ def test_law_without_noise_is_found() -> None:
     np.testing.assert_allclose(law.friction(number), power(number, FRICTION), rtol=1e-5)
 
 
-def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones() -> None:
+@pytest.mark.parametrize("correlation", [0.0, 0.9, -0.9])
+def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(correlation: float) -> None:
     seeds = 120
     pulls, squares = [], []
     for seed in range(seeds):
-        law = fit(dense_map(seed, alphas=(0.2, 0.5, 0.8)))
+        law = fit(dense_map(seed, alphas=(0.2, 0.5, 0.8), correlation=correlation))
         for part, true in ((law.friction, FRICTION), (law.packing_fraction, FRACTION)):
             pulls.append((part.parameters - true) / part.standard_errors)
             squares.append(part.chi_squared)
@@ -48,6 +49,12 @@ def test_variance_of_a_point_is_that_of_friction_and_of_inertial_number_times_sq
     power_of = number ** FRICTION[2]
     slopes = np.stack([np.ones_like(number), power_of, FRICTION[1] * power_of * np.log(number)]) / deviation
     np.testing.assert_allclose(law.covariance, np.linalg.inv(slopes @ slopes.T), rtol=1e-3)
+
+
+def test_a_map_that_does_not_know_the_correlation_of_its_errors_is_fitted_without_it() -> None:
+    data = dense_map()
+    old = fit(data.drop_vars("friction_error_correlation"))
+    np.testing.assert_array_equal(old.friction.parameters, fit(data).friction.parameters)
 
 
 def test_each_restitution_has_its_own_law() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import stdtrit
 
 from jaxgran import statistics
-from jaxgran.statistics import correlation_length, drift, jackknife, standard_errors
+from jaxgran.statistics import correlation_length, drift, error_correlation, jackknife, standard_errors
 
 TRIALS = 400
 
@@ -231,6 +231,23 @@ def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> No
     errors = np.array([error["ratio"] for _, error in samples])
     uncertainty = values.std() / np.sqrt(2 * TRIALS)
     assert values.std() - 3 * uncertainty < errors.mean() < 1.2 * values.std() + 3 * uncertainty
+
+
+def test_errors_of_two_averages_are_correlated_as_their_blocks_are() -> None:
+    """A correlation of n blocks scatters by (1 - ρ²)/√n; that of an average with its reciprocal is -1."""
+    rng, correlation, blocks = np.random.default_rng(15), 0.6, (4, 32)
+    first, other = rng.normal(10, 1, (2, *blocks))
+    second = 10 + correlation * (first - 10) + np.sqrt(1 - correlation**2) * (other - 10)
+    sums = {"first": first, "second": second, "steps": np.ones(blocks), "same": np.ones(blocks)}
+
+    def estimate(sums: dict) -> dict:
+        mean = {name: sums[name] / sums["steps"] for name in ("first", "second", "same")}
+        return mean | {"reciprocal": 1 / mean["first"]}
+
+    found = error_correlation(estimate, sums)
+    assert found[0, 1] == pytest.approx(correlation, abs=4 * (1 - correlation**2) / np.sqrt(128))
+    assert found[0, 3] == pytest.approx(-1, abs=1e-3) and np.isnan(found[0, 2])
+    np.testing.assert_array_equal(found, found.T)
 
 
 def test_error_of_a_constant_is_zero_and_that_of_an_unknown_value_unknown() -> None:

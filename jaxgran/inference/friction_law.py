@@ -25,6 +25,8 @@ FEWEST_POINTS = 4  # for the three parameters of a law
 FEWEST_PACKING_FRACTIONS = 3  # among the points
 NEEDED = ("inertial_number", "inertial_number_stderr", "macroscopic_friction", "macroscopic_friction_stderr")
 """Variables of a map that a friction law needs."""
+CORRELATION = "friction_error_correlation"
+"""Variable of the correlation of the errors of friction and inertial number."""
 
 _EXPONENTS = (0.05, 4.0)  # smallest and largest of a fit; an exponent at either end is not determined
 _MAX_ROUNDS = 30  # of the effective variance
@@ -92,7 +94,8 @@ def friction_law(
     """Fit friction and packing fraction as power laws of the inertial number to the dense points of a map.
 
     The fit is by least squares with the effective variance: the variance of a point is that of y plus that of I times
-    the squared slope of the law. It is found by iteration. Errors of μ and I are taken as independent.
+    the squared slope of the law, less twice the slope times their covariance. It is found by iteration. A map without
+    `friction_error_correlation` is fitted as if the errors of μ and I were independent.
 
     =========================  ===============================  =====================================================
     data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
@@ -147,7 +150,9 @@ def dense_points(
     """The points that :func:`friction_law` fits, along one dimension ``point``."""
     data = finest(data)
     dense = is_dense(data, largest_inertial_number, smallest_packing_fraction)
-    points = data[list(NEEDED)].assign(dense=dense)
+    if CORRELATION not in data:
+        data = data.assign({CORRELATION: xr.zeros_like(data.inertial_number)})
+    points = data[[*NEEDED, CORRELATION]].assign(dense=dense)
     points = points.stack(point=("packing_fraction", "restitution"), create_index=False)
     return points.isel(point=points.dense.values)
 
@@ -162,14 +167,17 @@ def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
     """The laws of friction and of packing fraction through dense points."""
     number, number_error = points.inertial_number.values, points.inertial_number_stderr.values
     friction, friction_error = points.macroscopic_friction.values, points.macroscopic_friction_stderr.values
-    fraction = points.packing_fraction.values
+    fraction, exact = points.packing_fraction.values, np.zeros(points.sizes["point"])
+    covariance = np.nan_to_num(points[CORRELATION].values) * number_error * friction_error
     return (
-        _fit(number, friction, number_error, friction_error, sign=1.0),
-        _fit(number, fraction, number_error, np.zeros_like(fraction), sign=-1.0),
+        _fit(number, friction, number_error, friction_error, covariance, sign=1.0),
+        _fit(number, fraction, number_error, exact, exact, sign=-1.0),
     )
 
 
-def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float) -> PowerLaw:
+def _fit(
+    x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, covariance_xy: np.ndarray, sign: float
+) -> PowerLaw:
     """Return the law through points with errors in both coordinates; its coefficient has the given sign."""
     from scipy.optimize import curve_fit  # here, as loading it takes longer than a figure
 
@@ -187,8 +195,8 @@ def _fit(x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray,
     converged = True
     for _ in range(_MAX_ROUNDS):
         previous, (_, coefficient, exponent) = parameters, parameters
-        slope = coefficient * exponent * (x / scale) ** (exponent - 1)
-        deviation = np.maximum(np.hypot(y_error, slope * x_error / scale), 1e-9)
+        slope = sign * coefficient * exponent * (x / scale) ** (exponent - 1) / scale
+        deviation = np.sqrt(np.maximum(y_error**2 + (slope * x_error) ** 2 - 2 * slope * covariance_xy, 1e-18))
         try:
             parameters, covariance = curve_fit(
                 law, x / scale, y, previous, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes

@@ -24,7 +24,7 @@ from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.memory import memory_strain
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.prediction import kinetic_theory
-from jaxgran.sampling.sample import correlation_strains, estimates
+from jaxgran.sampling.sample import correlation_strains, error_correlation_of, estimates
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1  # status of a replica without a result
@@ -60,6 +60,7 @@ def map_dataset(
     strain_by_seed                (point, seed)         sampled strain
     timestep_by_seed              (point, seed)         time step of the sample
     equilibration_strain_by_seed  (point, seed)         strain before the sample
+    friction_error_correlation    point                 of the errors of macroscopic_friction and inertial_number
     NAME_large_system             point without grains  estimate for a large system, for the names in ``BOUNDS``
     NAME_large_system_error       point without grains  bound on its error
     NAME_limit_seen               point without grains  whether the average has a limit at large numbers of grains
@@ -81,6 +82,7 @@ def map_dataset(
     count, seeds = math.prod(shape), settings.seeds
     values = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
     errors = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
+    friction_correlation = np.full(count, np.nan)
     memory, drifting = np.full(count, np.nan), np.zeros(count, bool)
     flows = settings.flows()
     scalar_averages = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
@@ -108,6 +110,7 @@ def map_dataset(
             mass = grains * (1 + spread**2 / 3)
             memory[point] = memory_strain(value, grains, mass, samples[0].area, samples[0].shear_rate)
             drifting[point] = is_drifting(samples, memory[point])
+            friction_correlation[point] = error_correlation_of(samples, "macroscopic_friction", "inertial_number")
             independent = correlation_strains(samples)
             for name in scalar_averages:
                 correlation[name][point] = independent[name]
@@ -164,6 +167,11 @@ def map_dataset(
             "long_name": "time step of the sample, shorter than asked for where a replica was retried",
             "units": "1 / shear rate",
         },
+    )
+    variables["friction_error_correlation"] = (
+        point_dims,
+        friction_correlation.reshape(shape),
+        {"long_name": "correlation of the errors of macroscopic friction and inertial number", "units": "1"},
     )
     variables["memory"] = (
         point_dims,

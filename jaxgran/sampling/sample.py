@@ -24,7 +24,7 @@ from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
-from jaxgran.statistics import Estimates, correlation_length, standard_errors
+from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
 
 BLOCKS = 32
 MOST_BLOCKS = 10**6
@@ -208,6 +208,17 @@ def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
     lengths = correlation_length(average, sums)
     block = np.mean(sums.duration) * np.asarray(seeds[0].shear_rate)
     return {name: length * block for name, length in lengths.items() if name not in EXTREME_OBSERVABLES}
+
+
+def error_correlation_of(seeds: Sequence[Sample], first: str, second: str) -> float:
+    """Correlation of the errors of two averages over replicas of one flow."""
+    average, sums = _stacked(seeds)
+
+    def pair(sums: Tally) -> dict[str, Array]:
+        found = average(sums)
+        return {name: found[name] for name in (first, second)}
+
+    return float(error_correlation(pair, sums)[0, 1])
 
 
 def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
