@@ -66,9 +66,9 @@ BENCHMARKS = (
     ),
     Benchmark(
         "dense_rheology",
-        "Do dense flows obey one friction law of the inertial number?",
-        (3, 1),
-        ("dense_rheology.png",),
+        "Do dense flows obey one friction law of the inertial number, and with which exponents?",
+        (40, 3),
+        ("dense_rheology.json", "dense_rheology_uniform.png", "dense_rheology_bidisperse.png"),
     ),
     Benchmark(
         "structure_study",

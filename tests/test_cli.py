@@ -143,7 +143,7 @@ MISTAKES = {
     "map --engine machine_code --solver jacobi": "--engine must be auto or jax with the solver jacobi",
     "run --restitution 0.5 --packing-fraction 0.6 --engine thread_block": "--engine must be auto or jax on a CPU",
     "map --activation always": "'midpoint', 'touching'",
-    "map --preset slow": "'quick', 'paper'",
+    "map --preset slow": "'quick', 'paper', 'dense'",
     "map --batch 0": "batch must be auto or a whole number of at least 1",
     "map --batch many": "batch must be auto or a whole number of at least 1",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --workers 0": "workers must be a whole number of at least 1",
@@ -202,7 +202,7 @@ MISTAKES = {
     "run --restitution 0.5 --packing-fraction 0.7 --grains=many": "--grains must be a whole number, not 'many'",
     "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
     "map --seeds": "'--seeds' requires an argument",
-    "map --preset fast": "--preset must be one of 'quick', 'paper', not 'fast'",
+    "map --preset fast": "--preset must be one of 'quick', 'paper', 'dense', not 'fast'",
 }
 
 
@@ -602,7 +602,7 @@ def test_completion_is_offered_and_its_script_calls_the_command(words: list[str]
         "jaxgran ": {"map", "plot", "run", "fit", "info"},
         "jaxgran p": {"plot"},
         "jaxgran run --m": {"--movie"},
-        "jaxgran map --preset ": {"quick", "paper"},
+        "jaxgran map --preset ": {"quick", "paper", "dense"},
     }.items(),
 )
 def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

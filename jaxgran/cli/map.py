@@ -38,7 +38,9 @@ PLOT_EXAMPLES = {
 
 
 def map_command(
-    preset: Annotated[Literal["quick", "paper"], typer.Option(help="Starting point for all other options.")] = "quick",
+    preset: Annotated[
+        Literal["quick", "paper", "dense"], typer.Option(help="Starting point for all other options.")
+    ] = "quick",
     restitution: Annotated[
         str | None, typer.Option(help="List of restitutions: 0.1,0.5,0.9 or start:stop:count.")
     ] = None,
