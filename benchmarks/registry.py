@@ -53,6 +53,12 @@ BENCHMARKS = (
         ("theory_check.json", "theory_check.png"),
     ),
     Benchmark(
+        "theory_losses",
+        "Which assumption of kinetic theory fails, and what of it survives dt → 0 and N → ∞?",
+        (3, 0.5),
+        ("theory_losses.json", "theory_losses.png"),
+    ),
+    Benchmark(
         "paper",
         "Where in the plane of restitution and packing fraction are binary collisions all there is?",
         (9, 0.5),

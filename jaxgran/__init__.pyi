@@ -21,6 +21,7 @@ from .model.status import Status
 from .plotting.errors import dominating_errors
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
+from .plotting.losses import theory_losses
 from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
@@ -77,4 +78,5 @@ __all__ = [
     "save_figures",
     "snapshot_series",
     "theory_errors",
+    "theory_losses",
 ]

@@ -145,7 +145,7 @@ def test_contact_value_starts_from_the_second_virial_coefficient():
 def test_collision_integrals_equal_averages_over_sampled_collisions():
     """Applies the rule of collision to random pairs, and compares with the closed forms within five standard errors."""
     alpha, nu, samples = 0.6, 0.5, 100_000
-    mixture = jax.tree.map(np.asarray, moments_module._mixture(jnp.asarray(nu), jnp.asarray(0.26), 2))
+    mixture = jax.tree.map(np.asarray, moments_module.uniform_mixture(jnp.asarray(nu), jnp.asarray(0.26), 2))
     tensors = np.array([[0.5, 0.7], [0.3, 0.4], [-0.1, -0.15]])  # xx, yy, xy of the two classes
     predicted = jax.jit(moments_module._collisions)(jnp.asarray(tensors), jnp.asarray(alpha), mixture)
     masses, densities = mixture.masses, mixture.number_densities

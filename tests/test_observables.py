@@ -57,6 +57,7 @@ def tally(microscopic) -> Tally:
         binary_impulse=binary.sum(),
         contact_moment=moment("impulses"),
         binary_moment=moment("binary"),
+        binary_speed_moment=0.4 * moment("binary"),
         cluster_moment=0.3 * moment("impulses"),
         kinetic_moment=kinetic,
         local_kinetic=np.float64(0.7 * steps * TIMESTEP),

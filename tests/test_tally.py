@@ -72,6 +72,7 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "overlap": overlap,
         "squared_impulse": p * p,
         "deep_contacts": overlap > DEEP_OVERLAP,
+        "binary_speed_moment": -approach * binary * moment,
     }
     begin = span_of(CONTACT).start
     assert len(terms) == span_of(CONTACT).stop - begin

@@ -139,6 +139,7 @@ def contact_terms(
       used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.
     """
     xx, xy, yy = nx * nx * distance, nx * ny * distance, ny * ny * distance
+    binary_speed = -binary_impulse * approach  # the impulse is zero where the contact does not approach
     return (
         impulse,
         binary_impulse,
@@ -159,4 +160,7 @@ def contact_terms(
         overlap,
         impulse * impulse,
         where(overlap > DEEP_OVERLAP, used, 0),
+        binary_speed * xx,
+        binary_speed * xy,
+        binary_speed * yy,
     )

@@ -68,6 +68,9 @@ class Tally:
     overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
     squared_impulse: Float[Array, "*b"] = _sum(CONTACT, "m²σ²γ̇²", "squares p² of the contact impulses")
     deep_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``")
+    binary_speed_moment: Float[Array, "*b 2 2"] = _sum(
+        CONTACT, "mσ³γ̇²", "the binary moment, each contact times its speed of approach max(0, −u⁻)", _TENSOR
+    )
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
     local_kinetic: Float[Array, "*b"] = _sum(

@@ -15,6 +15,7 @@ from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.error_variables import error_variables
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import BOUNDS, large_system_variables
+from jaxgran.maps.loss_variables import loss_variables
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.choices import Engine
@@ -24,7 +25,7 @@ from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.memory import memory_strain
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.prediction import kinetic_theory
-from jaxgran.sampling.sample import correlation_strains, error_correlation_of, estimates
+from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
 
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 NOT_RUN = -1  # status of a replica without a result
@@ -55,6 +56,10 @@ def map_dataset(
     NAME_correlation_strain       point                 strain of one independent sample, for averages of scalars
     NAME_by_seed                  (point, seed)         average of each seed
     theory_NAME                   point                 prediction of kinetic theory, for the names in ``THEORY``
+    enskog_STRESS                 point                 contact pressure and shear stress of Enskog's theory at the
+                                                        measured granular temperature, with ``_stderr``
+    theory_loss_STRESS_FACTOR     point                 factors whose product times enskog_STRESS is contact_STRESS, see
+                                                        ``sampling.losses``, with ``_stderr``
     status, status_by_seed        point, (point, seed)  worst status
     memory                        point                 strain over which the flow remembers
     strain_by_seed                (point, seed)         sampled strain
@@ -84,6 +89,7 @@ def map_dataset(
     errors = {name: np.full((count, *_tensor_shape(name)), np.nan) for name in OBSERVABLES}
     friction_correlation = np.full(count, np.nan)
     memory, drifting = np.full(count, np.nan), np.zeros(count, bool)
+    measured: dict[int, list[Sample]] = {}
     flows = settings.flows()
     scalar_averages = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
     correlation = {name: np.full(count, np.nan) for name in scalar_averages}
@@ -102,7 +108,7 @@ def map_dataset(
     for point in range(count):
         finite = [results[point, s] for s in range(seeds) if NOT_RUN < status[point, s] < Status.nonfinite]
         if finite:
-            samples = [replica.sample for replica in finite]
+            samples = measured[point] = [replica.sample for replica in finite]
             value, error = estimates(samples)
             for name in OBSERVABLES:
                 values[name][point], errors[name][point] = value[name], error[name]
@@ -138,6 +144,7 @@ def map_dataset(
         variables |= large_system_variables(point_dims[1:], settings.sizes, averages, OBSERVABLES)
     if settings.snapshots:
         variables |= instant_variables(point_dims, shape, first_of_points(results))
+    variables |= loss_variables(settings, point_dims, measured)
     predictions = _predictions(settings)
     for name in THEORY:
         long_name, units = OBSERVABLES[name]

@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError
 
-PICTURES = ("curves", "contours", "timestep", "size", "theory", "clusters", "errors", "rheology")
+PICTURES = ("curves", "contours", "timestep", "size", "theory", "losses", "clusters", "errors", "rheology")
 
 
 def check_output(path: Path) -> None:

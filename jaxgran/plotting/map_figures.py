@@ -11,6 +11,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.plotting.drawing import is_plane, writable_stem, write
 from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
+from jaxgran.plotting.losses import has_losses, theory_losses
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
@@ -29,6 +30,7 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     `{stem}_timestep.png`   at least two time steps
     `{stem}_size.png`       at least two numbers of grains
     `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
+    `{stem}_losses.png`     a plane, and the factors of the error of the theory
     `{stem}_clusters.png`   the shares of the clusters
     `{stem}_errors.png`     a plane, and the error budget of its points
     `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
@@ -49,6 +51,7 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
         "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
         "size": (data.sizes.get("grains", 1) >= 2, averages_against_grains),
         "theory": (is_plane(data) and has_theory(data), theory_errors),
+        "losses": (is_plane(data) and has_losses(data), theory_losses),
         "clusters": (has_clusters(data), cluster_shares),
         "errors": (is_plane(data) and has_errors(data), dominating_errors),
         "rheology": (has_friction_law(data), friction_figure),

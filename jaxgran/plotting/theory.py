@@ -160,17 +160,12 @@ def theory_errors(data: xr.Dataset) -> Figure:
         parts = error_parts(data, quantity)
         measured &= np.isfinite(parts["total"][0])
         for axes, (value, error) in zip(row, parts.values(), strict=True):
-            lines, hidden = _draw_errors(axes, data, value, error)
+            lines, hidden = draw_errors(axes, data, value, error)
             over = draw_excess(axes, data)
             panels.append((axes, lines, over.values()))
             noisy |= hidden
         row[0].set_ylabel(f"{_QUANTITIES[quantity]}\n{NU_LABEL}", fontsize=LABEL_SIZE)
-    entries = excess_keys(over)
-    if noisy:
-        entries.insert(
-            0, Patch(facecolor="white", edgecolor="0.5", hatch="....", linewidth=0, label="within ± std. error")
-        )
-    add_plane_legend(figure, data, measured, entries)
+    add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
     finish(figure, data, measured, [_THEORY_NOTE, status_note(data), missing_note(measured, " (hatched)")])
     fix_layout(figure)
     for axes, lines, over in panels:
@@ -178,10 +173,15 @@ def theory_errors(data: xr.Dataset) -> Figure:
     return figure
 
 
-def _draw_errors(
+def noise_keys() -> list[Patch]:
+    """Return the legend entry of the areas that ``draw_errors`` has dotted."""
+    return [Patch(facecolor="white", edgecolor="0.5", hatch="....", linewidth=0, label="within ± std. error")]
+
+
+def draw_errors(
     axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray
 ) -> tuple[dict[str, QuadContourSet], bool]:
-    """Draw contours and faint shades of an error.
+    """Draw contours and faint shades of an error, the logarithm of a quotient.
 
     Return the lines by their labels, and whether the error is anywhere smaller than its standard error.
     """

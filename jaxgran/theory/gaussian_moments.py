@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxgran.theory.mixture import ANGLES, Mixture, half_range_moments, mixture_of, uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
 from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats
 
-_ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic, so the error is below 1e-11
 _MAX_ITERATIONS = 40  # of Newton's method, which needs 4 to 7
 _LARGEST_STEP = 1.0  # of one Newton iteration, in the logarithm of a temperature
 
@@ -52,7 +52,9 @@ def gaussian_moments(
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
-    return _steady(alpha, rate, _mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature))
+    return _steady(
+        alpha, rate, uniform_mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature)
+    )
 
 
 @jax.jit
@@ -79,12 +81,10 @@ def mixture_moments(
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
     fractions = jnp.full(diameters.shape, 1 / diameters.size, nu.dtype)
     guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.mean(masses))
-    return _steady(alpha, rate, _mixture_of(nu, diameters, masses, fractions), guess)
+    return _steady(alpha, rate, mixture_of(nu, diameters, masses, fractions), guess)
 
 
-def _steady(
-    alpha: Float[Array, ""], rate: Float[Array, ""], mixture: "_Mixture", guess: Float[Array, ""]
-) -> SteadyShear:
+def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, guess: Float[Array, ""]) -> SteadyShear:
     """Solve the balance of the moments of a mixture, from a guess of the logarithm of its temperature."""
 
     def imbalance(unknowns):
@@ -108,48 +108,6 @@ def _steady(
     )
 
 
-class _Mixture(NamedTuple):
-    """A law of diameters represented by a few classes.
-
-    ================  ==================  ====  ==================================================================
-    diameters         (classes,)          σ     diameters of the grains
-    masses            (classes,)          m     masses of the grains
-    number_densities  (classes,)          1/σ²  grains per unit area
-    encounters        (classes, classes)  1/σ   number density of the second class times the contact diameter and χ
-    ================  ==================  ====  ==================================================================
-    """
-
-    diameters: Float[Array, " classes"]
-    masses: Float[Array, " classes"]
-    number_densities: Float[Array, " classes"]
-    encounters: Float[Array, "classes classes"]
-
-    @property
-    def contact_diameters(self) -> Float[Array, "classes classes"]:
-        return (self.diameters[:, None] + self.diameters[None, :]) / 2
-
-    @property
-    def reduced_masses(self) -> Float[Array, "classes classes"]:
-        m_i, m_j = self.masses[:, None], self.masses[None, :]
-        return m_i * m_j / (m_i + m_j)
-
-
-def _mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes: int) -> _Mixture:
-    """The uniform law of diameters in σ ± width."""
-    nodes, weights = np.polynomial.legendre.leggauss(size_classes)
-    diameters = 1 + width * jnp.asarray(nodes, nu.dtype)
-    return _mixture_of(nu, diameters, diameters**2, jnp.asarray(weights / 2, nu.dtype))
-
-
-def _mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> _Mixture:
-    """Classes of grains from their diameters, masses and number fractions, (classes,) each."""
-    mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
-    densities = fractions * nu / (jnp.pi / 4 * mean_square)
-    d_i, d_j = diameters[:, None], diameters[None, :]
-    chi = 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square / (1 - nu) ** 2
-    return _Mixture(diameters, masses, densities, densities[None, :] * (d_i + d_j) / 2 * chi)
-
-
 class _Collisions(NamedTuple):
     """Effects of the collisions at unit shear rate; components in the order xx, yy, xy.
 
@@ -167,7 +125,7 @@ class _Collisions(NamedTuple):
     rate: Float[Array, ""]
 
 
-def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: _Mixture) -> _Collisions:
+def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: Mixture) -> _Collisions:
     """Enskog collision integrals of Gaussian velocities.
 
     Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with the mean
@@ -175,15 +133,15 @@ def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""]
     the temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩.
     The average is over w > 0. There ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
     """
-    angle = (jnp.arange(_ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / _ANGLES)
+    angle = (jnp.arange(ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / ANGLES)
     nx, ny = jnp.cos(angle)[None, :], jnp.sin(angle)[None, :]
     normals = jnp.stack([nx * nx, ny * ny, nx * ny])  # (3, 1, angles)
-    arc = 2 * jnp.pi / _ANGLES  # the two halves of the circle give equal integrals
+    arc = 2 * jnp.pi / ANGLES  # the two halves of the circle give equal integrals
 
     txx, tyy, txy = temperatures[:, :, None]
     push_x, push_y = txx * nx + txy * ny, txy * nx + tyy * ny  # T·n, (classes, angles)
     spread = (push_x * nx + push_y * ny) / mixture.masses[:, None]
-    first, second, third = _half_range_moments(
+    first, second, third = half_range_moments(
         -mixture.contact_diameters[:, :, None] * (nx * ny)[None, :, :],
         jnp.sqrt(spread[:, None, :] + spread[None, :, :]),
     )  # each (classes, classes, angles)
@@ -204,17 +162,6 @@ def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""]
         dissipation=jnp.sum(lost[:, :, None] * third),
         rate=jnp.sum(per_grain[:, :, None] * first),
     )
-
-
-def _half_range_moments(mean: Array, deviation: Array) -> tuple[Array, Array, Array]:
-    """First, second and third moment of a Gaussian over its positive values."""
-    z = mean / deviation
-    above = jax.lax.erfc(-z / jnp.sqrt(2.0).astype(z.dtype)) / 2
-    bell = jnp.exp(-(z**2) / 2) / np.sqrt(2 * np.pi).item()
-    first = deviation * (z * above + bell)
-    second = deviation**2 * ((z**2 + 1) * above + z * bell)
-    third = deviation**3 * ((z**2 + 3) * z * above + (z**2 + 2) * bell)
-    return first, second, third
 
 
 def _moment_balance(temperatures: Float[Array, "3 classes"], collisions: _Collisions) -> Float[Array, "3 classes"]:

@@ -1,0 +1,91 @@
+"""The figure that says which assumption of kinetic theory fails where: four factors in the plane of 1 − α and ν."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
+from jaxgran.plotting.contours import add_plane_legend, draw_excess, excess_keys, label_contours
+from jaxgran.plotting.drawing import (
+    ALPHA_LABEL,
+    LABEL_SIZE,
+    NU_LABEL,
+    empty_figure,
+    finish,
+    fix_layout,
+    missing_note,
+    ordered,
+    require_plane,
+    status_note,
+)
+from jaxgran.plotting.theory import draw_errors, noise_keys
+
+PANELS = {
+    "anisotropy": "(a) anisotropy of the temperature",
+    "chaos": "(b) chaos: squared speed of approach",
+    "pairs": "(c) pair correlation at contact",
+    "binary": "(d) binary assumption",
+}
+"""Factors of the map and the titles of their panels."""
+
+_NOTE = (
+    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d). Enskog: isotropic Gaussian velocities at the measured T.\n"
+    "Black contours: measured over assumed, as a quotient less one (dashed where negative) or a factor"
+)
+
+
+def has_losses(data: xr.Dataset) -> bool:
+    """Return whether a map has the variables that :func:`theory_losses` draws."""
+    return not what_lacks(data, *RATIO, *_names("pressure"))
+
+
+def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
+    """Return the four factors by which a measured contact stress differs from Enskog's, in the plane of 1 − α and ν.
+
+    Each factor is a stress with one more assumption replaced by what was measured, over the stress before:
+    see ``jaxgran.sampling.losses``. Black contours have it as their label; they are dashed where it is below one. In
+    dotted areas it differs from one by less than its standard error. Green contours show the excess of the force ratio.
+
+    ======== =============================== =====================================================
+    data     (packing_fraction, restitution) `theory_loss_...` of the stress, with `_stderr`,
+                                             `force_ratio` and `status`
+    stress   text                            "pressure" or "shear_stress"
+    returns  Figure
+    raises   ValueError                      fewer than two restitutions or two packing fractions
+    ======== =============================== =====================================================
+    """
+    require_map(data, *RATIO, *_names(stress))
+    require_plane(data)
+    data = finest(ordered(data, *_names(stress)))
+    figure = empty_figure(width=6.2, height=6.4)
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    measured = np.isfinite(data[f"theory_loss_{stress}_pairs"].values)
+    panels, noisy, over = [], False, {}
+    for axes, (factor, title) in zip(grid.flat, PANELS.items(), strict=True):
+        value, error = (data[f"theory_loss_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            logarithm = np.where(value > 0, np.log(value), np.nan)
+            lines, hidden = draw_errors(axes, data, logarithm, error / value)
+        over = draw_excess(axes, data)
+        panels.append((axes, lines, over.values()))
+        noisy |= hidden
+        axes.set_title(title, fontsize=LABEL_SIZE)
+    for axes in grid[1]:
+        axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
+    for axes in grid[:, 0]:
+        axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
+    add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
+    note = _NOTE.format(stress.replace("_", " "))
+    finish(figure, data, measured, [note, status_note(data), missing_note(measured, " (hatched)")])
+    fix_layout(figure)
+    for axes, lines, others in panels:
+        label_contours(axes, list(lines.items()), others, room=4.0)
+    return figure
+
+
+def _names(stress: str) -> list[str]:
+    return [f"theory_loss_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]

@@ -1,0 +1,66 @@
+"""Mixtures of grains by a few classes of diameter, and the moments of approaching pairs with Gaussian velocities."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+ANGLES = 32  # contact directions on the half circle; the integrand is smooth and periodic, so the error is below 1e-11
+
+
+class Mixture(NamedTuple):
+    """A law of diameters represented by a few classes.
+
+    ================  ==================  ====  ==================================================================
+    diameters         (classes,)          σ     diameters of the grains
+    masses            (classes,)          m     masses of the grains
+    number_densities  (classes,)          1/σ²  grains per unit area
+    encounters        (classes, classes)  1/σ   number density of the second class times the contact diameter and χ
+    ================  ==================  ====  ==================================================================
+    """
+
+    diameters: Float[Array, " classes"]
+    masses: Float[Array, " classes"]
+    number_densities: Float[Array, " classes"]
+    encounters: Float[Array, "classes classes"]
+
+    @property
+    def contact_diameters(self) -> Float[Array, "classes classes"]:
+        return (self.diameters[:, None] + self.diameters[None, :]) / 2
+
+    @property
+    def reduced_masses(self) -> Float[Array, "classes classes"]:
+        m_i, m_j = self.masses[:, None], self.masses[None, :]
+        return m_i * m_j / (m_i + m_j)
+
+
+def uniform_mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes: int) -> Mixture:
+    """The uniform law of diameters in σ ± width."""
+    nodes, weights = np.polynomial.legendre.leggauss(size_classes)
+    diameters = 1 + width * jnp.asarray(nodes, nu.dtype)
+    return mixture_of(nu, diameters, diameters**2, jnp.asarray(weights / 2, nu.dtype))
+
+
+def mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> Mixture:
+    """Classes of grains from their diameters, masses and number fractions, (classes,) each.
+
+    Contact values: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
+    """
+    mean, mean_square = jnp.sum(fractions * diameters), jnp.sum(fractions * diameters**2)
+    densities = fractions * nu / (jnp.pi / 4 * mean_square)
+    d_i, d_j = diameters[:, None], diameters[None, :]
+    chi = 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / mean_square / (1 - nu) ** 2
+    return Mixture(diameters, masses, densities, densities[None, :] * (d_i + d_j) / 2 * chi)
+
+
+def half_range_moments(mean: Array, deviation: Array) -> tuple[Array, Array, Array]:
+    """First, second and third moment of a Gaussian over its positive values."""
+    z = mean / deviation
+    above = jax.lax.erfc(-z / jnp.sqrt(2.0).astype(z.dtype)) / 2
+    bell = jnp.exp(-(z**2) / 2) / np.sqrt(2 * np.pi).item()
+    first = deviation * (z * above + bell)
+    second = deviation**2 * ((z**2 + 1) * above + z * bell)
+    third = deviation**3 * ((z**2 + 3) * z * above + (z**2 + 2) * bell)
+    return first, second, third
