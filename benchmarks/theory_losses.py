@@ -90,7 +90,8 @@ def timesteps(plan: Plan, grains: int) -> tuple[float, ...]:
 def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[float, jg.Sample]:
     """One seed of one flow and number of grains: a sample of every time step."""
     grains, (alpha, nu), seed = task
-    steady = state = jg.prepare(jg.ShearFlow(grains, alpha, nu, START), jax.random.key(seed))
+    strain = max(sqrt(grains), 2 / (nu * (1 - alpha**2)))
+    steady = state = jg.prepare(jg.ShearFlow(grains, alpha, nu, START), jax.random.key(seed), equilibrate=strain)
     found = {}
     for timestep in timesteps(plan, grains):
         flow = jg.ShearFlow(grains, alpha, nu, timestep)

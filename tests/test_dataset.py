@@ -15,6 +15,7 @@ from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
+from jaxgran.sampling.losses import FACTORS, STRESSES, theory_losses
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
@@ -88,6 +89,18 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
         for there in data[f"theory_{name}"].stack(point=data[name].dims).transpose("point"):
             theory = gaussian_moments(float(there.restitution), float(there.packing_fraction))
             assert float(there) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
+
+
+def test_losses_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
+    samples = [results[0, seed].sample for seed in range(SEEDS)]
+    value, error = theory_losses(settings.flows()[0], samples)
+    here = data.sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
+    for stress in STRESSES:
+        for stored, name in [(f"enskog_{stress}", f"enskog_{stress}")] + [
+            (f"theory_loss_{stress}_{factor}", f"{stress}_{factor}") for factor in FACTORS
+        ]:
+            assert data[stored].dims == data[f"{stored}_stderr"].dims == ("packing_fraction", "restitution")
+            np.testing.assert_array_equal([here[stored], here[f"{stored}_stderr"]], [value[name], error[name]])
 
 
 def test_elastic_flow_has_no_prediction() -> None:

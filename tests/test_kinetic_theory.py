@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxgran.theory import gaussian_moments as moments_module
+from jaxgran.theory.enskog import momentum_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 from jaxgran.theory.steady_shear import SteadyShear, contact_value, maxwellian_collision_rate
@@ -140,6 +141,25 @@ def test_the_default_number_of_size_classes_suffices():
 def test_contact_value_starts_from_the_second_virial_coefficient():
     assert contact_value(0.0) == 1
     np.testing.assert_allclose(jax.grad(contact_value)(0.0), 25 / 16)
+
+
+def test_momentum_transfer_is_the_stress_of_the_moments_at_equal_temperatures():
+    tensor, alpha, nu = np.array([[0.5, -0.1], [-0.1, 0.3]]), jnp.asarray(0.6), jnp.asarray(0.5)
+    mixture = moments_module.uniform_mixture(nu, jnp.asarray(0.26), 4)
+    classes = np.repeat(np.array([0.5, 0.3, -0.1])[:, None], 4, axis=1)  # xx, yy, xy
+    xx, yy, xy = jax.jit(moments_module._collisions)(jnp.asarray(classes), alpha, mixture).stress
+    found = momentum_transfer(jnp.asarray(tensor), alpha, nu)
+    np.testing.assert_allclose(found.stress, [[xx, xy], [xy, yy]], rtol=1e-12)
+
+
+def test_momentum_transfer_of_slow_shear_has_the_viscosity_of_isotropic_collisions():
+    """Half of γ_b = (8/π) ν² χ (1 + α), in units of √(T/4π): V. Garzó and J. W. Dufty (1999) at vanishing shear."""
+    alpha, nu, rate, temperature = 0.8, 0.5, 1e-4, 2.0
+    found = momentum_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
+    bulk = 8 / np.pi * nu**2 * float(contact_value(nu)) * (1 + alpha)
+    np.testing.assert_allclose(-found.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6)
+    speed = found.speed_stress[0, 0] / found.stress[0, 0]  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T
+    np.testing.assert_allclose(speed, 2 * np.sqrt(2 / np.pi) * np.sqrt(2 * temperature), rtol=1e-6)
 
 
 def test_collision_integrals_equal_averages_over_sampled_collisions():

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
 from jaxgran.plotting.friction import friction_figure, parameters_text
+from jaxgran.plotting.losses import PANELS, theory_losses
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
 
@@ -36,6 +37,11 @@ def closure_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
     return 1.5 * (x - 0.5) + 0.6 * (nu - 0.547)
 
 
+def factor_of(k: int, x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the logarithm of synthetic factor k of a stress; the first is within its error everywhere."""
+    return 0.5 * STDERR * (x - x) if k == 0 else (-1.0) ** k * (0.4 * k * x + 0.5 * (nu - 0.55))
+
+
 def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
     return 0.08 + 0.6 * x + 0.6 * (nu - 0.4)
 
@@ -52,6 +58,10 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
         added |= {key: (DIMS, value) for key, value in parts.items()}
         added |= {f"{key}_stderr": (DIMS, STDERR * value) for key, value in parts.items()}
         added[f"theory_{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
+        for k, factor in enumerate(PANELS):
+            value = np.exp(factor_of(k, x, nu)) * np.ones(measured.shape)
+            added[f"theory_loss_{name}_{factor}"] = (DIMS, value)
+            added[f"theory_loss_{name}_{factor}_stderr"] = (DIMS, STDERR * value)
     ratio = np.ones((*data.force_ratio.shape, 2, 2))
     added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
     added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
@@ -209,12 +219,12 @@ def test_caption_names_the_run_and_the_theory() -> None:
         assert words in text
 
 
-@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
 def test_bad_status_is_ringed_in_every_plane(draw) -> None:
     data = theory_dataset()
     data.status[2, 3] = 2
     figure = draw(data)
-    planes = figure.axes if draw is theory_errors else [panel(figure, "m")]
+    planes = [panel(figure, "m")] if draw is cluster_shares else figure.axes
     for axes in planes:
         np.testing.assert_allclose(rings(axes), [[1.0 - data.restitution[3], data.packing_fraction[2]]])
     assert "status not ok" in legend_texts(figure)
@@ -225,6 +235,27 @@ def test_bad_status_is_ringed_in_every_plane(draw) -> None:
 def test_theory_needs_a_plane(alphas: int, nus: int) -> None:
     with pytest.raises(ValueError, match="at least two restitutions"):
         theory_errors(theory_dataset(alphas, nus))
+
+
+# ---------------------------------------------------------------------------------------------- losses
+
+
+@pytest.mark.parametrize("stress", ["pressure", "shear_stress"])
+def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(stress) -> None:
+    figure = theory_losses(theory_dataset(), stress)
+    assert [axes.get_title() for axes in figure.axes] == list(PANELS.values())
+    for k, axes in enumerate(figure.axes):
+        corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
+        lines = contours(axes, "black")
+        assert set(lines) == {level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()}
+        for level, line in lines.items():
+            np.testing.assert_allclose(factor_of(k, *vertices(line)), level, atol=1e-9)
+            assert (line.get_linestyle()[0][1] is not None) == (level < 0.0)
+        assert len(contours(axes, "#00803c")) == len(EXCESS_LEVELS)
+        for dotted in noise(axes):
+            assert abs(factor_of(k, *dotted.T)).max() < 1.001 * STDERR
+    assert noise(figure.axes[0]) and "within ± std. error" in legend_texts(figure)
+    assert f"Contact {stress.replace('_', ' ')}" in caption(figure)
 
 
 # -------------------------------------------------------------------------------------------- clusters
@@ -356,7 +387,7 @@ def test_restitution_with_too_few_points_says_so() -> None:
 # --------------------------------------------------------------------------------------------- together
 
 
-@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
 @pytest.mark.parametrize(("alphas", "nus"), [(2, 2), pytest.param(5, 6, marks=pytest.mark.slow), (10, 12)])
 def test_nothing_overlaps_on_the_page(page, draw, alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
@@ -372,7 +403,7 @@ def test_laws_do_not_overlap_on_the_page(page, alphas: tuple[float, ...]) -> Non
     assert_nothing_overlaps(friction_figure(data))
 
 
-@pytest.mark.parametrize("draw", [theory_errors, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
 def test_map_without_any_value_is_drawn(draw, page) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
@@ -381,7 +412,7 @@ def test_map_without_any_value_is_drawn(draw, page) -> None:
     assert all("no measured values" in [text.get_text() for text in axes.texts] for axes in figure.axes)
 
 
-@pytest.mark.parametrize("draw", [theory_errors, cluster_shares, friction_figure])
+@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares, friction_figure])
 def test_shortest_time_step_is_drawn(draw) -> None:
     data = dense_dataset() if draw is friction_figure else theory_dataset()
     several = with_timesteps(data, 3e-4, 1e-2)
@@ -397,13 +428,14 @@ def test_shortest_time_step_is_drawn(draw) -> None:
 @pytest.mark.parametrize(
     ("data", "names"),
     [
-        (theory_dataset(3, 3), ["curves", "contours", "theory", "clusters"]),
+        (theory_dataset(3, 3), ["curves", "contours", "theory", "losses", "clusters"]),
         (theory_dataset(1, 3), ["curves", "clusters"]),
-        (theory_dataset(3, 3).drop_vars("theory_pressure"), ["curves", "contours", "clusters"]),
+        (theory_dataset(3, 3).drop_vars("theory_pressure"), ["curves", "contours", "losses", "clusters"]),
+        (theory_dataset(3, 3).drop_vars("theory_loss_pressure_pairs"), ["curves", "contours", "theory", "clusters"]),
         (dense_dataset(), ["curves", "contours", "rheology"]),
         (dense_dataset(nus=3, alphas=(0.5,)), ["curves"]),
     ],
-    ids=["all", "line", "no theory", "dense", "few"],
+    ids=["all", "line", "no theory", "no losses", "dense", "few"],
 )
 def test_figures_are_written_where_the_map_has_their_data(
     data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -33,7 +33,8 @@ PANELS = {
 """Factors of the map and the titles of their panels."""
 
 _NOTE = (
-    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d). Enskog: isotropic Gaussian velocities at the measured T.\n"
+    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d).\n"
+    "Enskog: independent isotropic Gaussian velocities at the measured temperature.\n"
     "Black contours: measured over assumed, as a quotient less one (dashed where negative) or a factor"
 )
 
@@ -61,7 +62,7 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
     require_map(data, *RATIO, *_names(stress))
     require_plane(data)
     data = finest(ordered(data, *_names(stress)))
-    figure = empty_figure(width=6.2, height=6.4)
+    figure = empty_figure(width=7.4, height=6.8)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
     measured = np.isfinite(data[f"theory_loss_{stress}_pairs"].values)
     panels, noisy, over = [], False, {}

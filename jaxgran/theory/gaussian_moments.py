@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.theory.mixture import ANGLES, Mixture, half_range_moments, mixture_of, uniform_mixture
