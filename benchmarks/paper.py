@@ -3,7 +3,7 @@
 The same as ``jaxgran map --preset paper``: contours and curves of the ratio, errors of kinetic theory, the share of
 clusters, and the dataset with all numbers.
 
-    python -m benchmarks paper            # 9 minutes on two cores
+    python -m benchmarks paper            # half an hour on two cores
     python -m benchmarks paper --quick    # a plane of 3 × 3 points, 64 grains, dt = 5e-4
 """
 
@@ -20,7 +20,7 @@ QUICK |= {"grains": 64, "seeds": 1, "timestep": 5e-4, "equilibrate": 1.0, "strai
 
 def run(output: Output) -> None:
     """Map, and write the dataset and all figures that a map has."""
-    data = jg.ratio_map(**QUICK if output.quick else PRESETS["paper"], workers=usable_cores())
+    data = jg.ratio_map(**QUICK if output.quick else PRESETS["paper"], snapshots=True, workers=usable_cores())
     data = data.assign_attrs(command="python -m benchmarks paper", commit=output.hardware["commit"])
     write_dataset(data, output.path("paper", ".nc"))
     save_figures(data, output.path("paper", ""))
