@@ -1,4 +1,4 @@
-"""The map of the paper: the force ratio over the plane of restitution and packing fraction, N = 400, dt = 1e-5.
+"""The map of the paper: the force ratio over the plane of restitution and packing fraction, N = 1000, dt = 1e-5.
 
 The same as ``jaxgran map --preset paper``: contours and curves of the ratio, errors of kinetic theory, the share of
 clusters, and the dataset with all numbers.
