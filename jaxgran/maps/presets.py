@@ -14,7 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "restitution": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98),
         "packing_fraction": (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7, 0.75, 0.8, 0.82),
         "grains": 1000,
-        "seeds": 2,
+        "seeds": 1,
         "timestep": 1e-5,
     },
     "dense": {
