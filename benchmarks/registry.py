@@ -208,7 +208,7 @@ BENCHMARKS = (
     Benchmark(
         "coverage",
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
-        (20, 0.5),
+        (6, 0.5),
         ("coverage.json", "coverage.png"),
         one_core=True,
     ),
