@@ -177,7 +177,6 @@ def _influences(
     merges = [1] if seeds * fewer > 1 else []
     flat, named = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), merged)))
     without = flat[1:].astype(float) if merges else np.full(flat.shape, np.nan)
-    without = without - without[0]  # so that equal blocks have no influence at all, not that of rounding
     influence = (seeds * fewer - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
     influence = influence / np.where(scale > 0, scale, 1)
