@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 import jaxgran as jg
 from benchmarks.output import Output
@@ -151,6 +152,15 @@ def draw(plan: Plan, rows: list[dict]) -> Figure:
         panels[0].set_ylabel(TITLES[factor])
     grid[-1, 0].set_xlabel(rf"time step $\dot\gamma\,\mathrm{{d}}t$, at $N$ = {plan.size_of_timesteps}")
     grid[-1, 1].set_xlabel(rf"number of grains $N$, at $\dot\gamma\,\mathrm{{d}}t$ = {START:g}")
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize="small")
-    figure.suptitle("Contact pressure: measured over assumed (rings: status not ok)", fontsize="medium")
+    handles, _ = grid[0, 0].get_legend_handles_labels()
+    ring = Line2D([], [], marker="o", markersize=9, fillstyle="none", color="0.3", linestyle="none")
+    figure.legend(
+        [*handles, ring],
+        [*(handle.get_label() for handle in handles), "status not ok"],
+        title="contact pressure: measured over assumed",
+        loc="outside upper center",
+        ncols=3,
+        fontsize="small",
+        frameon=False,
+    )
     return figure
