@@ -87,14 +87,14 @@ def _losses(flow: ShearFlow, area: np.ndarray, tally: Tally) -> dict[str, np.nda
     return losses
 
 
-def _parts(stress: np.ndarray) -> dict[str, np.ndarray]:
+def _parts(stress: Array | np.ndarray) -> dict[str, np.ndarray]:
     """Pressure and shear stress of tensors (..., 2, 2)."""
     return {"pressure": np.trace(stress, axis1=-2, axis2=-1) / 2, "shear_stress": -stress[..., 0, 1]}
 
 
-def _transfer(flow: ShearFlow, tensors: np.ndarray) -> list[dict[str, np.ndarray]]:
+def _transfer(flow: ShearFlow, tensors: Array | np.ndarray) -> list[dict[str, np.ndarray]]:
     """Pressure and shear stress of ``momentum_transfer``, and the same times the speed, at tensors (rows, 2, 2)."""
-    count = len(tensors)
+    tensors, count = np.asarray(tensors), len(tensors)
     numbers = [np.asarray(x) for x in (flow.restitution, flow.packing_fraction, flow.shear_rate, flow.polydispersity)]
     filled = tensors[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(-1, _TOGETHER, 2, 2)
     found = [_momentum_transfer(jnp.asarray(part, float), *map(jnp.asarray, numbers)) for part in filled]
