@@ -26,7 +26,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.plotting.drawing import curve_styles
-from jaxgran.sampling.losses import FACTORS, STRESSES, theory_losses
+from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
 from jaxgran.sampling.sample import estimates
 
 START = 1e-3  # time step of the steady state, and of all numbers of grains
@@ -105,7 +105,7 @@ def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[floa
 
 def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     """The factors of one flow with their standard errors, and what else is known of it."""
-    value, error = (found | more for found, more in zip(theory_losses(flow, seeds), estimates(seeds), strict=True))
+    value, error = (found | more for found, more in zip(stress_losses(flow, seeds), estimates(seeds), strict=True))
     warm = value["local_granular_temperature"] / value["granular_temperature"]
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
     numbers |= {name: [value[name], error[name]] for name in (f"{s}_{f}" for s in STRESSES for f in FACTORS)}

@@ -15,7 +15,7 @@ from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
-from jaxgran.sampling.losses import FACTORS, STRESSES, theory_losses
+from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
@@ -93,7 +93,7 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
 
 def test_losses_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
-    value, error = theory_losses(settings.flows()[0], samples)
+    value, error = stress_losses(settings.flows()[0], samples)
     here = data.sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
     for stress in STRESSES:
         for stored, name in [(f"enskog_{stress}", f"enskog_{stress}")] + [

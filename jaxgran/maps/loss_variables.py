@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxgran.maps.settings import MapSettings
-from jaxgran.sampling.losses import FACTORS, STRESSES, theory_losses
+from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
 from jaxgran.sampling.observables import STRESS_UNIT
 from jaxgran.sampling.sample import Sample
 
@@ -32,7 +32,7 @@ def loss_variables(
     flows, shape = settings.flows(), tuple(map(len, settings.axes.values()))
     values, errors = ({name: np.full(len(flows), np.nan) for name in attrs} for _ in range(2))
     for point, seeds in samples.items():
-        value, error = theory_losses(flows[point], seeds)
+        value, error = stress_losses(flows[point], seeds)
         for name in attrs:
             values[name][point], errors[name][point] = value[name], error[name]
     variables = {}

@@ -48,7 +48,7 @@ FACTORS = {  # what is measured, and what is assumed in its place
 _TOGETHER = 256  # tensors of one call: one compiled program serves samples of any number of blocks
 
 
-def theory_losses(flow: ShearFlow, seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
+def stress_losses(flow: ShearFlow, seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """The four factors of pressure and shear stress, and Enskog's stress, with ``standard_errors``.
 
     Args:
@@ -87,12 +87,12 @@ def _losses(flow: ShearFlow, area: np.ndarray, tally: Tally) -> dict[str, np.nda
     return losses
 
 
-def _parts(stress: Array | np.ndarray) -> dict[str, np.ndarray]:
+def _parts(stress: Array | np.ndarray) -> dict[str, Any]:
     """Pressure and shear stress of tensors (..., 2, 2)."""
     return {"pressure": np.trace(stress, axis1=-2, axis2=-1) / 2, "shear_stress": -stress[..., 0, 1]}
 
 
-def _transfer(flow: ShearFlow, tensors: Array | np.ndarray) -> list[dict[str, np.ndarray]]:
+def _transfer(flow: ShearFlow, tensors: Array | np.ndarray) -> list[dict[str, Any]]:
     """Pressure and shear stress of ``momentum_transfer``, and the same times the speed, at tensors (rows, 2, 2)."""
     tensors, count = np.asarray(tensors), len(tensors)
     numbers = [np.asarray(x) for x in (flow.restitution, flow.packing_fraction, flow.shear_rate, flow.polydispersity)]
