@@ -18,6 +18,7 @@ from synthetic import random_replica
 
 from jaxgran.cli import app, fit, info, measure, run
 from jaxgran.cli import map as map_module
+from jaxgran.maps import results
 from jaxgran.model.status import Status
 
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
@@ -72,6 +73,15 @@ def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseExce
             raise end
 
     return replicas
+
+
+def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
+    """Files of maps have the ratios and what is named: to write and read all variables takes a second or two."""
+    whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
+    kept = {f"{name}{end}" for name in names for end in ("", "_stderr")} | {"status"}
+    patch.setattr(
+        results, "write_dataset", lambda data, path: whole(data[[name for name in data if name in kept]], path)
+    )
 
 
 def files(folder: Path) -> set[str]:

@@ -11,14 +11,12 @@ from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
 
-from jaxgran.cli import terminal
 from jaxgran.maps import journal, sweep
 
 PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
 journal.SECONDS = 0.1  # so that its batches have journals
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
 sys.modules["jaxgran.plotting.map_figures"] = figures
-terminal._compilation_cache = lambda: os.environ["COMPILED"]  # with what the tests have compiled
 advance_batch = sweep.advance_batch
 FAULT = os.environ.get("FAULT", "")
 

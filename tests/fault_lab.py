@@ -1,7 +1,7 @@
 """A folder in which maps run as processes of the real command line, and things are done to them.
 
-The map that nothing happened to, and what is left to do of the others, run in this process, which compiles once. The
-processes find its compiled programs in its cache.
+The map that nothing happened to, and what is left to do of the others, run in this process. The other processes have
+the cache of the command line, in the folder of the tests: the first of them compiles for all.
 """
 
 import os
@@ -11,7 +11,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-import jax
 import pytest
 import xarray as xr
 from command_line import Outcome, jaxgran
@@ -47,7 +46,7 @@ class Lab:
     def start(self, output: str, *words: str, fault: str = "", workers: int = 1) -> subprocess.Popen:
         """Start a map in a process of its own, as leader of a group of processes."""
         command = [sys.executable, str(DRIVER), *MAP, "--workers", str(workers), "--output", output, *words]
-        environment = os.environ | {"FAULT": fault, "COMPILED": jax.config.values["jax_compilation_cache_dir"]}
+        environment = os.environ | {"FAULT": fault}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
         return subprocess.Popen(command, cwd=self.folder, env=environment, **streams)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas
+from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import ratio_dataset, with_grains, with_timesteps
@@ -31,7 +31,7 @@ from jaxgran.maps import settings as map_settings
 from jaxgran.maps import sweep
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
-from jaxgran.plotting import map_figures
+from jaxgran.plotting import map_figures, theory
 from jaxgran.sampling import free_cooling, sample, steady_state, timestep
 
 GRAINS = 32
@@ -588,6 +588,7 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    write_few_variables(monkeypatch, *theory._SHARES)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
     for drawing in ("ratio_curves", "cluster_shares"):
         monkeypatch.setattr(map_figures, drawing, lambda _: Figure())

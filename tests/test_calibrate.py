@@ -1,5 +1,6 @@
 """The restitution of a made-up observation is found again, with an error that is true to its name."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
+from jaxgran.dynamics import plain
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.inference.restitution import fit_restitution
 from jaxgran.model.checks import InputError
@@ -20,6 +22,14 @@ GRAINS, FRAMES, STRAIN, NOISE = 64, 100, 0.5, 0.01
 TIMES = STRAIN * np.arange(1, FRAMES + 1) / FRAMES
 
 compiled_pack = jax.jit(pack)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_buffer() -> Iterator[None]:
+    """One size of the contact buffer: each is compiled with its derivatives, which takes longer than all fits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plain, "_FEW_BUFFERS", 1)
+        yield
 
 
 @cache

@@ -128,7 +128,6 @@ def test_a_batch_is_the_same_as_its_flows_one_by_one() -> None:
     expected = jax.tree.map(lambda *x: np.stack(x), *one_by_one)
     for batch in (
         predict(closure, alpha, nu),
-        jax.jit(predict)(closure, jnp.asarray(alpha), jnp.asarray(nu)),
         jax.vmap(predict, (None, 0, 0))(closure, jnp.asarray(alpha), jnp.asarray(nu)),
     ):
         for name, value in vars(batch).items():

@@ -148,7 +148,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
 def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     """A ladder of buffers that ends too early drops contacts, and says so."""
     state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
-    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (1, 2))
+    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (2,))
     _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 
@@ -187,7 +187,15 @@ ways = pytest.mark.parametrize("way", ["vmap", pytest.param("map", marks=pytest.
 
 
 @pytest.fixture(scope="module")
-def traced_batch(replicas):
+def few_buffers():
+    """Two sizes of the contact buffer besides the closed form of a pair: each is compiled, which takes long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collision, "contact_capacities", lambda grains: (1, grains // 4, 3 * grains))
+        yield
+
+
+@pytest.fixture(scope="module")
+def traced_batch(replicas, few_buffers):
     batch = jax.vmap(advance, in_axes=(0, 0, None), axis_name="replica")
     return jax.jit(batch).trace(*replicas, jnp.int32(0))
 

@@ -105,14 +105,13 @@ def test_record_is_at_the_times_in_whole_steps_and_starts_at_the_start(gases) ->
     np.testing.assert_allclose(record.collisions, 2 * np.cumsum(record.tally.collisions) / GRAINS)
 
 
-def test_transformations_apply(gases) -> None:
-    states = jax.tree.map(lambda *x: jnp.stack(x), *gases[:2])
-    for made in (
-        jax.eval_shape(jax.vmap(partial(cooling, FLOW, times=TIMES), axis_name="replica"), states),
-        jax.eval_shape(lambda states: jax.lax.map(lambda one: cooling(FLOW, one, TIMES), states), states),
-    ):
-        assert made[0].positions.shape == (2, GRAINS, 2)
-        assert made[1].temperature.shape == made[1].collisions.shape == (2, len(TIMES))
+@pytest.mark.parametrize("way", ["map", pytest.param("vmap", marks=pytest.mark.slow)])
+def test_transformations_apply(gases, way: str) -> None:
+    one = partial(cooling, FLOW, times=TIMES)
+    all_of_them = jax.vmap(one, axis_name="replica") if way == "vmap" else partial(jax.lax.map, one)
+    made = jax.eval_shape(all_of_them, jax.tree.map(lambda *x: jnp.stack(x), *gases[:2]))
+    assert made[0].positions.shape == (2, GRAINS, 2)
+    assert made[1].temperature.shape == made[1].collisions.shape == (2, len(TIMES))
 
 
 def test_a_change_of_numbers_compiles_nothing_anew(gases, cooled) -> None:

@@ -156,9 +156,9 @@ def parameters(flow: ShearFlow, state: State) -> dict:
 
 
 def differentiable(*arguments):
-    """The advance with two sizes of the contact buffer in place of five: each is compiled with its derivatives."""
+    """The advance with one size of the contact buffer in place of five: each is compiled with its derivatives."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collision_module, "contact_capacities", lambda grains: (grains // 2, 3 * grains))
+        patch.setattr(collision_module, "contact_capacities", lambda grains: (3 * grains,))
         return advance(*arguments)
 
 

@@ -1,14 +1,19 @@
 """Velocity scales: which part of the granular temperature is local, and which stands in the longest waves."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.dynamics.velocity_scales import local_temperature, wave_temperature
+from jaxgran.dynamics import velocity_scales
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
 COUNT, SIDE = 900, 30.0
+
+local_temperature, wave_temperature = map(
+    jax.jit, (velocity_scales.local_temperature, velocity_scales.wave_temperature)
+)
 
 
 def state_of(velocities, positions=None, tilt=0.3, masses=None) -> State:

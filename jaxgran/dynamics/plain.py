@@ -128,7 +128,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         least = now.solved.astype(jnp.int32)
         jump = steps_to_contact(pairs, lists.near.reach, flow, least)
         jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, jnp.divide(LONGEST_FLIGHT, shear_rate)) / dt))
-        jump = jump if free_flight else jnp.zeros_like(jump)
+        jump = jnp.where(free_flight, jump, 0)
         remaining = steps - now.step
         jump = jnp.clip(jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining)
         flight = jump.astype(slack.dtype) * dt

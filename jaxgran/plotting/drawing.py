@@ -34,6 +34,7 @@ ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
+_FILE_DPI = 200
 _MARKERS = "os^DvP<X>ph*"
 _LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
 _RING: dict[str, Any] = {
@@ -282,8 +283,10 @@ def writable_stem(stem: Path | str) -> Path:
 def write(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG under a temporary name in the same folder, then rename it."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    figure.set_dpi(_FILE_DPI)
+    fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
     try:
-        figure.savefig(temporary, format="png", dpi=200)
+        figure.savefig(temporary, format="png", dpi=_FILE_DPI)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import xarray as xr
+from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, require_map
 from jaxgran.model.checks import InputError
@@ -15,6 +18,7 @@ from jaxgran.plotting.losses import has_losses, theory_losses
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
+from jaxgran.plotting.two_processes import do_all
 
 
 def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
@@ -60,4 +64,9 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     for path in drawn:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    return [write(draw(data), path) for path, draw in drawn.items()]
+    do_all([partial(_draw, draw, data, path) for path, draw in drawn.items()])
+    return list(drawn)
+
+
+def _draw(draw: Callable[[xr.Dataset], Figure], data: xr.Dataset, path: Path) -> None:
+    write(draw(data), path)
