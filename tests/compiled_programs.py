@@ -79,6 +79,7 @@ def set_up() -> None:
     if "XLA_FLAGS" not in os.environ:
         os.environ["XLA_FLAGS"] = quick_flags()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, and why
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes of xdist, which start later: each has a core
 
 
 def configure_jax() -> None:

@@ -581,6 +581,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
         return path
 
     leave_out_layout(monkeypatch)
+    write_few_variables(monkeypatch)
     monkeypatch.setattr(sweep, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
     monkeypatch.setattr("jaxgran.maps.settings._temperature", lambda flows: np.full(np.shape(flows.restitution), 0.1))

@@ -270,11 +270,11 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
         assert np.sum(tally.residual_counts) == tally.solves
 
 
-def test_single_precision_is_double_precision_to_its_rounding(flowing) -> None:
+def test_single_precision_is_double_precision_to_its_rounding(flowing, engines) -> None:
     flow, state = of(0.7, tolerance=1e-6), flowing(0.7)
-    run = jax.jit(partial(kernel.advance, interpret=True))
+    run = engines["thread_block"]
     (after, tally), (expected, sums) = (
-        run(flow, jax.tree.map(lambda x, d=d: x.astype(d), state), jnp.int32(100)) for d in (jnp.float32, jnp.float64)
+        run(flow, jax.tree.map(lambda x, d=d: x.astype(d), state), 100) for d in (jnp.float32, jnp.float64)
     )
     assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)

@@ -7,6 +7,7 @@ import pytest
 from compiled_programs import exact_order
 from synthetic import one_sentence
 
+from jaxgran.dynamics import collision
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
@@ -33,9 +34,11 @@ def observe(seen: Snapshot) -> dict:
 
 
 def sampled(state, **options):
-    """A sample whose sums are in the same order whatever else is compiled."""
-    measure = jax.jit(lambda flow, state: sample(flow, state, STRAIN, **options))
-    return measure.lower(FLOW, state).compile(exact_order())(FLOW, state)
+    """A sample whose sums are in the same order whatever else is compiled, with two sizes of the contact buffer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collision, "contact_capacities", lambda grains: (1, 3 * grains))
+        measure = jax.jit(lambda flow, state: sample(flow, state, STRAIN, **options)).lower(FLOW, state)
+    return measure.compile(exact_order())(FLOW, state)
 
 
 @pytest.fixture(scope="module")

@@ -56,7 +56,7 @@ def test_delassus_product_equals_the_dense_matrix(network_of):
 
 
 @pytest.mark.parametrize("method", PRECISE)
-@settings(max_examples=40, derandomize=True, deadline=None)
+@settings(max_examples=20, derandomize=True, deadline=None)
 @given(networks, st.sampled_from([1.0, 4.0, 100.0]))
 def test_velocities_equal_the_exact_solution(solved, method, network_of, heaviest):
     network, masses, velocities = random_network(*network_of, heaviest)
