@@ -24,7 +24,7 @@ compiled_bound = jax.jit(spectral_bound, static_argnums=1)
 
 @pytest.fixture(scope="module")
 def networks():
-    """The quick collection, without the second of the flows, and from flows that are sheared less and compiled sooner."""
+    """The quick collection without one of the flows; the others are sheared less, and compiled sooner."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "FLOWS", (module.FLOWS[0], *module.FLOWS[2:]))
         sheared = module.sheared

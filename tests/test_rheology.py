@@ -23,9 +23,9 @@ def test_law_without_noise_is_found() -> None:
     np.testing.assert_allclose(law.friction(number), power(number, FRICTION), rtol=1e-5)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.9, -0.9])
+@pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9, -0.9])
 def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(correlation: float) -> None:
-    seeds = 120
+    seeds = 60
     pulls, squares = [], []
     for seed in range(seeds):
         law = fit(dense_map(seed, alphas=(0.2, 0.5, 0.8), correlation=correlation))
