@@ -21,7 +21,10 @@ first, fails = os.getpid(), sys.argv[1]
 
 def task(number):
     if fails == "both" or fails == "copy" and os.getpid() != first:
+        Path("failed").touch()
         raise OSError(28, "No space left on device")
+    while fails == "copy" and not Path("failed").exists():
+        time.sleep(0.01)  # until the copy has failed
     with open(f"task{number}", "a") as file:
         file.write(f"{os.getpid()} ")
     while fails == "none" and len({path.read_text() for path in Path().glob("task*")} - {""}) < 2:
