@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from jaxgran.plotting import drawing, ratio, theory
+from jaxgran.plotting import drawing, losses, ratio, theory
 
 
 def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
     """Figures keep their parts where Matplotlib puts them first: the layout takes longer than all that is drawn."""
-    for module in (drawing, ratio, theory):
+    for module in (drawing, losses, ratio, theory):
         patch.setattr(module, "fix_layout", lambda figure: figure.set_layout_engine("none"))
 
 

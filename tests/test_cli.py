@@ -322,7 +322,7 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
 def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is compared; of the others, which take longer, that there is a file."""
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "cluster_shares", "dominating_errors"):
+    for draw in ("ratio_contours", "theory_errors", "theory_losses", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, lambda _: Figure())
     outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
     assert (outcome.status, outcome.out) == (0, "")
