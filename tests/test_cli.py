@@ -57,7 +57,7 @@ SMALL_MAP = (
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
 SAME += ("solver", "engine", "solver_asked", "engine_asked")
-PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "clusters", "errors")}
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "losses", "clusters", "errors")}
 FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "64", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
