@@ -12,7 +12,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks() -> None:
-    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05"]
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05", "06"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -30,5 +30,5 @@ def test_a_notebook_has_no_outputs_begins_with_a_question_and_ends_with_a_figure
     title = cells[0].source.splitlines()[0]
     assert title.startswith("# ") and title.endswith("?")
     last = cells[-1].source.splitlines()[-1]
-    figures = ("plt.show()", "jg.flow_figure(", "jg.ratio_contours(", "jg.theory_errors(")
+    figures = ("plt.show()", "jg.flow_figure(", "jg.ratio_contours(", "jg.theory_errors(", "jg.theory_losses(")
     assert last.startswith(figures)
