@@ -5,7 +5,7 @@ grains 1.4 times as large as the other half. Each is fitted by μ(I) = μ₀ + a
 1/√p, the pressure diverges as p ∼ (ν_c − ν)^−β with β = 2/c. The fits are repeated without the loosest flows: where the
 parameters still move, the flows are not close enough to the limit for the power laws alone.
 
-    python -m benchmarks dense_rheology            # about 40 minutes on two cores
+    python -m benchmarks dense_rheology            # about 20 minutes on two cores
     python -m benchmarks dense_rheology --quick    # 64 grains, a short strain, three minutes
 """
 

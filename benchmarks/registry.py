@@ -73,7 +73,7 @@ BENCHMARKS = (
     Benchmark(
         "dense_rheology",
         "Do dense flows obey one friction law of the inertial number, and with which exponents?",
-        (40, 3),
+        (20, 3),
         ("dense_rheology.json", "dense_rheology_uniform.png", "dense_rheology_bidisperse.png"),
     ),
     Benchmark(

@@ -19,9 +19,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "dense": {
         "restitution": (0.2, 0.5),
-        "packing_fraction": (0.79, 0.795, 0.8, 0.805, 0.81, 0.815, 0.82, 0.825, 0.83),
+        "packing_fraction": (0.79, 0.8, 0.805, 0.81, 0.815, 0.82, 0.825, 0.83),
         "grains": 1000,
-        "seeds": 2,
+        "seeds": 1,
         "timestep": 1e-4,
         "strain": 16.0,
     },
