@@ -68,10 +68,14 @@ def memory() -> str:
 
 
 def devices() -> list[str]:
-    """Platform and kind of each JAX device; RuntimeError if a driver does not answer."""
+    """Platform and kind of each JAX device; RuntimeError if there is none, or if a driver does not answer."""
     import jax
 
-    return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    try:
+        return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    except (RuntimeError, AssertionError) as failure:  # JAX asserts that a platform it was asked for is there
+        why = " ".join(str(failure).split()).partition(" (set JAX_PLATFORMS")[0].rstrip(".")
+        raise RuntimeError(why or f"none is there for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}") from failure
 
 
 def precision() -> str:

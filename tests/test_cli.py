@@ -394,7 +394,7 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
 def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     outcome = in_a_process(tmp_path, "info")
     assert (outcome.status, outcome.err) == (0, "")
-    lines = dict(line.split(maxsplit=1) for line in outcome.out.splitlines() if "compilation" not in line)
+    lines = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in outcome.out.splitlines() if "  " in line)
     assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
     assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
     assert lines["precision"] == "float64"
@@ -402,7 +402,21 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert lines["jaxgran"].startswith(version("jaxgran"))
     assert float(lines["memory"].removesuffix(" GiB")) > 0.1
     assert str(usable_cores()) in lines["cores"]
-    assert "jaxgran" in outcome.out.splitlines()[-1]  # the folder of the compilation cache
+    for name in ("cache folder", "compiled programs", "machine code", "figures"):
+        folder, _, state = lines[name].partition(", ")
+        assert Path(folder).is_dir() and state == "works", name
+
+
+@pytest.mark.parametrize(("command", "platform"), [("info", "cuda"), ("map", "cuda"), ("fit text.gsd", "banana")])
+def test_a_platform_that_is_not_there_is_one_sentence(command: str, platform: str, folder: Path, monkeypatch) -> None:
+    monkeypatch.setenv("JAX_PLATFORMS", platform)
+    outcome = in_a_process(folder, *command.split())
+    if command == "info":
+        assert (outcome.status, outcome.err) == (0, "")
+        assert platform in next(line for line in outcome.out.splitlines() if line.startswith("devices"))
+    else:
+        assert_one_sentence(outcome)
+        assert platform in outcome.err
 
 
 def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_not_answer(
@@ -415,7 +429,7 @@ def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_n
     monkeypatch.setenv("JAX_PLATFORMS", "cpu,made-up")
     outcome = jaxgran(tmp_path, "info")
     assert outcome.status == 0
-    assert "none: Unable to initialize backend 'cuda': no driver.\n" in outcome.out
+    assert "none: Unable to initialize backend 'cuda': no driver\n" in outcome.out
     assert re.search(r"^engine +none$", outcome.out, re.MULTILINE)
     assert "JAX_PLATFORMS=cpu,made-up" in outcome.out
     checkout = (Path(app.__file__).resolve().parents[2] / ".git").exists()

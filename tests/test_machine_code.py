@@ -29,8 +29,7 @@ print(jg.Status(int(tally.outcome)).name, float(tally.overlap))
 
 def outcome(package: Path, cache: Path) -> tuple[str, str]:
     """Status and overlap of one step with a copy of the package, and what it says on standard error."""
-    environment = os.environ | {"PYTHONPATH": str(package), "XDG_CACHE_HOME": str(cache), "NUMBA_OPT": "0"}
-    environment.pop("NUMBA_CACHE_DIR", None)
+    environment = os.environ | {"PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(cache), "NUMBA_OPT": "0"}
     ran = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, cwd=package)
     assert ran.returncode == 0, ran.stderr
     return ran.stdout, ran.stderr

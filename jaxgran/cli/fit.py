@@ -8,7 +8,7 @@ import typer
 from rich import box
 from rich.table import Table
 
-from jaxgran.cli.terminal import BAD_STATUS, configured_jax, print_table, stop, with_error
+from jaxgran.cli.terminal import BAD_STATUS, configured_jax, print_table, require_device, stop, with_error
 from jaxgran.model.checks import InputError, require_number, shown
 
 _LARGEST_CHI_SQUARED = 9.0  # above it, no restitution of the map has these stresses
@@ -52,6 +52,7 @@ def fit_command(
 
 
 def _fit_trajectory(file: Path, timestep: float | None) -> None:
+    require_device()
     from jaxgran.inference.restitution import fit_restitution
     from jaxgran.io.trajectory import read_trajectory
 
@@ -76,6 +77,7 @@ def _fit_trajectory(file: Path, timestep: float | None) -> None:
 
 
 def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:
+    require_device()
     from jaxgran.inference.closure_fit import fit_closure
     from jaxgran.inference.cross_validation import leave_one_out
     from jaxgran.inference.stress_inversion import restitution_from_stresses

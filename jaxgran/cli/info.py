@@ -1,10 +1,12 @@
-"""The command ``info``: versions and hardware for a bug report."""
+"""The command ``info``: versions, hardware and caches for a bug report."""
 
 import os
 import platform
 import shutil
+from pathlib import Path
 
 from jaxgran import environment
+from jaxgran.caches import obstacle, users_folder
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
@@ -23,12 +25,11 @@ def info_command() -> None:
         "processor": environment.processor(),
         "cores": f"{os.cpu_count()}, of which this process may use {environment.usable_cores()}",
         "memory": environment.memory(),
-        "devices": _devices(),
-        **_engine(),
+        **_devices(),
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
         "settings": ", ".join(f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)) or "none",
-        "compilation cache": jax.config.values["jax_compilation_cache_dir"],
+        **_caches(jax.config.values["jax_compilation_cache_dir"]),
     }
     for name, value in lines.items():
         print(f"{name:18s} {value}")
@@ -39,20 +40,36 @@ def _commit() -> str:
     return f", commit {found}" if found else ""
 
 
-def _devices() -> str:
+def _devices() -> dict[str, str]:
+    """The devices, and the engine and solver that "auto" takes there."""
     try:
-        return ", ".join(environment.devices())
-    except RuntimeError as failure:  # the report is needed most if a driver does not answer
-        return f"none: {' '.join(str(failure).split())}"
-
-
-def _engine() -> dict[str, str]:
+        found = environment.devices()
+    except RuntimeError as failure:  # the report is needed most if there is none
+        return {"devices": f"none: {failure}", "engine": "none", "solver": "none"}
     from jaxgran.dynamics.engine import select_engine, solver_in_use
     from jaxgran.model.flow import ShearFlow
 
     flow = ShearFlow(grains=256, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
-    try:
-        engine = select_engine(flow)
-    except RuntimeError:  # there is no device
-        return {"engine": "none", "solver": "none"}
-    return {"engine": f"auto takes {engine}", "solver": solver_in_use(engine, flow.solver)}
+    engine = select_engine(flow)
+    solver = solver_in_use(engine, flow.solver)
+    return {"devices": ", ".join(found), "engine": f"auto takes {engine}", "solver": solver}
+
+
+def _caches(programs: str | None) -> dict[str, str]:
+    """The folders of caches, and whether files can be written there."""
+    import matplotlib
+
+    from jaxgran.dynamics.machine_code.ffi import object_file
+
+    folders = {
+        "cache folder": users_folder(),
+        "compiled programs": None if programs is None else Path(programs),
+        "machine code": object_file().parent,
+        "figures": Path(matplotlib.get_cachedir()),
+    }
+    return {name: "none" if folder is None else f"{folder}, {_state(folder)}" for name, folder in folders.items()}
+
+
+def _state(folder: Path) -> str:
+    why = obstacle(folder)
+    return f"cannot be written ({why})" if why else "works"

@@ -19,7 +19,7 @@ from jaxgran.cli.arguments import (
     whole_numbers,
 )
 from jaxgran.cli.measure import finish, measured, print_budget
-from jaxgran.cli.terminal import configured_jax, print_table, say, say_written, with_error
+from jaxgran.cli.terminal import configured_jax, print_table, require_device, say, say_written, with_error
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.choices import Activation, Engine, Solver
@@ -146,6 +146,7 @@ def plot_command(
 def _like(file: Path) -> dict[str, Any]:
     """The parameters of the map in a file; other differences that could change its numbers go to standard error."""
     configured_jax()
+    require_device()
     from jaxgran.maps.results import choices_of, differences, read_dataset
 
     data = read_dataset(file)

@@ -23,6 +23,7 @@ from jaxgran.cli.terminal import (
     configured_jax,
     is_interruption,
     print_table,
+    require_device,
     say,
     say_written,
     stop,
@@ -59,6 +60,7 @@ def measured(
     ``record`` and the other arguments see ``replicas``. Modules named in ``load`` are imported while the flows run.
     """
     jax = configured_jax()
+    require_device()
     from jaxgran.maps.checkpoint import Checkpoint
     from jaxgran.maps.output import check_output
     from jaxgran.maps.settings import MapSettings, automatic

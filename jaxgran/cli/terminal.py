@@ -11,16 +11,19 @@ exit status  meaning
 ===========  ========================================================
 """
 
+import os
 import sys
+import warnings
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
-import platformdirs
 from rich.console import Console
 from rich.table import Table
 
-from jaxgran.environment import processor_kind
+from jaxgran.caches import cache_folder, obstacle, users_folder
+from jaxgran.environment import devices, processor_kind
 
 NO_FILE = 1
 INPUT_MISTAKE = 2
@@ -29,7 +32,7 @@ INTERRUPTED = 130
 
 
 def configured_jax():
-    """JAX in double precision, with a cache of compiled programs in the user's cache folder."""
+    """JAX in double precision, with a cache of compiled programs."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -38,9 +41,33 @@ def configured_jax():
     return jax
 
 
-def _compilation_cache() -> str:
-    """Folder of compiled programs, one for each kind of processor: several machines may share a home folder."""
-    return str(Path(platformdirs.user_cache_dir("jaxgran")) / processor_kind())
+def require_device() -> None:
+    """End the command with one sentence unless JAX has a device."""
+    try:
+        devices()
+    except RuntimeError as failure:
+        stop(f"JAX finds no device: {failure}. JAX_PLATFORMS=cpu takes the processor.")
+
+
+@cache
+def _compilation_cache() -> str | None:
+    """Folder of compiled programs, one for each kind of processor: several machines may share a home folder.
+
+    If it is not the user's cache folder, a sentence says so once. The caches of figures then go to the same place.
+    """
+    folder = cache_folder()
+    if folder != users_folder():
+        instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
+        say(
+            f"the cache folder {str(users_folder())!r} cannot be written ({obstacle(users_folder())}), so {instead}; "
+            "XDG_CACHE_HOME may name another."
+        )
+        warnings.filterwarnings("ignore", "the machine code is compiled anew")
+    if folder is None:
+        return None
+    if folder != users_folder():
+        os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
+    return str(folder / processor_kind())
 
 
 def say(sentence: str) -> None:

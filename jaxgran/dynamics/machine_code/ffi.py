@@ -12,13 +12,14 @@ import re
 import warnings
 from functools import cache
 from importlib.metadata import version
+from multiprocessing import parent_process
 from pathlib import Path
 from threading import Lock
 
 import jax
 from llvmlite import binding as llvm
-from platformdirs import user_cache_path
 
+from jaxgran.caches import cache_folder, users_folder
 from jaxgran.files import keep, one_at_a_time, read_kept
 
 TARGET = "jaxgran_advance"
@@ -44,12 +45,12 @@ def sources() -> list[Path]:
 
 
 def object_file() -> Path:
-    """Where the machine code is kept: in the user's cache folder, or in that of numba's environment variable."""
+    """Where the machine code is kept: in the folder of the caches, or in that of numba's environment variable."""
     words = [version("numba"), version("llvmlite"), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
     digest = hashlib.sha256("\n".join([*words, os.environ.get("NUMBA_OPT", "")]).encode())
     for path in sources():
         digest.update(path.read_bytes())
-    folder = Path(os.environ.get(_CACHE_FOLDER) or user_cache_path("jaxgran") / "machine_code")
+    folder = Path(os.environ.get(_CACHE_FOLDER) or (cache_folder() or users_folder()) / "machine_code")
     return folder / f"{digest.hexdigest()[:16]}.o"
 
 
@@ -88,6 +89,8 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     try:
         keep(path, content, _MOST_KEPT)
     except OSError as error:
+        if parent_process() is not None:  # which warns too
+            return content
         warnings.warn(
             f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
             f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "

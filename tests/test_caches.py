@@ -1,0 +1,65 @@
+"""Compiled programs are kept in the user's cache folder, in a temporary one, or nowhere: everything runs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxgran import caches
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owner")
+
+
+@pytest.fixture
+def nothing_for_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's cache folder cannot be made; the folder of temporary files is the result."""
+    (tmp_path / "file").touch()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    return tmp_path / "temporary"
+
+
+def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert caches.cache_folder() == caches.users_folder() == tmp_path / "cache" / "jaxgran"
+    assert not list(caches.users_folder().iterdir())
+
+
+def test_a_temporary_folder_that_nobody_else_can_write_takes_its_place(nothing_for_the_user: Path) -> None:
+    assert caches.obstacle(caches.users_folder()) == "Not a directory"
+    folder = caches.cache_folder()
+    assert folder is not None and folder.parent == nothing_for_the_user
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert caches.cache_folder() == folder
+
+
+def test_a_temporary_folder_of_others_is_not_used(nothing_for_the_user: Path) -> None:
+    folder = nothing_for_the_user / f"jaxgran-{os.getuid()}"
+    folder.mkdir()
+    folder.chmod(0o777)
+    assert caches.cache_folder() is None
+    folder.rmdir()
+    (nothing_for_the_user / "elsewhere").mkdir(mode=0o700)
+    folder.symlink_to("elsewhere")
+    assert caches.cache_folder() is None
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_command_says_once_where_programs_are_kept(nothing_for_the_user: Path, shared: bool) -> None:
+    folder = nothing_for_the_user / f"jaxgran-{os.getuid()}"
+    if shared:
+        folder.mkdir()
+        folder.chmod(0o777)
+    command = [sys.executable, "-c", "from jaxgran.cli.app import main; main()", "info"]
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0
+    (sentence,) = (line for line in done.stderr.splitlines() if "jaxgran" in line)
+    assert "cannot be written (Not a directory)" in sentence
+    assert ("every run compiles anew" if shared else f"are kept in '{folder}'") in sentence
+    (programs,) = (line.split()[2:] for line in done.stdout.splitlines() if line.startswith("compiled programs"))
+    assert programs == (["none"] if shared else [str(next(folder.glob("[!m]*"))) + ",", "works"])
