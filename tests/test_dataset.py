@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -248,7 +249,7 @@ def test_file_is_readable_by_others_as_the_umask_says(few, tmp_path: Path) -> No
     assert (tmp_path / "map.nc").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-@pytest.mark.parametrize("kind", ["missing", "folder", "text", "empty", "truncated", "other"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "text", "empty", "truncated", "flipped", "other"])
 def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "file.nc"
     if kind == "folder":
@@ -260,11 +261,36 @@ def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) 
     elif kind == "truncated":
         write_dataset(few, path)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    elif kind == "flipped":
+        write_dataset(few, path)
+        content = bytearray(path.read_bytes())
+        for place in (3923, 524, 18433):
+            content[place % len(content)] ^= 4
+        path.write_bytes(content)
     elif kind == "other":
         xr.Dataset({"temperature": ("x", np.arange(3.0))}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match=r"file\.nc") as caught:
         read_dataset(path)
     assert one_sentence(str(caught.value))
+
+
+def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(few, tmp_path: Path) -> None:
+    path, rng = tmp_path / "map.nc", np.random.default_rng(0)
+    few.to_netcdf(path, engine="h5netcdf")
+    assert read_dataset(path).equals(few)
+    write_dataset(few, path)
+    whole = path.read_bytes()
+    for place in rng.integers(len(whole) - 40, size=50):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
+        with pytest.raises(ValueError, match="damaged"):
+            read_dataset(path)
+
+
+def test_a_file_that_was_edited_by_others_is_read(few, tmp_path: Path) -> None:
+    write_dataset(few, tmp_path / "map.nc")
+    with h5py.File(tmp_path / "map.nc", "r+") as file:
+        file["force_ratio"][0, 0] = 7.0
+    assert read_dataset(tmp_path / "map.nc").force_ratio[0, 0] == 7.0
 
 
 @pytest.mark.parametrize(

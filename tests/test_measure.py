@@ -15,7 +15,8 @@ from synthetic import one_sentence, random_tally
 from jaxgran.dynamics.tally import EXTREMES
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State, require_match
 from jaxgran.model.status import DEEP_SHARE, Status
 from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.observables import OBSERVABLES
@@ -103,7 +104,7 @@ def test_lax_map_applies_with_a_traced_strain(batch, measured) -> None:
 
 def test_a_change_of_numbers_compiles_nothing_anew(state, measured) -> None:
     compiled = _sample._cache_size()
-    sample(replace(FLOWS[0], restitution=0.6, packing_fraction=0.61, timestep=9e-3, tolerance=1e-5), state, 0.4)
+    sample(replace(FLOWS[0], restitution=0.6, timestep=9e-3, tolerance=1e-5), state, 0.4)
     assert _sample._cache_size() == compiled
 
 
@@ -191,3 +192,21 @@ def test_float32_measures_what_float64_does_at_a_time_step_it_resolves(state) ->
         float(double.averages["kinetic_pressure"]), rel=1e-3
     )
     assert float(np.sum(single.tally.steps)) == 100
+
+
+@pytest.mark.parametrize(("name", "value"), [("packing_fraction", 0.601), ("polydispersity", 0.2)])
+def test_a_flow_that_is_not_that_of_the_state_is_refused(state, name: str, value: float) -> None:
+    right = getattr(FLOWS[0], name)
+    with pytest.raises(InputError, match=f"^{name} must be {right}, which the state has, not {value}: ") as refused:
+        sample(replace(FLOWS[0], **{name: value}), state, STRAIN)
+    assert one_sentence(str(refused.value))
+    require_match(FLOWS[0], state)
+    require_match(FLOWS[0], in_float32(state))
+    jax.eval_shape(lambda nu: require_match(replace(FLOWS[0], packing_fraction=nu), state), 0.8)  # it is traced
+
+
+def test_sizes_of_ones_own_belong_to_no_polydispersity(state) -> None:
+    for radii in (jnp.full(GRAINS, 0.5), jnp.asarray(np.repeat([0.4, 0.6], GRAINS // 2))):
+        side = jnp.sqrt(jnp.pi * jnp.sum(radii**2) / 0.6)
+        own = replace(state, grains=Grains(radii, 4 * radii**2), side=side)
+        require_match(FLOWS[0], own)

@@ -25,7 +25,7 @@ from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, require_match, require_state
 
 _MOST_POINTS = 10**6  # of a growth curve, which is held in memory
 
@@ -66,6 +66,7 @@ def growth(flow: ShearFlow, state: State, strain: float | Array, count: int, mov
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_POINTS, "as memory is limited")
     require_strain(flow, strain, count)
+    require_match(flow, state)
     return _growth(flow, state, strain, count, moving_contacts)
 
 

@@ -1,5 +1,10 @@
-"""The file of a map: it is written, read and compared."""
+"""The file of a map: it is written, read and compared.
 
+A file ends in the SHA-256 checksum of what stands before it, which other readers of NetCDF ignore. It is compared first,
+as the HDF5 library can wait forever in a damaged file. Files of other programs, and older ones, have no checksum.
+"""
+
+import hashlib
 import os
 from dataclasses import fields
 from io import BytesIO
@@ -14,6 +19,9 @@ from jaxgran.files import replaced
 from jaxgran.maps.schema import RATIO, what_lacks
 from jaxgran.model.checks import InputError, shown
 
+_MARK = b"SHA-256:"  # between the dataset and its checksum
+_DIGEST = hashlib.sha256().digest_size  # bytes
+
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
@@ -21,7 +29,7 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
     content = BytesIO()
     data.to_netcdf(content, engine="h5netcdf")
     with replaced(path) as temporary:
-        temporary.write_bytes(content.getbuffer())
+        temporary.write_bytes(content.getvalue() + _MARK + hashlib.sha256(content.getbuffer()).digest())
 
 
 def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
@@ -29,6 +37,7 @@ def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
     if not os.path.isfile(path):
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
+        _require_whole(path)
         with h5py.File(path, "r") as file:  # h5netcdf would print a second error for a file it cannot open
             left_out = [name for name in map(str, file) if name.endswith(without)]
         data = xr.load_dataset(path, engine="h5netcdf", drop_variables=left_out)
@@ -39,6 +48,14 @@ def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
     if problem:
         raise InputError(f"{shown(str(path))} is not a ratio map: {problem}.")
     return data
+
+
+def _require_whole(path: Path) -> None:
+    """Raise a ValueError if a file has a checksum, and it is not that of its content."""
+    whole = path.read_bytes()
+    content, end = whole[: -_DIGEST - len(_MARK)], whole[-_DIGEST - len(_MARK) :]
+    if end.startswith(_MARK) and end.removeprefix(_MARK) != hashlib.sha256(content).digest():
+        raise ValueError("it is damaged, and not what was written")
 
 
 def choices_of(data: xr.Dataset) -> dict[str, Any]:

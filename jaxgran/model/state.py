@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.model.checks import InputError
@@ -13,6 +14,8 @@ from jaxgran.model.display import Row, arrays, display_methods, rounded
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
+
+_ROUNDING = 1e-5  # of a packing fraction or a diameter in float32, with some room
 
 
 def _rows(state: "State") -> list[Row]:
@@ -66,6 +69,27 @@ def require_state(flow: ShearFlow, state: State) -> None:
             f"state must be one State of {flow.grains} grains, best from prepare, not "
             f"{f'of positions {jnp.shape(state.positions)}' if isinstance(state, State) else type(state).__name__}."
         )
+
+
+def require_match(flow: ShearFlow, state: State) -> None:
+    """Raise an InputError if flow and state differ in packing fraction or polydispersity; traced values pass.
+
+    The engines take both from the state. Sizes other than those of ``polydisperse`` belong to no polydispersity.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((flow, state))):
+        return
+    radii = np.sort(np.asarray(state.grains.radii, float))
+    of_state = {"packing_fraction": float(np.pi * np.sum(radii**2) / np.asarray(state.side, float) ** 2)}
+    quantiles = (2 * np.arange(radii.size) + 1) / radii.size - 1
+    spread = (2 * radii[-1] - 1) / quantiles[-1]
+    if spread > _ROUNDING and np.allclose(2 * radii, 1 + spread * quantiles, rtol=0, atol=_ROUNDING):
+        of_state["polydispersity"] = float(spread)
+    for name, found in of_state.items():
+        if abs(found - float(getattr(flow, name))) > _ROUNDING:
+            raise InputError(
+                f"{name} must be {found:.6g}, which the state has, not {float(getattr(flow, name)):g}: a flow with "
+                "another one begins with a state of its own, from prepare."
+            )
 
 
 def kinetic_energy(grains: Grains, velocities: Array) -> Float[Array, ""]:

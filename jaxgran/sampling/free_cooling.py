@@ -23,7 +23,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, listed, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, require_match, require_state
 
 _LARGEST_CROSSING = 0.1  # largest motion in one step of a grain of thermal speed, in its diameters
 _SMALLEST_CROSSING = 20  # smallest motion in one step of such a grain at the start, in roundings of a position
@@ -76,13 +76,15 @@ def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Coo
       The state at the last of the times, and the record.
 
     Raises:
-      InputError: (a ValueError) the flow is sheared, the times do not increase by a time step or more, a grain of
-        thermal speed would cross more than a tenth of its diameter in one step, or positions cannot resolve a step.
+      InputError: (a ValueError) the flow is sheared, the state has another packing fraction or polydispersity,
+        the times do not increase by a time step or more, a grain of thermal speed would cross more than a tenth of its
+        diameter in one step, or positions cannot resolve a step.
     """
     require_state(flow, state)
     require("shear_rate", flow.shear_rate, lambda x: x == 0, "0 in free cooling")
     times = _require_times(flow, times)
     _require_slow(flow, state)
+    require_match(flow, state)
     return _cooling(flow, state, times)
 
 

@@ -21,7 +21,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, require_whole, shown, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
-from jaxgran.model.state import State, require_state
+from jaxgran.model.state import State, require_match, require_state
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
@@ -262,7 +262,7 @@ def sample(
         fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
 
     Args:
-      flow: parameters of the state.
+      flow: parameters of the state, with its packing fraction and polydispersity.
       state: the flow at the beginning, usually from ``prepare``.
       strain: strain γ̇t to sample, rounded to whole time steps. A new value does not recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
@@ -277,13 +277,15 @@ def sample(
       The final state and the sample.
 
     Raises:
-      InputError: (a ValueError) the flow is not sheared; the strain is not a positive number, is shorter than one time
+      InputError: (a ValueError) the state has another packing fraction or polydispersity than the flow; the flow is
+        not sheared; the strain is not a positive number, is shorter than one time
         step a block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the
         result of ``observe`` is not summed over contacts; or the flow names an engine that cannot do this.
     """
     require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
     require_strain(flow, strain, blocks)
+    require_match(flow, state)
     check_precision(flow, state)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
