@@ -38,14 +38,16 @@ from synthetic import one_sentence, random_replica
 from jaxgran.cli import app
 from jaxgran.cli import map as map_module
 from jaxgran.cli.arguments import number_list
-from jaxgran.cli.terminal import print_table
+from jaxgran.cli.tables import print_table
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import sweep
 from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
+from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.checks import InputError
+from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting import map_figures, movie
 from jaxgran.sampling.budget import sampling_error
@@ -296,10 +298,11 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
     assert "dt = 0.001 / shear rate, midpoint activation" in " ".join(out.split())
     for nu in (0.5, 0.6):
         rows = [line for line in out.splitlines() if line.split()[:1] == [str(nu)]]
-        ratios = data.force_ratio, data.stress_ratio.sel(axis_a="x", axis_b="y")
-        for row, ratio in zip(rows, ratios, strict=True):
+        ratios = (data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)
+        for row, (ratio, error) in zip(rows, ratios, strict=True):
             for alpha in (0.5, 0.9):
-                assert f"{float(ratio.sel(packing_fraction=nu, restitution=alpha)):.4g} ±" in row
+                point = {"packing_fraction": nu, "restitution": alpha}
+                assert with_error(float(ratio.sel(point)), float(error.sel(point))) in row
     assert "points" not in out
     assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
     for name in ("small.nc", *PICTURES):
@@ -358,16 +361,22 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     folder, outcome = small_run
     data = read_dataset(folder / "flow.nc")
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
-    assert outcome.out.split("\n")[0].startswith(f"Engine machine_code, solver {data.attrs['solver']}")
+    words = " ".join(outcome.out.split())
+    assert words.startswith(f"64 grains, dt = {data.attrs['timestep']:g} / shear rate, midpoint activation ")
+    assert f" engine machine_code, solver {data.attrs['solver']} " in words
+    groups = [line.strip() for line in outcome.out.splitlines()]
+    places = [groups.index(name) for name in ("Forces", "Stresses", "Motion and structure", "Quality of the run")]
+    assert places == sorted(places)
+    assert "frames cut the flow elsewhere" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
     data = data.isel(restitution=0, packing_fraction=0)
     averages, budget = outcome.out.split("Whole error")
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
         (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
-        assert f"{float(data[name]):.4g} ± {float(data[f'{name}_stderr']):.2g}" in row
+        assert with_error(float(data[name]), float(data[f"{name}_stderr"])) in row
     (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("shear-stress ratio  "))
     value, error = (float(data[name][0, 1]) for name in ("stress_ratio", "stress_ratio_stderr"))
-    assert f"{value:.4g} ± {error:.2g}" in row
+    assert with_error(value, error) in row
     (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
     parts = [
         1.96 * data.pressure_stderr,
@@ -451,7 +460,7 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"), "--timestep", "1e-3")
     assert (outcome.status, outcome.err) == (0, "")
     rows = rows_of(outcome.out)
-    assert rows["restitution ± standard error"] == "0.712 ± 0.01"
+    assert rows["restitution ± standard error"] == "0.712 ± 0.010"
     assert rows["recorded restitution"] == "0.7"
     assert rows["windows, collisions"] == "10, 123" and rows["outliers"] == "2 %"
     ((strain, state, shear_rate, timestep),) = given
@@ -751,14 +760,14 @@ def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_
     assert "wrote jaxgran_map_timestep.png" in outcome.err
     data = read_dataset(tmp_path / "jaxgran_map.nc")
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
-    values = {"Force": data.force_ratio, "Shear-stress": data.stress_ratio.sel(axis_a="x", axis_b="y")}
+    values = {"Force": (data.force_ratio, data.force_ratio_stderr), "Shear-stress": shear_stress_ratio(data)}
     _, *tables = re.split("(Force|Shear-stress) ratio at dt = ", " ".join(outcome.out.split()))
     assert tables[::2] == ["Force", "Shear-stress"] * 2
     for name, table, dt in zip(tables[::2], tables[1::2], (1e-3, 1e-3, 1e-4, 1e-4), strict=True):
         assert table.startswith(f"{dt:g} / shear rate, midpoint activation")
         for alpha in (0.5, 0.9):
-            value = values[name].sel(timestep=dt, packing_fraction=0.6, restitution=alpha)
-            assert f"{float(value):.4g} ±" in table
+            point = {"timestep": dt, "packing_fraction": 0.6, "restitution": alpha}
+            assert with_error(*(float(x.sel(point)) for x in values[name])) in table
         assert table.count("*") == (dt == 1e-4)
 
 
@@ -779,8 +788,9 @@ def test_several_numbers_of_grains_have_a_table_each_estimates_and_a_figure(
     titles = [f"Force ratio at {n} grains, dt = {dt:g} / shear rate" for n in (64, 128) for dt in (1e-3, 1e-4)]
     titles += [f"Large systems at dt = {dt:g} / shear rate" for dt in (1e-3, 1e-4)]
     assert [out.index(title) for title in titles] == sorted(out.index(title) for title in titles)
-    for value in data.pressure_large_system.values.flat:
-        assert f"{value:.4g} ±" in out
+    errors = data.pressure_large_system_error.values.flat
+    for value, error in zip(data.pressure_large_system.values.flat, errors, strict=True):
+        assert with_error(value, error) in out
     assert (choices_of(data)["grains"], choices_of(data)["timestep"]) == ((64, 128), (1e-3, 1e-4))
 
 

@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from synthetic import random_tally
 
-from jaxgran.model.display import Row, html_of, text_of, value_text
+from jaxgran.model.display import Row, html_of, text_of, value_text, with_error
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -108,7 +110,7 @@ def test_sample_shows_its_averages_with_their_errors_and_its_status() -> None:
     one = sample(status=Status.deep_overlap)
     rows, errors = cells(one), one.errors()
     for name in ("force_ratio", "pressure", "granular_temperature"):
-        expected = f"{float(one.averages[name]):.4g} ± {float(errors[name]):.2g}"
+        expected = with_error(float(one.averages[name]), float(errors[name]))
         assert rows[name.replace("_", " ")][0] == expected
         assert f"{name}={expected}" in repr(one)
     assert rows["status"][0] == "deep_overlap"
@@ -178,3 +180,32 @@ def test_value_takes_a_few_letters(value, text: str) -> None:
 
 def test_error_stands_beside_its_value() -> None:
     assert value_text(np.float64(1.23456), np.float64(0.0123)) == "1.235 ± 0.012"
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (58.724, 6.04, "59 ± 6"),
+        (1.0, 0.00019, "1.00000 ± 0.00019"),  # the excess over one is the result
+        (3.4, 0.0997, "3.40 ± 0.10"),
+        (0.5, 20.0, "0 ± 20"),
+        (12345.0, 121.0, "12340 ± 120"),
+        (12345.0, 6.0, "12345 ± 6"),
+        (1.23e7, 2e5, "(1.230 ± 0.020)e+07"),
+        (-7.98e-7, 1e-6, "(-0.8 ± 1.0)e-06"),
+        (1.0, 3e-17, "1 ± 3e-17"),
+        (0.0, 0.0, "0 ± 0"),
+        (np.nan, np.nan, "nan ± nan"),
+        (2.5, np.nan, "2.5 ± nan"),
+    ],
+)
+def test_a_value_has_the_digits_that_its_error_leaves(value: float, error: float, text: str) -> None:
+    assert with_error(value, error) == text
+
+
+@given(st.floats(1e-12, 1e12), st.floats(1e-12, 1e12), st.sampled_from([-1, 1]))
+def test_rounding_moves_a_value_by_less_than_its_error_and_the_error_by_a_seventh(value, error, sign) -> None:
+    digits, _, power = with_error(sign * value, error).strip("(").partition(")e")
+    shown, rounded_error = (float(x) * 10.0 ** int(power or 0) for x in digits.split(" ± "))
+    assert rounded_error == pytest.approx(error, rel=1 / 7)
+    assert abs(shown - sign * value) <= 0.51 * error + 1e-6 * value

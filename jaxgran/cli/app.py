@@ -16,6 +16,7 @@ from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
 from jaxgran.cli.mistakes import UsageError, by_option, in_words
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
+from jaxgran.cli.tables import use_plain_letters
 from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, is_interruption, stop
 from jaxgran.model.checks import InputError
 
@@ -59,6 +60,7 @@ def command_line(
 
 def main() -> None:
     """Entry point: a mistake in the input ends with one sentence and exit status 2."""
+    use_plain_letters()
     try:
         status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
     except InputError as mistake:

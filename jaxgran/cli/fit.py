@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
-from rich.table import Table
 
-from jaxgran.cli.terminal import BAD_STATUS, configured_jax, print_table, require_device, stop, with_error
+from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, stop
 from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.display import with_error
 
 _LARGEST_CHI_SQUARED = 9.0  # above it, no restitution of the map has these stresses
 
@@ -65,15 +65,15 @@ def _fit_trajectory(file: Path, timestep: float | None) -> None:
         found = fit_restitution(trajectory.strain, trajectory.state, float(trajectory.shear_rate), timestep)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)
-    table = Table(box=box.SIMPLE)
-    table.add_column("restitution ± standard error")
-    table.add_column(with_error(found.restitution, found.stderr))
     recorded = f"{float(trajectory.restitution):g}" if math.isfinite(trajectory.restitution) else "none"
-    table.add_row("recorded restitution", recorded)
-    table.add_row("noise of the velocities, σγ̇", f"{found.noise:.2g}")
-    table.add_row("windows, collisions", f"{found.windows}, {found.collisions:g}")
-    table.add_row("outliers", f"{100 * found.outliers:.2g} %")
-    print_table(table)
+    rows = [
+        ["recorded restitution", recorded],
+        ["noise of the velocities, σγ̇", f"{found.noise:.2g}"],
+        ["windows, collisions", f"{found.windows}, {found.collisions:g}"],
+        ["outliers", f"{100 * found.outliers:.2g} %"],
+    ]
+    columns = ("restitution ± standard error", with_error(found.restitution, found.stderr))
+    print_table(Table("", columns, rows, numbers=False))
 
 
 def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:
@@ -85,15 +85,12 @@ def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: fl
 
     data = read_dataset(file)
     closure, errors = fit_closure(data), leave_one_out(data)
-    table = Table(
-        title="Closure of the map, each point predicted from the others", box=box.SIMPLE, title_justify="left"
-    )
-    for name in ("observable", "rms error", "largest error", "noise of a point"):
-        table.add_column(name)
+    columns = ("observable", "rms error", "largest error", "noise of a point")
+    table = Table("Closure of the map, each point predicted from the others", columns, numbers=False)
     for name in ("pressure", "shear_stress", "force_ratio"):
         error, noise = abs(errors[f"{name}_error"]), errors[f"{name}_noise"]
         shares = ((error**2).mean() ** 0.5, error.max(), (noise**2).mean() ** 0.5)
-        table.add_row(name.replace("_", " "), *(f"{100 * float(share):.2g} %" for share in shares))
+        table.rows.append([name.replace("_", " "), *(f"{100 * float(share):.2g} %" for share in shares)])
     if stresses is None:
         print_table(table)
     else:

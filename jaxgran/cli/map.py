@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich import box
-from rich.table import Table
 
 from jaxgran.cli.arguments import (
     RelativeError,
@@ -19,10 +17,12 @@ from jaxgran.cli.arguments import (
     whole_numbers,
 )
 from jaxgran.cli.measure import finish, measured, print_budget
-from jaxgran.cli.terminal import configured_jax, print_table, require_device, say, say_written, with_error
+from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.terminal import configured_jax, require_device, say, say_written
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
 from jaxgran.model.choices import Activation, Engine, Solver
+from jaxgran.model.display import with_error
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
@@ -172,15 +172,12 @@ def _ratio_table(data, name: str, ratio, stderr) -> Table:
     timestep, rule = data.attrs["timestep"], data.attrs["activation"]
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = f"{name} at {size}dt = {timestep:g} / shear rate, {rule} activation; a column is a restitution"
-    table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    table.add_column("packing fraction")
-    for alpha in data.restitution.values:
-        table.add_column(f"{alpha:g}", justify="right", no_wrap=True)
+    table = Table(title, ["packing fraction", *(f"{alpha:g}" for alpha in data.restitution.values)])
     for nu in data.packing_fraction.values:
         row = {"packing_fraction": nu}
         marks = ["" if status == 0 else " *" for status in data.status.sel(row).values]
         cells = zip(ratio.sel(row).values, stderr.sel(row).values, marks, strict=True)
-        table.add_row(f"{nu:g}", *(with_error(value, error) + mark for value, error, mark in cells))
+        table.rows.append([f"{nu:g}", *(with_error(value, error) + mark for value, error, mark in cells)])
     return table
 
 
@@ -189,9 +186,8 @@ def _large_system_table(data) -> Table:
     from jaxgran.maps.large_system import BOUNDS, LIMIT_SEEN
 
     title = f"Large systems at dt = {data.attrs['timestep']:g} / shear rate; ± bounds the error of sampling and size"
-    table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    for name in ("packing fraction", "restitution", *BOUNDS):
-        table.add_column(name.replace("_", " "), justify="right")
+    columns = ["packing fraction", "restitution", *(name.replace("_", " ") for name in BOUNDS)]
+    table = Table(title, columns, keys=2)
     for nu in data.packing_fraction.values:
         for alpha in data.restitution.values:
             point = data.sel(packing_fraction=nu, restitution=alpha)
@@ -200,5 +196,5 @@ def _large_system_table(data) -> Table:
                 value, error = float(point[f"{name}_large_system"]), float(point[f"{name}_large_system_error"])
                 no_limit = int(point[f"{name}_limit_seen"]) == LIMIT_SEEN["no_limit_seen"]
                 cells.append("no limit seen" if no_limit else with_error(value, error))
-            table.add_row(f"{nu:g}", f"{alpha:g}", *cells)
+            table.rows.append([f"{nu:g}", f"{alpha:g}", *cells])
     return table

@@ -12,17 +12,14 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Literal
 
-from rich import box
-from rich.table import Table
-
 from jaxgran.cli.progress import progress
+from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import (
     BAD_STATUS,
     INTERRUPTED,
     NO_FILE,
     configured_jax,
     is_interruption,
-    print_table,
     require_device,
     say,
     say_written,
@@ -199,15 +196,13 @@ def print_budget(data) -> None:
     from jaxgran.maps.schema import relative_parts
 
     title = f"Whole error, 95 %, relative to a large system{'' if data.status.size == 1 else ': median (largest)'}"
-    table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    for name in ("observable", "sampling", "time step", "size", "tolerance", "together"):
-        table.add_column(name, justify="left" if name == "observable" else "right")
+    table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "together"))
     for name in _BUDGETED:
         parts = relative_parts(data, name)
         ordered = (parts[part] for part in ("sampling", "timestep", "size", "tolerance", "error"))
         cells = [_percent(part) for part in ordered]
         cells[1] = "at its dt" if name == "force_ratio" else cells[1]
-        table.add_row(name.replace("_", " "), *cells)
+        table.rows.append([name.replace("_", " "), *cells])
     print_table(table)
 
 
@@ -218,7 +213,7 @@ def _percent(part) -> str:
     known = part[np.isfinite(part)]
     if known.size == 0:
         return ""
-    median, largest = (f"{100 * x:.2g}" for x in (np.median(known), known.max()))
+    median, largest = (f"{float(f'{100 * x:.2g}'):g}" for x in (np.median(known), known.max()))
     return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
 
 

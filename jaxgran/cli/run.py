@@ -6,18 +6,32 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
-from rich.table import Table
 
 from jaxgran.cli.arguments import RelativeError, chosen_for, numbers_or_auto, require_one
 from jaxgran.cli.measure import finish, measured, print_budget
 from jaxgran.cli.progress import counted
-from jaxgran.cli.terminal import configured_jax, print_table, say, with_error
+from jaxgran.cli.tables import Table, print_table
+from jaxgran.cli.terminal import configured_jax, say
 from jaxgran.model.checks import InputError, require_number, shown
 from jaxgran.model.choices import Engine
+from jaxgran.model.display import with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are kept and none is given
+
+_GROUPS = {  # names of observables by what they tell; those that are not here are of the last group
+    "Forces": ("force_ratio", "contact_force", "binary_force", "force_second_moment"),
+    "Stresses": (
+        *("pressure", "contact_pressure", "binary_pressure", "kinetic_pressure"),
+        *("shear_stress", "contact_shear_stress", "binary_shear_stress", "kinetic_shear_stress"),
+        *("bagnold_pressure", "bagnold_shear_stress", "macroscopic_friction", "inertial_number"),
+    ),
+    "Motion and structure": (
+        *("granular_temperature", "local_granular_temperature", "wave_share", "collision_rate"),
+        *("coordination_number", "network_size", "cluster_pressure_share", "cluster_shear_share"),
+    ),
+}
+_LAST_GROUP = "Quality of the run"
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
@@ -39,7 +53,13 @@ def run_command(
         str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or auto. [default: 1e-3]")
     ] = None,
     engine: Annotated[Engine, typer.Option(help="Program that advances the flow.")] = "auto",
-    trajectory: Annotated[Path | None, typer.Option(help="GSD file of the flow, frame by frame.")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            help="GSD file of the flow, frame by frame. Frames cut the flow elsewhere: its numbers change within their "
+            "errors."
+        ),
+    ] = None,
     every: Annotated[
         float | None,
         typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.05 with --error]"),
@@ -72,6 +92,7 @@ def run_command(
     print_table(_summary_table(data))
     print_budget(data)
     if recorder is not None and recorder.frames:
+        say("frames cut the flow elsewhere: its numbers differ from those without frames, within their errors.")
         if trajectory is not None:
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
@@ -122,24 +143,31 @@ def _summary_table(data) -> Table:
     from jaxgran.maps.schema import shear_stress_ratio
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
-    title = f"Engine {data.attrs['engine']}, solver {data.attrs['solver']}"
-    table = Table(title=title, box=box.SIMPLE, title_justify="left")
-    for name in ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory"):
-        table.add_column(name)
+    grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
+    title = (
+        f"{grains} grains, dt = {timestep:g} / shear rate, {rule} activation\n"
+        f"engine {data.attrs['engine']}, solver {data.attrs['solver']}"
+    )
+    columns = ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory")
+    table = Table(title, columns, numbers=False)
     point = data.isel(packing_fraction=0, restitution=0)
     strain = float(point.strain_by_seed.sum())
 
     def number(name: str) -> float:
         return float(point[name]) if name in point else math.nan
 
-    for name in OBSERVABLES:
-        if name not in TENSORS:
-            unit = OBSERVABLES[name][1]
+    scalars = [name for name in OBSERVABLES if name not in TENSORS]
+    others = [name for name in scalars if name not in sum(_GROUPS.values(), ())]
+    for group, names in {**_GROUPS, _LAST_GROUP: others}.items():
+        table.rows.append([group])
+        for name in names:
             value = with_error(number(name), number(f"{name}_stderr"))
+            unit = OBSERVABLES[name][1].replace("sigma", "σ").replace("^2", "²").replace(" ", "")
             samples = strain / number(f"{name}_correlation_strain")
             theory = number(f"theory_{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.add_row(name.replace("_", " "), value, "" if unit == "1" else unit, *texts)
-        if name == "force_ratio":
-            table.add_row("shear-stress ratio", with_error(*map(float, shear_stress_ratio(point))))
+            table.rows.append([name.replace("_", " "), value, "" if unit == "1" else unit, *texts])
+            if name == "force_ratio":
+                ratio = with_error(*map(float, shear_stress_ratio(point)))
+                table.rows.append(["shear-stress ratio", ratio, "", "", ""])
     return table

@@ -1,4 +1,4 @@
-"""Shared by all commands: exit statuses, sentences on standard error, tables on standard output, the set-up of JAX.
+"""Shared by all commands: exit statuses, sentences on standard error, the set-up of JAX.
 
 ===========  ========================================================
 exit status  meaning
@@ -18,9 +18,6 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import NoReturn
-
-from rich.console import Console
-from rich.table import Table
 
 from jaxgran.caches import cache_folder, obstacle, users_folder
 from jaxgran.environment import devices, processor_kind
@@ -92,14 +89,3 @@ def is_interruption(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
-
-
-def with_error(value: float, error: float) -> str:
-    """A value and its standard error as text."""
-    return f"{value:.4g} ± {error:.2g}"
-
-
-def print_table(table: Table) -> None:
-    """Print a table on standard output, in full width if that is not a terminal."""
-    console = Console()
-    console.print(table) if console.is_terminal else Console(width=40 + 20 * len(table.columns)).print(table)

@@ -1,7 +1,7 @@
 """The file of a map: it is written, read and compared.
 
-A file ends in the SHA-256 checksum of what stands before it, which other readers of NetCDF ignore. It is compared first,
-as the HDF5 library can wait forever in a damaged file. Files of other programs, and older ones, have no checksum.
+A file ends in the SHA-256 checksum of what stands before it, which other readers of NetCDF ignore. It is compared
+first, as the HDF5 library can wait forever in a damaged file. Files of other programs, and older ones, have none.
 """
 
 import hashlib

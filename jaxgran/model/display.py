@@ -4,6 +4,7 @@ Both forms use the same list of rows. An array of many values is shown by its sh
 thousand replicas needs no more space than one. A traced value is shown by its type.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from html import escape
@@ -14,6 +15,9 @@ import numpy as np
 from jaxgran.model.status import Status
 
 _LONGEST_REPR = 100  # characters of a value that is not a number
+_LEAST_SHOWN = 1e-6  # relative error; digits below it are not shown
+_TWO_DIGITS = 3.55  # an error that begins with less has two digits
+_SMALLEST_PLAIN, _LARGEST_ROUNDED = -4, 5  # powers of ten of numbers without an exponent
 _CELL_STYLE = "text-align: left; padding: 0.1em 0.8em"
 
 
@@ -54,7 +58,7 @@ def value_text(value: Any, error: Any = None) -> str:
         words = " ".join(repr(value).split())
         return words if len(words) <= _LONGEST_REPR else f"{words[:_LONGEST_REPR]}…"
     if numbers.ndim == 0:
-        return str(numbers[()]) if error is None else f"{numbers.item():.4g} ± {float(error):.2g}"
+        return str(numbers[()]) if error is None else with_error(numbers.item(), float(error))
     shape = "×".join(map(str, numbers.shape))
     finite = numbers[np.isfinite(numbers)]
     if finite.size == 0:
@@ -63,6 +67,28 @@ def value_text(value: Any, error: Any = None) -> str:
     spread = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
     lost = f", {numbers.size - finite.size} not finite" if finite.size < numbers.size else ""
     return f"<{shape} values, {spread}{lost}>"
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error as text, both to the digits that the error leaves.
+
+    The error has two digits up to 3.5 in its first digit, and one above, as the Particle Data Group rounds.
+
+    Examples:
+      >>> with_error(58.724, 6.04), with_error(1.000123, 0.00019), with_error(-7.98e-7, 1e-6)
+      ('59 ± 6', '1.00012 ± 0.00019', '(-0.8 ± 1.0)e-06')
+    """
+    if not (math.isfinite(value) and _LEAST_SHOWN * abs(value) < error < math.inf):
+        return f"{value:.6g} ± {error:.2g}"
+    digits, power = f"{error:.2e}".split("e")
+    last = int(power) - (float(digits) < _TWO_DIGITS)  # power of ten of the last digit
+    largest = math.floor(math.log10(max(abs(value), error)))
+    plain = _SMALLEST_PLAIN <= largest <= max(last, _LARGEST_ROUNDED)
+    shared = 0 if plain or last <= 0 <= largest else largest  # power of ten behind the brackets
+    value, error = (round(x, -last) / 10**shared for x in (value, error))
+    places = max(0, shared - last)
+    text = f"{value:.{places}f} ± {error:.{places}f}"
+    return f"({text})e{shared:+03d}" if shared else text
 
 
 def _plain_text(row: Row) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,6 +23,7 @@ from jaxgran.inference.friction_law import (
     is_dense,
 )
 from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
+from jaxgran.model.display import with_error
 from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     NU_LABEL,
@@ -135,12 +135,5 @@ def parameters_text(law: PowerLaw) -> str:
     if not law.determined:
         return "not determined"
     values = law.parameters * [1.0, np.sign(law.parameters[1]), 1.0]
-    parts = [_with_error(value, error) for value, error in zip(values, law.standard_errors, strict=True)]
+    parts = [with_error(value, error) for value, error in zip(values, law.standard_errors, strict=True)]
     return f"{', '.join(parts)} ({law.chi_squared:.2g})".replace("-", "−")
-
-
-def _with_error(value: float, error: float) -> str:
-    """Return a number and its standard error with one digit of the error, or two digits if the first is a one."""
-    magnitude = math.floor(math.log10(error)) if error > 0.0 else -3
-    digits = max(0, -magnitude + (error < 2.0 * 10.0**magnitude))
-    return f"{value:.{digits}f} ± {error:.{digits}f}"

@@ -1,0 +1,99 @@
+"""Tables on standard output: in pages of columns where the terminal is narrow, and in the letters that it has."""
+
+import codecs
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from io import TextIOWrapper
+from textwrap import wrap
+
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+
+_UNLIMITED = 10_000  # characters; width of what is no terminal
+_NARROW_KEY = 22  # characters of a line of a row's name
+_IN_ASCII = str.maketrans(
+    {"±": "+-", "σ": "sigma", "γ": "gamma", "\u0307": "-dot", "ν": "nu", "α": "alpha", "²": "^2"}
+    | {"–": "-", "−": "-", "×": "x", "…": "...", "’": "'"}
+)
+
+
+@dataclass
+class Table:
+    """A table of texts: a title, the names of its columns, and rows; a row of one text is the name of a group.
+
+    The first ``keys`` columns name a row, and stand on every page. The others are set to the right, or else to the left
+    with ``numbers`` false.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: list[list[str]] = field(default_factory=list)
+    keys: int = 1
+    numbers: bool = True
+
+
+def print_table(table: Table) -> None:
+    """Print a table on standard output, with the columns that do not fit into its width on further pages."""
+    console = Console()
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = Console(width=_UNLIMITED)
+    left = list(range(table.keys, len(table.columns)))
+    narrow = _width(_page(table, left)) > console.width
+    while left:
+        shown = len(left)
+        while shown > 1 and _width(_page(table, left[:shown], narrow)) > console.width:
+            shown -= 1
+        console.print(_page(table, left[:shown], narrow))
+        left = left[shown:]
+
+
+def _width(page: RichTable) -> int:
+    """The width of a page of which nothing is cut off."""
+    return Console(width=_UNLIMITED).measure(page).maximum
+
+
+def _page(table: Table, columns: Iterable[int], narrow: bool = False) -> RichTable:
+    """The keys and some columns of a table; long keys take several lines if it is ``narrow``."""
+    page = RichTable(title=plain(table.title), box=box.SIMPLE, title_justify="left")
+    places = [*range(table.keys), *columns]
+    for k in places:
+        widest = max((len(plain(row[k])) for row in table.rows if len(row) > 1), default=0)
+        words = plain(table.columns[k]).split()
+        head = "\n".join(wrap(" ".join(words), max(widest, *map(len, words))))
+        page.add_column(head, no_wrap=True, justify="right" if table.numbers and k >= table.keys else "left")
+    for row in table.rows:
+        if len(row) == 1:
+            page.add_section()
+        cells = [plain(row[k]) for k in places if k < len(row)]
+        cells[0] = "\n".join(wrap(cells[0], _NARROW_KEY if narrow else _UNLIMITED))
+        page.add_row(*cells)
+    return page
+
+
+def plain(text: str) -> str:
+    """The text in the letters that standard output has."""
+    encoding = sys.stdout.encoding or "utf-8"
+    return text.encode(encoding, "in_ascii").decode(encoding)
+
+
+def use_plain_letters() -> None:
+    """Standard output and error print letters that they do not have in others, rather than end the command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="in_ascii")
+
+
+def _in_ascii(error: UnicodeError) -> tuple[str | bytes, int]:
+    """What stands for letters that cannot be encoded; bytes of a file name that is no text stay as they are."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    letters = error.object[error.start : error.end]
+    if all("\udc80" <= letter <= "\udcff" for letter in letters):
+        return letters.encode("ascii", "surrogateescape"), error.end
+    return letters.translate(_IN_ASCII).encode("ascii", "replace"), error.end
+
+
+codecs.register_error("in_ascii", _in_ascii)

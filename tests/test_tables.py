@@ -1,0 +1,83 @@
+"""A table fits the terminal in pages that name their rows, and the letters that the terminal has."""
+
+import os
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from io import BytesIO, StringIO, TextIOWrapper
+
+import pytest
+
+from jaxgran.cli.run import _GROUPS
+from jaxgran.cli.tables import Table, print_table, use_plain_letters
+from jaxgran.sampling.observables import OBSERVABLES, TENSORS
+
+RATIOS = [0.1 * k for k in range(1, 8)]
+FRACTIONS = ("0.5", "0.65", "0.7")
+MAP = Table(
+    "Force ratio at dt = 0.001 / shear rate",
+    ["packing fraction", *(f"{alpha:.2g}" for alpha in RATIOS)],
+    [[nu, *(f"{10 * float(nu) + alpha:.4f} ± 0.0019" for alpha in RATIOS)] for nu in FRACTIONS],
+)
+
+
+def printed(table: Table) -> str:
+    with redirect_stdout(StringIO()) as out:
+        print_table(table)
+    return out.getvalue()
+
+
+def test_without_a_terminal_a_table_is_one_page() -> None:
+    rows = [line.split() for line in printed(MAP).splitlines() if line.split()[:1] == ["0.65"]]
+    assert [len(row) for row in rows] == [1 + 3 * len(RATIOS)]
+
+
+@pytest.mark.parametrize("width", [40, 80, 120])
+def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: int, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    out = printed(MAP)
+    assert max(map(len, out.splitlines())) <= width and "…" not in out
+    for nu, *cells in MAP.rows:
+        rows = [line for line in out.splitlines() if line.split()[:1] == [nu]]
+        assert len(rows) == out.count("Force ratio") > 1
+        assert all(any(cell in row for row in rows) for cell in cells)
+
+
+def test_long_names_of_rows_take_two_lines_where_that_saves_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [["Stresses"], ["granular temperature of small boxes", "1.00 ± 0.10", "m/t²"], ["pressure", "2", ""]]
+    table = Table("", ["observable", "value", "unit"], rows, numbers=False)
+    monkeypatch.setenv("COLUMNS", "48")
+    narrow = [line.strip() for line in printed(table).splitlines()]
+    assert any(line.startswith("granular temperature ") for line in narrow) and "of small boxes" in narrow
+    assert "Stresses" in narrow
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "granular temperature of small boxes" in printed(table)
+
+
+def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    content = BytesIO()
+    monkeypatch.setattr(sys, "stdout", TextIOWrapper(content, "ascii"))
+    monkeypatch.setattr(sys, "stderr", StringIO())
+    use_plain_letters()
+    print("σγ̇ … ☃")
+    print_table(MAP)
+    sys.stdout.flush()
+    out = content.getvalue().decode("ascii")
+    assert out.startswith("sigmagamma-dot ... ?\n")
+    lines = [line for line in out.splitlines() if line.startswith("| ")]
+    assert "6.6000 +- 0.0019" in out and len({len(line) for line in lines}) == 1  # columns stay straight
+
+
+def test_names_of_files_that_are_no_text_keep_their_bytes() -> None:
+    program = "from jaxgran.cli.tables import use_plain_letters; use_plain_letters(); print('wrote \\udcff.nc')"
+    for encoding in ("utf-8", "ascii"):
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, env=os.environ | {"PYTHONIOENCODING": encoding}
+        )
+        assert (done.returncode, done.stdout) == (0, b"wrote \xff.nc\n")
+
+
+def test_groups_of_a_run_name_observables() -> None:
+    names = [name for group in _GROUPS.values() for name in group]
+    assert len(set(names)) == len(names)
+    assert set(names) < set(OBSERVABLES) - set(TENSORS)
