@@ -386,7 +386,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert [word for word in row.split()[1:] if word != "%"] == shown
     (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
     samples = data.strain_by_seed.sum().item() / data.pressure_correlation_strain.item()
-    assert row.split()[4:] == ["m", "/", "t^2", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
+    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
 
 
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
@@ -559,7 +559,7 @@ def test_fit_of_a_map_finds_a_restitution_from_stresses_and_says_how_well(
     monkeypatch.setattr(name, lambda _, *numbers: given.append(numbers) or found)
     outcome = jaxgran(tmp_path, "fit", str(known_map), *STRESSES, "--relative-error", "0.1")
     assert (outcome.status, outcome.err) == (0, "")
-    assert outcome.out.splitlines()[-1] == f"restitution 0.65 ± 0.02{words}"
+    assert outcome.out.splitlines()[-1] == f"restitution 0.650 ± 0.020{words}"
     assert given == [pytest.approx((0.7, 3.0, 1.0, 0.3, 0.1))]
 
 
@@ -845,7 +845,7 @@ def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
 ) -> None:
     (tmp_path / "old.nc").write_bytes(b"old")
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({}, KeyboardInterrupt))
-    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc")
+    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc", "--overwrite")
     assert outcome.status == 130
     assert (tmp_path / "old.nc").read_bytes() == b"old"
     assert files(tmp_path) == {"old.nc"}

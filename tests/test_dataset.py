@@ -12,7 +12,7 @@ from synthetic import one_sentence, random_replica
 from jaxgran.maps.dataset import NOT_RUN, THEORY, map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import choices_of, read_dataset, write_dataset
+from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
@@ -147,6 +147,13 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
         values, meanings = data[name].attrs["flag_values"], data[name].attrs["flag_meanings"].split()
         assert dict(zip(values.tolist(), meanings, strict=True)) == {-1: "not_run", **{s.value: s.name for s in Status}}
         assert data[name].dtype == values.dtype
+
+
+def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
+    given_up = map_dataset(settings, {**results, (0, 0): None}, RUN)
+    assert given_up.status_by_seed[0, 0, 0] == given_up.status[0, 0] == Status.failed
+    assert np.isnan(given_up.force_ratio_by_seed[0, 0, 0]) and np.isfinite(given_up.force_ratio[0, 0])
+    assert not is_finished(given_up)
 
 
 def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:

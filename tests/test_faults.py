@@ -126,7 +126,7 @@ def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: La
     done = lab.finish(lab.start("deadly.nc", fault="deadly batch", workers=2))
     assert done.returncode == 3
     assert "killed its worker 3 times: (restitution 0.3, packing fraction 0.6) not measured." in done.stderr
-    assert "not run: (restitution 0.3, packing fraction 0.6)." in done.stderr
+    assert "failed: (restitution 0.3, packing fraction 0.6)." in done.stderr
     data = read_dataset(lab.folder / "deadly.nc")
     for name in ("force_ratio", "pressure", "status"):
         assert data[name].values[0, 1] == lab.whole[name].values[0, 1]

@@ -67,13 +67,13 @@ def _fit_trajectory(file: Path, timestep: float | None) -> None:
         stop(str(failure), BAD_STATUS)
     recorded = f"{float(trajectory.restitution):g}" if math.isfinite(trajectory.restitution) else "none"
     rows = [
+        ["restitution ± standard error", with_error(found.restitution, found.stderr)],
         ["recorded restitution", recorded],
         ["noise of the velocities, σγ̇", f"{found.noise:.2g}"],
         ["windows, collisions", f"{found.windows}, {found.collisions:g}"],
         ["outliers", f"{100 * found.outliers:.2g} %"],
     ]
-    columns = ("restitution ± standard error", with_error(found.restitution, found.stderr))
-    print_table(Table("", columns, rows, numbers=False))
+    print_table(Table("", ("of the trajectory", "value"), rows, numbers=False))
 
 
 def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:

@@ -81,7 +81,11 @@ def map_command(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a running Dask cluster, such as tcp://127.0.0.1:8786.")
     ] = None,
-    output: Annotated[Path, typer.Option(help="NetCDF file; the figures go beside it.")] = Path("jaxgran_map.nc"),
+    output: Annotated[
+        Path | None,
+        typer.Option(help="NetCDF file; the figures go beside it. [default: jaxgran_map.nc, or jaxgran_map_PRESET.nc]"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the output, whatever it holds.")] = False,
     like: Annotated[
         Path | None, typer.Option(help="Dataset whose map is repeated; other options override its parameters.")
     ] = None,
@@ -109,9 +113,20 @@ def map_command(
     }
     given = {name: value for name, value in given.items() if value is not None}
     chosen = kept_choices(PRESETS[preset] if like is None else _like(like), given) | chosen_for(error) | given
+    if output is None:
+        output = Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc")
     figures = ["jaxgran.plotting.map_figures"]
-    data, interrupted = measured(
-        chosen, batch_size(batch), workers, output, quiet, target_error, resume, scheduler, load=figures
+    data, interrupted, written = measured(
+        chosen,
+        batch_size(batch),
+        workers,
+        output,
+        quiet,
+        target_error,
+        resume,
+        scheduler,
+        load=figures,
+        overwrite=overwrite,
     )
 
     from jaxgran.maps.schema import parts, shear_stress_ratio
@@ -125,7 +140,7 @@ def map_command(
         for part in parts(data.isel(grains=-1)):
             print_table(_large_system_table(part))
     print_budget(data)
-    finish(data, [output, *pictures], interrupted, can_resume=True)
+    finish(data, [*([output] if written else []), *pictures], interrupted, can_resume=True)
 
 
 def plot_command(
@@ -133,6 +148,7 @@ def plot_command(
     output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
 ) -> None:
     """Draw the figures of a finished map."""
+    from jaxgran.maps.output import remove_pictures
     from jaxgran.maps.results import read_dataset
     from jaxgran.plotting.map_figures import save_figures
 
@@ -140,7 +156,9 @@ def plot_command(
     folder = file.parent if output is None else output
     if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
         raise InputError(f"output must be a folder that exists and can be written to, not {shown(str(folder))}.")
-    say_written(save_figures(data, folder / file.stem))
+    pictures = save_figures(data, folder / file.stem)
+    remove_pictures(folder / file.name, but=pictures)
+    say_written(pictures)
 
 
 def _like(file: Path) -> dict[str, Any]:

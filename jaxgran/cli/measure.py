@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from jaxgran.cli.progress import progress
 from jaxgran.cli.tables import Table, print_table
@@ -26,6 +26,7 @@ from jaxgran.cli.terminal import (
     stop,
 )
 from jaxgran.environment import usable_cores
+from jaxgran.model.checks import InputError, shown
 
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 _MEANING_OF_STATUS = {
@@ -35,8 +36,17 @@ _MEANING_OF_STATUS = {
     "infeasible": "no impulses satisfy the contact law, the packing is jammed",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
-    "not_run": "the point was given up",
+    "failed": "its processes died again and again, perhaps for lack of memory; add --resume to try once more",
+    "not_run": "the point is missing",
 }
+
+
+class Outcome(NamedTuple):
+    """The dataset of a map, whether its run was interrupted, and whether the dataset was written."""
+
+    data: Any
+    interrupted: bool
+    written: bool
 
 
 def measured(
@@ -50,16 +60,19 @@ def measured(
     scheduler: str | None = None,
     record: Callable | None = None,
     load: Iterable[str] = (),
-):
-    """Run a map with progress, write its dataset, and return it and whether it was interrupted.
+    overwrite: bool = False,
+) -> "Outcome":
+    """Run a map with progress, and write its dataset.
 
-    If ``resume`` is True or False, a checkpoint is kept beside the output; True continues an earlier one. For
-    ``record`` and the other arguments see ``replicas``. Modules named in ``load`` are imported while the flows run.
+    If ``resume`` is True or False, a checkpoint is kept beside the output. True continues an earlier one, and takes a
+    finished map from its file. A file with anything but the same map is replaced only with ``overwrite``, and a
+    finished map never by an interrupted one. For ``record`` and the other arguments see ``replicas``. Modules named in
+    ``load`` are imported while the flows run.
     """
     jax = configured_jax()
     require_device()
     from jaxgran.maps.checkpoint import Checkpoint
-    from jaxgran.maps.output import check_output
+    from jaxgran.maps.output import check_output, remove_pictures
     from jaxgran.maps.settings import MapSettings, automatic
     from jaxgran.maps.sweep import check_batches, predicted_cost, replicas
 
@@ -74,8 +87,18 @@ def measured(
     count = len(settings.flows()) * settings.seeds
     workers = min(count, workers or (usable_cores() if on_cpu else 1))
     costs = [predicted_cost(flow) for flow in settings.flows()]
-    checkpoint = None if output is None or resume is None else Checkpoint(output, settings, resume)
-    results = {} if checkpoint is None else dict(checkpoint.done)
+    folder, kept = None, False
+    if output is not None:
+        earlier, lost, kept = _earlier(output, settings)
+        if lost and not overwrite:
+            raise InputError(f"output must be another file, or --overwrite be given: {shown(str(output))} has {lost}.")
+        folder = Checkpoint(output, settings, bool(resume))
+        if resume and kept and not lost and not folder.done and not folder.journals():
+            folder.close(finished=True)
+            say(f"{output} is finished: it is shown and drawn from the file.")
+            return Outcome(earlier, False, False)
+    checkpoint = None if resume is None else folder
+    results: dict[Any, Any] = {} if checkpoint is None else dict(checkpoint.done)
     run: dict[str, Any] = {
         "automatic_choice": automatic_choice,
         "command": os.fsencode(shlex.join(["jaxgran", *sys.argv[1:]])).decode(errors="backslashreplace"),
@@ -86,7 +109,7 @@ def measured(
         _say_resumed(checkpoint, count)
 
     Thread(target=_load_beside, args=(settings, load), daemon=True).start()
-    start, interrupted, finished = time.perf_counter(), False, False
+    start, interrupted, finished, written = time.perf_counter(), False, False, False
     try:
         with progress(costs, settings.seeds, quiet) as meter:
             meter.resumed(point for point, _ in results)
@@ -107,16 +130,28 @@ def measured(
 
         speed = {"wall_time_seconds": seconds, "replica_steps_per_second": meter.done_steps / seconds}
         data = map_dataset(settings, results, run | speed)
-        if output is not None and results:
+        if output is not None and any(results.values()) and not (interrupted and kept):
             write_dataset(data, output)
-        finished = len(results) == count
+            remove_pictures(output)
+            written = True
+        finished = sum(replica is not None for replica in results.values()) == count
     except OSError as error:
         advice = "" if checkpoint is None else f"; what is done is in {checkpoint.folder}: make room and add --resume"
         stop(f"stopped by the file system, {error.strerror or error}{advice}.", NO_FILE)
     finally:
-        if checkpoint is not None:
-            checkpoint.close(finished)
-    return data, interrupted
+        if folder is not None:
+            folder.close(finished or checkpoint is None)
+    return Outcome(data, interrupted, written)
+
+
+def _earlier(output: Path, settings) -> tuple[Any, str, bool]:
+    """The map that the output holds already, what is lost with it in words, and whether it is finished."""
+    if not output.exists():
+        return None, "", False
+    from jaxgran.maps.results import earlier_map, is_finished  # here, or every map would begin by loading xarray
+
+    data, lost = earlier_map(output, settings)
+    return data, lost, data is not None and is_finished(data)
 
 
 def _load_beside(settings, modules: Iterable[str]) -> None:
@@ -227,8 +262,6 @@ def _say_retried(data) -> None:
 
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
     """Print what was written and what went wrong, and exit with the matching status."""
-    started = bool((data.status_by_seed >= 0).any())  # without results, an existing file is an older one
-    written = [path for path in written if started and path.exists()]
     say_written(written)
     _say_imprecise(data)
     _say_retried(data)
@@ -236,7 +269,8 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
     _say_short(data, bad.pop("short_sample", []))
     if interrupted:
         missing = len(bad.get("not_run", []))
-        saved = "; what is done is saved" if written else ""
+        started = can_resume and bool((data.status_by_seed >= 0).any())
+        saved = "; what is done is saved" if started or written else ""
         resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
         stop(
             f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}", INTERRUPTED

@@ -68,6 +68,7 @@ def run_command(
         Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files, whatever they hold.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
     """Run one flow to its steady state, sample it, and print its averages with their errors."""
@@ -86,9 +87,12 @@ def run_command(
         **chosen_for(error),
         **{name: value for name, value in given.items() if value is not None},
     }
+    for name, file in (("trajectory", trajectory), ("movie", movie)):
+        if file is not None and file.is_file() and not overwrite:
+            raise InputError(f"{name} must be a new file, or --overwrite be given: {shown(str(file))} is there.")
     recorder, frames = _recorder(trajectory, movie, every, strain or _RECORDED_STRAIN)
     record = None if recorder is None else recorder.recording
-    data, interrupted = measured(chosen, "auto", 1, output, quiet, record=record)
+    data, interrupted, written = measured(chosen, "auto", 1, output, quiet, record=record, overwrite=overwrite)
     print_table(_summary_table(data))
     print_budget(data)
     if recorder is not None and recorder.frames:
@@ -97,7 +101,7 @@ def run_command(
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
             _write_movie(movie, frames, quiet)
-    finish(data, [output] if output else [], interrupted)
+    finish(data, [output] if output and written else [], interrupted)
 
 
 def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, strain: float):

@@ -40,9 +40,9 @@ _AXES = {
 
 
 def map_dataset(
-    settings: MapSettings, results: Mapping[Key, Replica], run: Mapping[str, str | float | int]
+    settings: MapSettings, found: Mapping[Key, Replica | None], run: Mapping[str, str | float | int]
 ) -> xr.Dataset:
-    """The dataset of the finished replicas; points without any are NaN with the status ``not_run``.
+    """The dataset of the finished replicas; points without any are NaN with the status ``not_run`` or ``failed``.
 
     ============================  ====================  =============================================================
     variable                      dimensions            meaning
@@ -80,7 +80,7 @@ def map_dataset(
 
     Args:
       settings: the map.
-      results: replicas by point (in the order of ``settings.flows()``) and seed.
+      found: replicas by point (in the order of ``settings.flows()``) and seed; None for those that were given up.
       run: further attributes to store: command, wall time, speed.
     """
     point_dims, shape = tuple(settings.axes), tuple(map(len, settings.axes.values()))
@@ -98,6 +98,9 @@ def map_dataset(
     equilibration = np.full((count, seeds), np.nan)
     strain = np.full((count, seeds), np.nan)
     timestep = np.full((count, seeds), np.nan)
+    results = {key: replica for key, replica in found.items() if replica is not None}
+    for key in found.keys() - results.keys():
+        status[key] = Status.failed
     for (point, seed), replica in results.items():
         status[point, seed], equilibration[point, seed] = replica.status, replica.strain
         tally = replica.sample.tally

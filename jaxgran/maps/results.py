@@ -9,7 +9,7 @@ import os
 from dataclasses import fields
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -18,6 +18,9 @@ import xarray as xr
 from jaxgran.files import replaced
 from jaxgran.maps.schema import RATIO, what_lacks
 from jaxgran.model.checks import InputError, shown
+
+if TYPE_CHECKING:
+    from jaxgran.maps.settings import MapSettings
 
 _MARK = b"SHA-256:"  # between the dataset and its checksum
 _DIGEST = hashlib.sha256().digest_size  # bytes
@@ -85,6 +88,30 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
         }
     except KeyError as missing:
         raise InputError(f"this dataset does not contain the {missing.args[0]} of its map.") from None
+
+
+def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None, str]:
+    """The map that is in a file already, or None, and what a map of these settings would replace there, in words.
+
+    The words are "" if it is a map of the same settings.
+    """
+    try:
+        data = read_dataset(path)
+        chosen = choices_of(data)
+    except InputError:
+        return None, "what is no map of this version"
+    for field in fields(settings):
+        there, here = chosen.get(field.name, field.default), getattr(settings, field.name)
+        if there != here:
+            return data, f"a map with {field.name} {shown(there)} and not {shown(here)}"
+    return data, ""
+
+
+def is_finished(data: xr.Dataset) -> bool:
+    """Whether a map has all its replicas."""
+    flags = dict(zip(data.status.attrs["flag_meanings"].split(), data.status.attrs["flag_values"], strict=True))
+    missing = [flags[name] for name in ("not_run", "failed") if name in flags]
+    return not np.isin(data.get("status_by_seed", data.status), missing).any()
 
 
 def differences(data: xr.Dataset) -> list[str]:

@@ -173,8 +173,8 @@ def replicas(
     warn: Callable[[str], None] = warnings.warn,
     scheduler: str | None = None,
     record: Wrap | None = None,
-) -> Generator[tuple[Key, Replica]]:
-    """Run every replica of a map and yield its key and result when its batch is done.
+) -> Generator[tuple[Key, Replica | None]]:
+    """Run every replica of a map and yield its key and result when its batch is done; None if it was given up.
 
     Args:
       settings: the map.
@@ -202,6 +202,7 @@ def replicas(
         for number, outcome in outcomes:
             if isinstance(outcome, Died):
                 warn(f"{outcome}: {_points(settings, tasks[number])} not measured.")
+                yield from ((key, None) for key in tasks[number])
                 continue
             if checkpoint is not None:
                 checkpoint.add(dict(outcome))

@@ -19,6 +19,7 @@ class Status(IntEnum):
     infeasible = 5  # no impulses satisfy the contact law: the packing is jammed
     capacity = 6  # more pairs or contacts than the buffers hold
     nonfinite = 7  # a position, velocity or impulse is not a finite number
+    failed = 8  # the processes that ran it died, and it was given up
 
 
 DEEP_OVERLAP = 1e-2  # σ

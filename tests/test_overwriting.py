@@ -1,0 +1,128 @@
+"""Nothing that took time is replaced by something else: it is refused in a sentence, until --overwrite is given."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas
+from drawn import leave_out_layout, write_without_drawing
+
+from jaxgran.maps import sweep
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.results import is_finished, read_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.status import Status
+
+MAP = ("map", *POINTS, "--seeds", "1")
+BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
+
+
+@pytest.fixture(autouse=True)
+def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps of made-up replicas, whose pictures are files of a few bytes."""
+    leave_out_layout(monkeypatch)
+    write_without_drawing(monkeypatch)
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas(BOTH))
+
+
+@pytest.fixture
+def finished(tmp_path: Path) -> bytes:
+    """The content of a finished map, jaxgran_map.nc."""
+    assert jaxgran(tmp_path, *MAP).status == 0
+    return (tmp_path / "jaxgran_map.nc").read_bytes()
+
+
+def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finished: bytes, tmp_path: Path) -> None:
+    before = files(tmp_path)
+    outcome = jaxgran(tmp_path, *MAP, "--strain", "9", "--grains", "64")
+    assert_one_sentence(outcome)
+    assert "--output must be another file, or --overwrite be given" in outcome.err
+    assert "'jaxgran_map.nc' has a map with grains 256 and not 64." in outcome.err
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
+    assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
+    assert read_dataset(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
+
+
+def test_the_same_map_may_be_repeated(finished: bytes, tmp_path: Path) -> None:
+    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3").status == 0  # as by default
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() != finished  # it has another command
+
+
+def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "jaxgran_map.nc").write_bytes(b"years of work")
+    outcome = jaxgran(tmp_path, *MAP)
+    assert_one_sentence(outcome)
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == b"years of work"
+
+
+def test_a_finished_map_is_taken_from_its_file_by_resume(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", None)  # nothing is run
+    (tmp_path / "jaxgran_map_curves.png").unlink()
+    outcome = jaxgran(tmp_path, *MAP, "--resume")
+    assert outcome.status == 0
+    assert "jaxgran_map.nc is finished: it is shown and drawn from the file." in outcome.err
+    assert "wrote jaxgran_map_curves.png" in outcome.err and "wrote jaxgran_map.nc" not in outcome.err
+    assert "Force ratio" in outcome.out
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+    assert_one_sentence(jaxgran(tmp_path, *MAP, "--resume", "--grains", "64"))
+
+
+def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+    half = dict(list(BOTH.items())[:1])
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas(half, KeyboardInterrupt))
+    for words in ([], ["--grains", "64", "--overwrite"]):
+        outcome = jaxgran(tmp_path, *MAP, *words)
+        assert outcome.status == 130
+        assert "1 points missing; what is done is saved" in outcome.err and "wrote" not in outcome.err
+        assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+        unfinished = tmp_path / "jaxgran_map.nc.unfinished"
+        assert list(unfinished.glob("done-*.nc"))
+        for path in unfinished.iterdir():
+            path.unlink()
+        unfinished.rmdir()
+
+
+def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> None:
+    assert jaxgran(tmp_path, *MAP, "--preset", "paper").status == 0
+    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
+    data = read_dataset(tmp_path / "jaxgran_map_paper.nc")
+    assert data.attrs["grains"] == 400 and is_finished(data)
+
+
+def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)}))
+    names = {"jaxgran_map_curves.png", "jaxgran_map_timestep.png", "jaxgran_map_clusters.png"}
+    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3,1e-4").status == 0
+    assert files(tmp_path) >= names
+    (tmp_path / "jaxgran_map_notes.png").touch()
+    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc").status == 0
+    assert files(tmp_path) >= names
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas(BOTH))
+    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
+    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
+    assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
+
+
+RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--grains", "32", "--output", "flow.nc")
+
+
+@pytest.mark.parametrize("option", ["trajectory", "movie"])
+def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
+    file = tmp_path / ("flow.gsd" if option == "trajectory" else "flow.gif")
+    file.write_bytes(b"frames")
+    outcome = jaxgran(tmp_path, *RUN, f"--{option}", file.name)
+    assert_one_sentence(outcome)
+    assert f"--{option} must be a new file, or --overwrite be given" in outcome.err
+    assert files(tmp_path) == {file.name}
+
+
+def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok}))
+    first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
+    outcome = jaxgran(tmp_path, *RUN)
+    assert_one_sentence(outcome)
+    assert "another process is writing 'flow.nc'" in outcome.err
+    first.close(finished=True)
+    assert jaxgran(tmp_path, *RUN).status == 0
+    assert files(tmp_path) == {"flow.nc"}
+    np.testing.assert_array_equal(read_dataset(tmp_path / "flow.nc").status, [[Status.ok]])
