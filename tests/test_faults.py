@@ -84,13 +84,16 @@ def test_workers_that_are_killed_one_after_the_other_are_replaced(lab: Lab) -> N
 
 
 @pytest.mark.parametrize("workers", WORKERS)
-def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab, workers: int) -> None:
-    output = f"interrupted{workers}.nc"
+@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(
+    lab: Lab, sent: signal.Signals, status: int, workers: int
+) -> None:
+    output = f"{sent.name}{workers}.nc"
     process = lab.start(output, workers=workers)
     lab.wait_for(output, process=process)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the workers too
+    os.killpg(process.pid, sent)  # as a terminal and Slurm do, to the workers too
     done = lab.finish(process)
-    assert done.returncode == 130
+    assert done.returncode == status
     *_, last = done.stderr.strip().splitlines()
     words = last.split("Continue: jaxgran ")[1].split()
     assert words[-1] == "--resume" and words[words.index("--output") + 1] == output

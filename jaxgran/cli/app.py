@@ -2,7 +2,7 @@
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -17,7 +17,14 @@ from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_comma
 from jaxgran.cli.mistakes import UsageError, by_option, in_words
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
 from jaxgran.cli.tables import use_plain_letters
-from jaxgran.cli.terminal import INTERRUPTED, NO_FILE, is_interruption, stop
+from jaxgran.cli.terminal import (
+    INTERRUPTED,
+    NO_FILE,
+    is_interruption,
+    sigterm_interrupts,
+    stop,
+    stop_interrupted,
+)
 from jaxgran.model.checks import InputError
 
 EXAMPLES = {
@@ -61,6 +68,12 @@ def command_line(
 def main() -> None:
     """Entry point: a mistake in the input ends with one sentence and exit status 2."""
     use_plain_letters()
+    with sigterm_interrupts():
+        _run()
+
+
+def _run() -> NoReturn:
+    """Run the command that is given, and exit."""
     try:
         status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
     except InputError as mistake:
@@ -76,7 +89,7 @@ def main() -> None:
             raise
         status = INTERRUPTED
     if status == INTERRUPTED:  # typer returns this status after Ctrl-C
-        stop("interrupted.", INTERRUPTED)
+        stop_interrupted("interrupted.")
     raise SystemExit(status)
 
 

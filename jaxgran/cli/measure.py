@@ -16,7 +16,6 @@ from jaxgran.cli.progress import progress
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import (
     BAD_STATUS,
-    INTERRUPTED,
     NO_FILE,
     configured_jax,
     is_interruption,
@@ -24,6 +23,7 @@ from jaxgran.cli.terminal import (
     say,
     say_written,
     stop,
+    stop_interrupted,
 )
 from jaxgran.environment import usable_cores
 from jaxgran.model.checks import InputError, shown
@@ -272,9 +272,7 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
         started = can_resume and bool((data.status_by_seed >= 0).any())
         saved = "; what is done is saved" if started or written else ""
         resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
-        stop(
-            f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}", INTERRUPTED
-        )
+        stop_interrupted(f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}")
     if bad:
         which = "the flow has" if data.status.size == 1 else "points marked * have"
         words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())

@@ -7,14 +7,17 @@ exit status  meaning
 1            the file system failed
 2            a mistake in the input
 3            finished, but a point has a bad status, or a fit failed
-130          interrupted
+130          interrupted (Ctrl-C)
+143          ended by SIGTERM, which Slurm sends before it kills
 ===========  ========================================================
 """
 
 import os
+import signal
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import NoReturn
@@ -26,6 +29,9 @@ NO_FILE = 1
 INPUT_MISTAKE = 2
 BAD_STATUS = 3
 INTERRUPTED = 130
+TERMINATED = 143
+
+_terminated = False  # whether SIGTERM has come
 
 
 def configured_jax():
@@ -84,8 +90,32 @@ def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
     raise SystemExit(status)
 
 
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """SIGTERM interrupts the block as Ctrl-C does, once; the exit status tells them apart."""
+    global _terminated
+    _terminated = False
+
+    def interrupt(*_: object) -> NoReturn:
+        global _terminated
+        _terminated = True
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is done is being saved
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def stop_interrupted(sentence: str) -> NoReturn:
+    """Print that the command was interrupted, and exit with the status of the signal."""
+    stop(sentence, TERMINATED if _terminated else INTERRUPTED)
+
+
 def is_interruption(error: BaseException | None) -> bool:
-    """Whether Ctrl-C led to the error: compiled code that Python interrupts raises an error of its own instead."""
+    """Whether Ctrl-C or SIGTERM led to the error: compiled code that is interrupted raises an error of its own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None

@@ -18,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxgran.dynamics.advance import advance, register_machine_code
+from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS
@@ -116,14 +117,14 @@ def batch_program(function: Callable, register: Callable[[], None] = lambda: Non
     @wraps(function)
     def program(flow, *arguments):
         if in_lockstep(flow.engine) or jax.device_count() > 1:
-            return together(flow, *arguments)
+            return waited(together(flow, *arguments))
         batch = jax.tree.map(_on_host, (flow, *arguments))
         count = len(jax.tree.leaves(batch)[0])
         groups = []
         for first in range(0, count, _GROUP):
             places = np.arange(first, first + _GROUP)
             filled = jax.tree.map(lambda x, k=places: x[np.minimum(k, count - 1)], batch)
-            groups.append(jax.tree.map(np.asarray, in_group(places < count, filled)))
+            groups.append(jax.tree.map(np.asarray, waited(in_group(places < count, filled))))
         return jax.tree.map(lambda *x: np.concatenate(x)[:count], *groups)
 
     return program

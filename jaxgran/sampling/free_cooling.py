@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, listed, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
@@ -85,7 +86,7 @@ def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Coo
     times = _require_times(flow, times)
     _require_slow(flow, state)
     require_match(flow, state)
-    return _cooling(flow, state, times)
+    return waited(_cooling(flow, state, times))
 
 
 @jax.jit

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import select_engine
+from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.plain import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
@@ -291,7 +292,7 @@ def sample(
         if function is not None and not callable(function):
             raise InputError(f"{name} must be a function or None, not {shown(function)}.")
     if callback is None:
-        return _sample(flow, state, strain, blocks, observe)
+        return waited(_sample(flow, state, strain, blocks, observe))
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, state, strain))):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
     return _sample_with_callback(flow, state, strain, blocks, observe, callback)
@@ -345,7 +346,7 @@ def _sample_with_callback(
     """The sample, block by block, with a call of ``callback`` after each."""
     parts: list[Sample] = []
     for steps in np.asarray(_steps_of_blocks(flow, strain, blocks)):
-        state, part = _sample_one_block(flow, state, jnp.asarray([steps]), observe)
+        state, part = waited(_sample_one_block(flow, state, jnp.asarray([steps]), observe))
         parts.append(part)
         if callback(state, _joined(parts)):
             break

@@ -10,6 +10,8 @@ import hashlib
 import os
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from multiprocessing import parent_process
@@ -23,6 +25,7 @@ from jaxgran.caches import cache_folder, users_folder
 from jaxgran.files import keep, one_at_a_time, read_kept
 
 TARGET = "jaxgran_advance"
+_STOP = "jaxgran_stop"  # a word in the memory of the machine code; it runs while this is zero
 _LOCK = Lock()
 _MOST_KEPT = 8  # versions of the machine code in the cache
 _IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
@@ -76,6 +79,7 @@ def _register() -> None:
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
     _ENGINES.append(engine)
+    _STOP_WORDS.append(ctypes.c_int64.from_address(engine.get_global_value_address(_STOP)))
     new = ctypes.pythonapi.PyCapsule_New
     new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     jax.ffi.register_ffi_target(TARGET, new(engine.get_function_address(TARGET), None, None), platform="cpu")
@@ -85,7 +89,7 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     """The machine code, compiled and kept if possible."""
     from jaxgran.dynamics.machine_code.handler import object_code
 
-    content = object_code(TARGET, machine)
+    content = object_code(TARGET, _STOP, machine)
     try:
         keep(path, content, _MOST_KEPT)
     except OSError as error:
@@ -100,4 +104,17 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     return content
 
 
+@contextmanager
+def stopped() -> Iterator[None]:
+    """All machine code that runs in this process ends within the block, with the status ``failed``."""
+    for word in _STOP_WORDS:
+        word.value = 1
+    try:
+        yield
+    finally:
+        for word in _STOP_WORDS:
+            word.value = 0
+
+
 _ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the machine code
+_STOP_WORDS: list[ctypes.c_int64] = []

@@ -17,10 +17,11 @@ from jaxgran.dynamics.machine_code.memory import arrays_of, doubles, integers
 _EXTENSIONS, _INTERFACE, _ARGUMENTS, _RESULTS = 1, 2, 9, 14  # words of a frame
 _DATA, _DIMS = 3, 5  # words of a buffer
 _ENTRY = """
+@%s = global i64 0
 define i64 @%s(i64 %%frame) {
   %%result = alloca i64
   %%exception = alloca ptr
-  call i32 @%s(ptr %%result, ptr %%exception, i64 %%frame)
+  call i32 @%s(ptr %%result, ptr %%exception, i64 %%frame, i64 ptrtoint (ptr @%s to i64))
   %%returned = load i64, ptr %%result
   ret i64 %%returned
 }
@@ -44,8 +45,8 @@ def _length(buffers, k):
     return _word(_word(_word(buffers, k), _DIMS), 0)
 
 
-def _handler(frame):
-    """``advance_loop``: arguments and results are buffers of a call frame."""
+def _handler(frame, stop):
+    """``advance_loop``: arguments and results are buffers of a call frame; ``stop`` is the address of a word."""
     extension = _word(frame, _EXTENSIONS)
     if extension != 0:
         metadata = integers(_word(extension, 3), (4,))
@@ -71,15 +72,16 @@ def _handler(frame):
         doubles(_data(made, 1), (grains, 2)),
         results,
         arrays,
+        integers(stop, (1,)),
     )
     return 0
 
 
-def object_code(symbol: str, machine: llvm.TargetMachine) -> bytes:
-    """The handler and all that it calls as an object file for a processor."""
-    made = njit(types.int64(types.int64), **OPTIONS)(_handler)
+def object_code(symbol: str, stop: str, machine: llvm.TargetMachine) -> bytes:
+    """The handler and all that it calls as an object file for a processor, with the word that stops it."""
+    made = njit(types.int64(types.int64, types.int64), **OPTIONS)(_handler)
     (kept,) = made.overloads.values()
     (code,) = made.inspect_llvm().values()
-    module = llvm.parse_assembly(code + _ENTRY % (symbol, kept.fndesc.mangled_name))
+    module = llvm.parse_assembly(code + _ENTRY % (stop, symbol, kept.fndesc.mangled_name, stop))
     module.verify()
     return machine.emit_object(module)

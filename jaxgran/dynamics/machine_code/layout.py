@@ -30,6 +30,7 @@ LANES = 64  # entries of the calendar that are compared together
 EPSILON = float(np.finfo(np.float64).eps)
 OK, ITERATION_LIMIT = int(Status.ok), int(Status.iteration_limit)
 INFEASIBLE, CAPACITY, NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
+FAILED = int(Status.failed)
 
 
 class Flow(NamedTuple):

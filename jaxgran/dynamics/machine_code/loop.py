@@ -29,6 +29,7 @@ from jaxgran.dynamics.machine_code.compiled import LAW, compiled
 from jaxgran.dynamics.machine_code.layout import (
     CAPACITY,
     EPSILON,
+    FAILED,
     FIRST,
     INVERSE_MASS,
     MANY,
@@ -64,7 +65,7 @@ _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @compiled
-def advance_loop(positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, arrays):
+def advance_loop(positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, arrays, stop):
     """Advance one replica.
 
     Args:
@@ -75,6 +76,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         solve, and steps.
       results: (RESULTS,) receives the running sums, the status and the tilt.
       arrays: memory of the loop, see ``memory``.
+      stop: (1,), a number that others set; the loop ends with the status ``failed`` where it is not zero.
     """
     side, tilt, alpha, dt, rate = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     flow = Flow(side, rate, dt, numbers[6], 1.0 + alpha, numbers[5], int(numbers[7]))
@@ -91,7 +93,7 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
 
     done, solved = 0, 0  # steps until the last search; whether the contacts of the present step have been dealt with
     status = OK if finite else NONFINITE
-    while done < steps and status != NONFINITE:
+    while done < steps and status < NONFINITE:
         fastest = bring_into_cell(grains, side, tilt, rate)
         kinetic = kinetic_sums(grains, rate)
         needed = 1.2 * (2 * fastest * (1 + LIFE) + rate * largest) * ahead  # what one step may need
@@ -119,6 +121,9 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             kinetic = add_flight(results, k - before, flight, rate * flight, kinetic)
             slack -= loss * flight
             solved = solved if k == before else 0
+            if stop[0] != 0:
+                status = FAILED
+                break
             if done + k >= steps or strike > k or (k > before and slack < -16 * EPSILON * skin):
                 break
 

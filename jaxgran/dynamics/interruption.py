@@ -1,0 +1,36 @@
+"""Ctrl-C while compiled code runs: the wait for its results ends at once, and so does the machine code."""
+
+import sys
+import time
+from typing import TypeVar
+
+import jax
+
+_FFI = "jaxgran.dynamics.machine_code.ffi"
+_PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
+T = TypeVar("T")
+
+
+def waited(results: T) -> T:
+    """The results when they are computed.
+
+    Ctrl-C, or whatever raises a KeyboardInterrupt, ends all machine code of the process within a step of its flow.
+    The engine "jax" cannot be stopped: what it was asked for is computed beside what follows, and lost.
+    """
+    try:
+        return jax.block_until_ready(results)
+    except KeyboardInterrupt:
+        if _FFI in sys.modules:
+            with sys.modules[_FFI].stopped():
+                _wait(results)
+        raise
+
+
+def _wait(results: object) -> None:
+    end = time.monotonic() + _PATIENCE
+    while time.monotonic() < end and not all(_is_there(leaf) for leaf in jax.tree.leaves(results)):
+        time.sleep(0.01)
+
+
+def _is_there(leaf: object) -> bool:
+    return not isinstance(leaf, jax.Array) or leaf.is_ready()

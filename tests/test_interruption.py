@@ -1,0 +1,53 @@
+"""Ctrl-C ends what is computed at once, and leaves the machine code as it was."""
+
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgran.dynamics.machine_code import ffi
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.status import Status
+from jaxgran.sampling.sample import sample
+
+SECOND = 1.0
+FLOW = ShearFlow(pytest.GRAINS, 0.7, 0.7, 1e-3)
+
+
+def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flowing) -> None:
+    advance, state = engines["machine_code"], flowing(0.7)
+    end, whole = advance(FLOW, state, 1000)
+    with ffi.stopped():
+        _, cut = advance(FLOW, state, 1000)
+    assert cut.outcome == Status.failed and cut.steps < 1000
+    again, tally = advance(FLOW, state, 1000)
+    assert tally.outcome == whole.outcome == Status.ok
+    np.testing.assert_array_equal(again.positions, end.positions)
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="no signals to a thread")
+def test_a_sample_of_hours_ends_within_a_second_of_ctrl_c(flowing) -> None:
+    state = flowing(0.7)
+    _, before = sample(FLOW, state, 0.1)
+    sent = []
+
+    def interrupt() -> None:
+        sent.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    timer = threading.Timer(0.5, interrupt)
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        sample(replace(FLOW, timestep=1e-5), state, 1e4)
+    assert time.monotonic() - sent[0] < SECOND
+    computing = time.process_time()
+    time.sleep(0.2)
+    assert time.process_time() - computing < 0.1  # nothing goes on beside
+    _, after = sample(FLOW, state, 0.1)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), before, after))
