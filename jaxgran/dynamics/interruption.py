@@ -28,9 +28,6 @@ def waited(results: T) -> T:
 
 def _wait(results: object) -> None:
     end = time.monotonic() + _PATIENCE
-    while time.monotonic() < end and not all(_is_there(leaf) for leaf in jax.tree.leaves(results)):
+    arrays = [leaf for leaf in jax.tree.leaves(results) if hasattr(leaf, "is_ready")]
+    while time.monotonic() < end and not all(array.is_ready() for array in arrays):
         time.sleep(0.01)
-
-
-def _is_there(leaf: object) -> bool:
-    return not isinstance(leaf, jax.Array) or leaf.is_ready()
