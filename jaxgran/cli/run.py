@@ -1,6 +1,7 @@
 """The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
 import math
+import os
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -88,7 +89,7 @@ def run_command(
         **{name: value for name, value in given.items() if value is not None},
     }
     for name, file in (("trajectory", trajectory), ("movie", movie)):
-        if file is not None and file.is_file() and not overwrite:
+        if file is not None and os.path.isfile(file) and not overwrite:
             raise InputError(f"{name} must be a new file, or --overwrite be given: {shown(str(file))} is there.")
     recorder, frames = _recorder(trajectory, movie, every, strain or _RECORDED_STRAIN)
     record = None if recorder is None else recorder.recording
