@@ -63,7 +63,7 @@ def run(output: Output) -> None:
             rows.append(row | parts_of(words, folder))
             print_row(rows[-1])
         sample = float(process([sys.executable, "-c", _SAMPLE], folder).stdout)
-    print(f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms of Python until it returns")
+    print(f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms until it returns")
     output.write_rows("startup", {"runs": RUNS, "sample_milliseconds": sample}, "commands", rows)
 
 

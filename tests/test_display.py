@@ -208,4 +208,4 @@ def test_rounding_moves_a_value_by_less_than_its_error_and_the_error_by_a_sevent
     digits, _, power = with_error(sign * value, error).strip("(").partition(")e")
     shown, rounded_error = (float(x) * 10.0 ** int(power or 0) for x in digits.split(" ± "))
     assert rounded_error == pytest.approx(error, rel=1 / 7)
-    assert abs(shown - sign * value) <= 0.51 * error + 1e-6 * value
+    assert abs(shown - sign * value) <= 0.51 * error + 5.1e-7 * value

@@ -79,7 +79,7 @@ def with_error(value: float, error: float) -> str:
       ('59 ± 6', '1.00012 ± 0.00019', '(-0.8 ± 1.0)e-06')
     """
     if not (math.isfinite(value) and _LEAST_SHOWN * abs(value) < error < math.inf):
-        return f"{value:.6g} ± {error:.2g}"
+        return f"{value:.7g} ± {error:.2g}"
     digits, power = f"{error:.2e}".split("e")
     last = int(power) - (float(digits) < _TWO_DIGITS)  # power of ten of the last digit
     largest = math.floor(math.log10(max(abs(value), error)))
