@@ -743,7 +743,7 @@ def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> 
     """A map has made-up replicas, of which the last has a bad status, and its figures are not drawn."""
     leave_out_layout(monkeypatch)
     write_without_drawing(monkeypatch)
-    write_few_variables(monkeypatch, "pressure_large_system")
+    write_few_variables(monkeypatch, "pressure_large_system", "pressure_large_system_error")
     statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
     monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
 

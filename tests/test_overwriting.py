@@ -9,6 +9,7 @@ from drawn import leave_out_layout, write_without_drawing
 
 from jaxgran.maps import sweep
 from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import is_finished, read_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
@@ -86,7 +87,7 @@ def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> N
     assert jaxgran(tmp_path, *MAP, "--preset", "paper").status == 0
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
     data = read_dataset(tmp_path / "jaxgran_map_paper.nc")
-    assert data.attrs["grains"] == 400 and is_finished(data)
+    assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
 
 
 def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
