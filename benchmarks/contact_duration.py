@@ -57,7 +57,7 @@ class Plan(NamedTuple):
     reference_runs: Runs
 
 
-DECADES = tuple(float(f"1e-{k}") for k in range(2, 8))
+DECADES = tuple(float(f"1e-{k}") for k in range(2, 9))
 FULL = Plan(
     (0.2, 0.5), (0.6, 0.75), Runs(256, 4, 25.0), DECADES[4::-1], DECADES, tuple(EVENT_DRIVEN), Runs(1000, 2, 100.0)
 )
@@ -200,7 +200,9 @@ def draw(flows: list[Flow], discs: list[dict], grains: list[dict]) -> Figure:
     handles, labels = zip(
         *(pair for line in panels[:, 0] for pair in zip(*line.get_legend_handles_labels(), strict=True)), strict=True
     )
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=min(3, len(flows)), fontsize="small", frameon=False
+    )
     return figure
 
 

@@ -5,6 +5,7 @@ import pytest
 from oracles import gaps_of
 
 from benchmarks import event_driven
+from benchmarks.collapse import roots
 from benchmarks.event_driven import Discs, Law, averages, sheared
 
 ROUNDING = 1e-12
@@ -127,3 +128,15 @@ def test_a_collapse_and_a_small_cell_are_refused(monkeypatch) -> None:
     monkeypatch.setattr(event_driven, "MOST_COLLISIONS", 50)
     with pytest.raises(RuntimeError, match="collapse"):
         sheared(lattice(10, 0.5), Law(0.5), 1.0)
+
+
+@pytest.mark.parametrize("restitution", [0.02, 0.05])
+def test_a_shorter_duration_adds_the_collisions_of_a_collapse(restitution) -> None:
+    """Three discs in a row: the time between collisions falls by λ₋/λ₊ at each, see ``benchmarks.collapse``."""
+    before, exact, added = row([4.0, 5.1, 6.25], [1.0, 0.0, -1.0]), roots(3, restitution), 3
+    found = []
+    for duration in 1e-4 * (exact.smaller / exact.larger) ** np.arange(0, 2 * added, added):
+        after, sums = sheared(before, Law(restitution, duration, shear_rate=0.0), 10.0)
+        assert np.all(np.diff(after.velocities[:, 0]) > 0)
+        found.append(sums["collisions"] - sums["elastic"])
+    assert found[1] - found[0] == added
