@@ -41,6 +41,9 @@ GAP, DURATION = 0.1, 0.5  # σ, and σ over the first speed: the first flight ta
 GRAINS, SIDE = 32, 20.0  # the discs that are not in the row rest elsewhere
 TIMESTEPS = 10.0 ** -np.arange(2, 8.25, 0.5)  # σ over the first speed
 COARSE, FINE = 1e-4, 3e-8  # time steps between which the laws of vanishing dt are measured
+LAWS = ("most_steps", "steps_per_decade", "exponent")  # what is measured above, and below the threshold
+LEAST = 1e-6  # smallest excess that is drawn
+MIDDLE = 7  # time step through which the lines of the exact slopes are drawn
 
 advance = jax.jit(jg.advance)
 
@@ -116,17 +119,15 @@ def run(output: Output) -> None:
     for one in rows:
         print(f"{one['discs']:5d}{one['restitution']:7g}   " + "   ".join(described(law, one.get(law)) for law in LAWS))
     choices = {
-        "gaps": list(gaps),
         "first_gap": GAP,
+        "second_gap": (gaps[0], gaps[-1]),
+        "starts": len(gaps),
         "duration": DURATION,
         "slopes_between": (COARSE, FINE),
         "thresholds": THRESHOLDS,
     }
     output.write_rows("collapse", {"run": choices, "timesteps": list(TIMESTEPS)}, "rows", rows)
     output.write_picture(draw(rows), "collapse")
-
-
-LAWS = ("most_steps", "steps_per_decade", "exponent")
 
 
 def described(law: str, values: tuple | None) -> str:
@@ -142,8 +143,10 @@ def study(discs: int, restitution: float, gaps: np.ndarray) -> dict:
     """Means over the starts at each time step, and the law of vanishing dt, measured and exact."""
     states = [row(discs, gap) for gap in gaps]
     steps, excess = np.stack([measured(restitution, dt, states) for dt in TIMESTEPS], axis=1)
-    found = {"discs": discs, "restitution": restitution, "steps": list(steps.mean(axis=1))}
-    found["excess"] = list(excess.mean(axis=1))
+    found = {"discs": discs, "restitution": restitution}
+    for name, values in (("steps", steps), ("excess", excess)):
+        found[name] = list(values.mean(axis=1))
+        found[f"{name}_error"] = list(values.std(axis=1, ddof=1) / np.sqrt(len(gaps)))
     if restitution > THRESHOLDS[discs]:
         return found | {"most_steps": (float(steps.max()), most_collisions(discs, restitution))}
     exact = roots(discs, restitution)
@@ -177,14 +180,16 @@ def draw(rows: list[dict]) -> Figure:
                 "color": ("black", "tab:blue", "tab:red")[k % 3],
                 "marker": "osD"[k % 3],
                 "markersize": 4.5,
+                "capsize": 2,
                 "markerfacecolor": None if collapses else "white",
                 "linestyle": "none" if collapses else ":",
                 "label": f"r = {one['restitution']:g}",
             }
             steps, excess = np.array(one["steps"]), np.array(one["excess"])
             seen = excess > LEAST
-            panels[0, column].plot(TIMESTEPS, steps, **style)
-            panels[1, column].plot(TIMESTEPS[seen], excess[seen], **style)
+            panels[0, column].errorbar(TIMESTEPS, steps, one["steps_error"], **style)
+            error = np.minimum(one["excess_error"], 0.9 * excess)[seen]
+            panels[1, column].errorbar(TIMESTEPS[seen], excess[seen], error, **style)
             if collapses:
                 exact = roots(discs, one["restitution"])
                 decades = np.log10(TIMESTEPS / TIMESTEPS[MIDDLE])
@@ -201,13 +206,10 @@ def draw(rows: list[dict]) -> Figure:
     return figure
 
 
-LEAST = 1e-6  # smallest excess that is drawn
-MIDDLE = 7  # time step through which the lines of the exact slopes are drawn
-
-
 def dress(steps: Axes, excess: Axes) -> None:
     """Scales and labels, that panels share."""
     steps.set(xscale="log", ylim=(0, 30), ylabel="steps with contacts (mean over starts)")
     excess.set(yscale="log", ylim=(LEAST, 2), ylabel="excess of the force ratio, ⟨F⟩/⟨F_bc⟩ − 1")
     steps.text(0.02, 0.02, "lines: exact slopes 1/log₁₀(λ₊/λ₋)", transform=steps.transAxes, fontsize="small")
-    excess.text(0.02, 0.02, "lines: dt^β, exact exponents", transform=excess.transAxes, fontsize="small")
+    words = {"transform": excess.transAxes, "fontsize": "small", "ha": "right"}
+    excess.text(0.98, 0.02, "lines: dt^β, exact exponents", **words)
