@@ -4,7 +4,8 @@ The same flows are run twice, N = 256: by jaxgran at several time steps dt, and 
 of contact t_c. Both end the inelastic collapse. Collisions within one dt are solved together, and collisions within t_c
 of an earlier one are elastic. For each dt the study asks at which t_c the event-driven discs collide as often, and at
 which the elastic collisions have the share of the contact pressure that jaxgran's clusters have. If dt were a duration
-of contact, both answers would be c dt with one c for all dt and flows.
+of contact, both answers would be c dt with one c for all dt and flows. Between 1e-6 and 1e-3 each curve is also fitted
+by a power of its time.
 
 First the event-driven program itself, at t_c = 0 and N = 1000, is compared with the values of another one that
 ``validation`` has.
@@ -34,6 +35,9 @@ from jaxgran.statistics import standard_errors
 BLOCKS = 32  # of a sample, for its errors
 STEPPED = (*OBSERVABLES, "collision_rate", "force_ratio", "cluster_pressure_share")
 MATCHED = {"collision_rate": "collision_rate", "cluster_pressure_share": "elastic_pressure_share"}
+OF_DISCS = ("collision_rate", "elastic_pressure_share")  # what is fitted by powers
+OF_GRAINS = ("collision_rate", "cluster_pressure_share", "force_ratio")
+FITTED = (1e-6, 1e-3)  # of t_c and dt
 Flow = tuple[float, float]  # packing fraction and restitution
 
 
@@ -59,9 +63,7 @@ class Plan(NamedTuple):
 
 TIMESTEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 DURATIONS = (5e-3, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # at 1e-2 dense flows heat up without end
-FULL = Plan(
-    (0.2, 0.5), (0.6, 0.75), Runs(256, 4, 25.0), TIMESTEPS, DURATIONS, tuple(EVENT_DRIVEN), Runs(1000, 2, 100.0)
-)
+FULL = Plan((0.2, 0.5), (0.6, 0.75), Runs(256, 3, 16.0), TIMESTEPS, DURATIONS, tuple(EVENT_DRIVEN), Runs(1000, 2, 50.0))
 QUICK = Plan((0.2,), (0.6,), Runs(64, 2, 4.0), TIMESTEPS[2:4], DURATIONS[:4], ((0.6, 0.7),), Runs(256, 2, 5.0))
 
 
@@ -77,9 +79,15 @@ def run(output: Output) -> None:
     discs = [row for rows in done[len(plan.reference) :] for row in rows]
     grains = stepped(plan)
     matches = [match for row in grains for match in matched(row, [one for one in discs if one["flow"] == row["flow"]])]
-    report(reference, matches)
+    powers = [
+        fitted(rows, flow, name)
+        for flow in flows
+        for rows, names in ((discs, OF_DISCS), (grains, OF_GRAINS))
+        for name in names
+    ]
+    report(reference, matches, powers)
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    head |= {"reference": reference, "matches": matches, "event_driven": discs}
+    head |= {"reference": reference, "matches": matches, "powers": powers, "event_driven": discs}
     output.write_rows("contact_duration", head, "jaxgran", grains)
     output.write_picture(draw(flows, discs, grains), "contact_duration")
 
@@ -160,8 +168,25 @@ def matched(row: dict, discs: list[dict]) -> list[dict]:
     return found
 
 
-def report(reference: list[dict], matches: list[dict]) -> None:
-    """Print the event-driven averages beside the others', and the quotients t_c/dt."""
+def fitted(rows: list[dict], flow: Flow, name: str) -> dict:
+    """Exponent of a power of the time, with its error, for one curve; of a force ratio, its excess.
+
+    The error grows with √(χ² per degree of freedom) where the curve is no power. None where there is nothing to fit.
+    """
+    some = [row for row in rows if tuple(row["flow"]) == flow and FITTED[0] <= row["time"] <= FITTED[1]]
+    times, value, error = np.array([(row["time"], *row[name]) for row in some]).T
+    value = value - (name == "force_ratio")
+    found = {"flow": flow, "observable": name, "exponent": None, "error": None}
+    if np.all(value > 0) and np.all(error > 0):
+        place, weight = np.log(times), value / error
+        powers, covariance = np.polyfit(place, np.log(value), 1, w=weight, cov="unscaled")
+        chi2 = np.sum((weight * (np.log(value) - np.polyval(powers, place))) ** 2) / max(1, len(some) - 2)
+        found |= {"exponent": float(powers[0]), "error": float(np.sqrt(covariance[0, 0] * max(1.0, chi2)))}
+    return found
+
+
+def report(reference: list[dict], matches: list[dict], powers: list[dict]) -> None:
+    """Print the event-driven averages beside the others', the quotients t_c/dt, and the exponents of all flows."""
     print("event-driven, N and strain as in the plan (the other program)")
     for row in reference:
         values = ("{:9.4f} ± {:6.4f} ({:6.4g})".format(*row[name]) for name in OBSERVABLES)
@@ -173,6 +198,12 @@ def report(reference: list[dict], matches: list[dict]) -> None:
             for m in (one, two)
         )
         print("ν {:4g}  α {:3g}".format(*one["flow"]), f"dt {one['timestep']:6g}", *texts)
+    print("exponents of", *(f"{name:>24}" for name in (*OF_DISCS, *OF_GRAINS)), " (two of t_c, three of dt)")
+    count = len(OF_DISCS) + len(OF_GRAINS)
+    for first in range(0, len(powers), count):
+        some = powers[first : first + count]
+        texts = (f"{p['exponent']:16.3f} ± {p['error']:5.3f}" if p["exponent"] else f"{'–':>24}" for p in some)
+        print("ν {:4g}  α {:3g}".format(*some[0]["flow"]), *texts)
 
 
 def draw(flows: list[Flow], discs: list[dict], grains: list[dict]) -> Figure:
