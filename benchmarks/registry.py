@@ -115,7 +115,7 @@ BENCHMARKS = (
     Benchmark(
         "contact_duration",
         "Is a time step a duration of contact of event-driven discs?",
-        (15, 1),
+        (10, 1),
         ("contact_duration.json", "contact_duration.png"),
     ),
     Benchmark(
