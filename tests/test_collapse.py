@@ -25,7 +25,6 @@ def test_roots_of_a_collapse_are_real_below_the_threshold(discs, angle) -> None:
     assert half_trace(discs, threshold) ** 2 == pytest.approx(threshold, rel=1e-14)
     larger, smaller = roots(discs, 0.9 * threshold)
     assert 0 < smaller < larger < 1
-    assert most_collisions(discs, 1.0) == discs  # elastic discs pass their velocities on
 
 
 @pytest.mark.parametrize(("discs", "restitution"), [(3, 0.08), (3, 0.1), (3, 0.3), (4, 0.18), (4, 0.2), (4, 0.5)])
