@@ -106,6 +106,19 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "collapse",
+        "What does a time step do to an inelastic collapse of three and four discs?",
+        (1, 0.4),
+        ("collapse.json", "collapse.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "contact_duration",
+        "Is a time step a duration of contact of event-driven discs?",
+        (10, 1),
+        ("contact_duration.json", "contact_duration.png"),
+    ),
+    Benchmark(
         "free_cooling",
         "How long does a gas without shear follow Haff's law?",
         (2, 1),

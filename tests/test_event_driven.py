@@ -1,0 +1,142 @@
+"""The event-driven reference obeys conservation laws, Enskog's rate and its own law of a collision."""
+
+import numpy as np
+import pytest
+from oracles import gaps_of
+
+from benchmarks import event_driven
+from benchmarks.collapse import roots
+from benchmarks.event_driven import Discs, Law, averages, sheared
+
+ROUNDING = 1e-12
+
+
+def lattice(across: int, packing_fraction: float, polydispersity: float = 0.26, seed: int = 0) -> Discs:
+    """Discs on a square lattice, with random velocities of temperature one and no total momentum."""
+    rng, count = np.random.default_rng(seed), across**2
+    diameters = rng.permutation(1 + polydispersity * (2 * (np.arange(count) + 0.5) / count - 1))
+    side = np.sqrt(np.pi / 4 * np.sum(diameters**2) / packing_fraction)
+    places = (np.stack(np.divmod(np.arange(count), across), axis=-1) + 0.5) * side / across
+    masses = diameters**2
+    velocities = rng.normal(size=(count, 2)) / np.sqrt(masses)[:, None]
+    velocities -= masses @ velocities / np.sum(masses)
+    velocities *= np.sqrt(2 * count / np.sum(masses[:, None] * velocities**2))
+    return Discs(diameters / 2, masses, places, velocities, np.full(count, -np.inf), side, 0.0)
+
+
+def row(positions: list[float], velocities: list[float]) -> Discs:
+    """Equal discs on a line."""
+    places = np.stack([np.asarray(positions), np.full(len(positions), 5.0)], axis=-1)
+    speeds = np.stack([np.asarray(velocities), np.zeros(len(velocities))], axis=-1)
+    ones = np.ones(len(positions))
+    return Discs(ones / 2, ones, places, speeds, -np.inf * ones, 20.0, 0.0)
+
+
+def energy(discs: Discs) -> float:
+    return float(np.sum(discs.masses[:, None] * discs.velocities**2) / 2)
+
+
+@pytest.fixture(scope="module")
+def flow() -> tuple[Discs, Discs, dict, Law]:
+    """Discs before and after a strain of two with a duration of contact, and the sums over it."""
+    law, before = Law(0.3, 1e-3), lattice(10, 0.5)
+    return before, *sheared(before, law, 2.0), law
+
+
+def test_momentum_is_kept_and_no_discs_overlap(flow) -> None:
+    before, after, sums, _ = flow
+    assert sums["collisions"] > 500
+    np.testing.assert_allclose(after.masses @ after.velocities, 0, atol=1e-9)
+    gaps = gaps_of(after.positions, after.radii, after.side, after.tilt)
+    assert np.min(gaps) > -ROUNDING
+    assert np.max(np.abs(after.positions - before.positions)) > 1
+
+
+def test_power_of_the_shear_is_dissipated_or_heats_the_discs(flow) -> None:
+    before, after, sums, law = flow
+    work = averages(sums, after)["shear_stress"] * law.shear_rate * sums["duration"] * after.side**2
+    assert work > 10
+    np.testing.assert_allclose(work, sums["dissipation"] + energy(after) - energy(before), rtol=1e-10)
+
+
+def test_some_collisions_of_a_duration_are_elastic_and_all_at_a_long_one(flow) -> None:
+    _, after, sums, _ = flow
+    found = averages(sums, after)
+    assert 0 < found["elastic_share"] < 0.5 and 0 < found["elastic_pressure_share"] < 0.5
+    before = after._replace(last=np.zeros_like(after.last))
+    end, sums = sheared(before, Law(0.3, 1e9, shear_rate=0.0), 1.0)
+    assert sums["elastic"] == sums["collisions"] > 100
+    assert sums["dissipation"] == 0
+    assert energy(end) == pytest.approx(energy(before), rel=ROUNDING)
+
+
+@pytest.mark.parametrize("move", [(0.0, 3.7), (1.3, -12.1)])
+def test_flow_is_the_same_everywhere(move) -> None:
+    """Moved by any vector, through the sheared boundary too, the same discs collide at the same times."""
+    law, before = Law(0.5, 1e-3), lattice(10, 0.5, seed=1)
+    _, sums = sheared(before, law, 0.4, blocks=2)
+    _, moved = sheared(before._replace(positions=before.positions + move), law, 0.4, blocks=2)
+    for name, values in sums.items():
+        np.testing.assert_allclose(moved[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def test_flow_does_not_depend_on_the_list_of_near_pairs(monkeypatch) -> None:
+    law, before = Law(0.9), lattice(12, 0.3)
+    one, sums = sheared(before, law, 1.0)
+    monkeypatch.setattr(event_driven, "MOST_SKIN", 0.1)
+    other, again = sheared(before, law, 1.0)
+    assert sums["collisions"] == again["collisions"] > 100
+    np.testing.assert_allclose(other.velocities, one.velocities, atol=1e-6)
+
+
+def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
+    """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, which is exact to 0.3 % at this packing fraction."""
+    fraction, count = 0.3, 400
+    gas, _ = sheared(lattice(20, fraction, polydispersity=0.0), Law(1.0, shear_rate=0.0), 10.0)
+    gas, sums = sheared(gas, Law(1.0, shear_rate=0.0), 80.0, blocks=16)
+    found = averages(sums, gas)
+    np.testing.assert_allclose(found["granular_temperature"], 1, rtol=1e-9)
+    chi, density = (1 - 7 * fraction / 16) / (1 - fraction) ** 2, 4 * fraction / np.pi
+    expected = {
+        "collision_rate": 2 * density * chi * np.sqrt(np.pi) * np.sqrt(count / (count - 1)),  # without total momentum
+        "pressure": density * (1 + 2 * fraction * chi),
+    }
+    for name, value in expected.items():
+        error = found[name].std(ddof=1) / np.sqrt(len(found[name]))
+        assert error < 0.01 * value
+        assert abs(found[name].mean() - value) < 4 * error + 0.003 * value
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_second_collision_is_elastic_within_the_duration(soft) -> None:
+    """The first disc hits the second, which is at the third 0.02/(1 + α) later. It stops there if this is elastic."""
+    alpha = 0.4
+    before = row([4.0, 5.01, 6.02], [1.0, 0.0, 0.0])
+    fast, slow = (1 + alpha) / 2, (1 - alpha) / 2
+    later = 0.01 / fast
+    law = Law(alpha, later * (1.01 if soft else 0.99), shear_rate=0.0)
+    after, sums = sheared(before, law, 0.01 + later + 1e-3)
+    expected = [slow, 0.0, fast] if soft else [slow, fast * slow, fast * fast]
+    np.testing.assert_allclose(after.velocities[:, 0], expected, atol=ROUNDING)
+    assert sums["collisions"] == 2 and sums["elastic"] == soft
+    np.testing.assert_allclose(sums["dissipation"], energy(before) - energy(after), rtol=ROUNDING)
+
+
+def test_a_collapse_and_a_small_cell_are_refused(monkeypatch) -> None:
+    with pytest.raises(ValueError, match="more discs"):
+        sheared(lattice(3, 0.5), Law(0.5), 1.0)
+    monkeypatch.setattr(event_driven, "MOST_COLLISIONS", 50)
+    with pytest.raises(RuntimeError, match="collapse"):
+        sheared(lattice(10, 0.5), Law(0.5), 1.0)
+
+
+@pytest.mark.parametrize("restitution", [0.02, 0.05])
+def test_a_shorter_duration_adds_the_collisions_of_a_collapse(restitution) -> None:
+    """Three discs in a row: the time between collisions falls by λ₋/λ₊ at each, see ``benchmarks.collapse``."""
+    before, exact, added = row([4.0, 5.1, 6.25], [1.0, 0.0, -1.0]), roots(3, restitution), 3
+    found = []
+    for duration in 1e-4 * (exact.smaller / exact.larger) ** np.arange(0, 2 * added, added):
+        after, sums = sheared(before, Law(restitution, duration, shear_rate=0.0), 10.0)
+        assert np.all(np.diff(after.velocities[:, 0]) > 0)
+        found.append(sums["collisions"] - sums["elastic"])
+    assert found[1] - found[0] == added
