@@ -96,7 +96,15 @@ def test_a_drifting_record_is_refused() -> None:
 
 
 def test_noise_that_hides_any_drift_is_refused() -> None:
-    assert not any(steady_state._is_level(one) for one in np.random.default_rng(2).normal(size=(100, 12)))
+    noise = np.random.default_rng(2).normal(size=(100, 12))
+    assert not any(steady_state._is_level(one) for one in noise)
+
+
+def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
+    rng, limits = np.random.default_rng(3), steady_state._LAST_LIMITS
+    noise = 0.5 * rng.normal(size=(500, 40))
+    assert np.mean([steady_state._is_level(one, 0.5, *limits) for one in noise]) > 0.99
+    assert not any(steady_state._is_level(one, 0.5, *limits) for one in noise + np.linspace(0.0, 4.0, 40))
 
 
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:

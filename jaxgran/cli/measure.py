@@ -28,6 +28,7 @@ from jaxgran.cli.terminal import (
 from jaxgran.environment import usable_cores
 from jaxgran.model.checks import InputError, shown
 
+_MOST_NAMED = 6  # points of a map in one sentence
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 _MEANING_OF_STATUS = {
     "iteration_limit": "some contact solve ended above the tolerance",
@@ -210,6 +211,12 @@ def _say_imprecise(data) -> None:
     )
 
 
+def _some(points: list[str]) -> str:
+    """The first points of a list, and how many more there are."""
+    more = len(points) - _MOST_NAMED
+    return ", ".join(points[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
 def _say_short(data, points: list[str]) -> None:
     """Print which samples are shorter than a few memories, and the strain that would do."""
     from jaxgran.sampling.memory import FEWEST_MEMORIES
@@ -219,7 +226,7 @@ def _say_short(data, points: list[str]) -> None:
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
     short = data.status == data.status.attrs["flag_values"][code]
     enough = FEWEST_MEMORIES * float(data.memory.where(short).max())
-    which = "" if data.status.size == 1 else f" at {', '.join(points)}"
+    which = "" if data.status.size == 1 else f" at {_some(points)}"
     say(
         f"short sample{which}: it lasts less than {FEWEST_MEMORIES:g} memories of the flow, so its errors may be too "
         f"small. Add --strain {math.ceil(enough)}."
@@ -275,7 +282,7 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
         stop_interrupted(f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}")
     if bad:
         which = "the flow has" if data.status.size == 1 else "points marked * have"
-        words = "; ".join(f"{name.replace('_', ' ')}: {', '.join(points)}" for name, points in bad.items())
+        words = "; ".join(f"{name.replace('_', ' ')}: {_some(points)}" for name, points in bad.items())
         meanings = "; ".join(
             f"{name.replace('_', ' ')}: {_MEANING_OF_STATUS[name]}" for name in bad if name in _MEANING_OF_STATUS
         )

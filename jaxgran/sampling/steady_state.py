@@ -7,7 +7,8 @@ is then shortened geometrically. At the final step the network relaxes over a st
 The test for a steady state is statistical. The flow is sheared in chunks, and the temperature T and pressure P of each
 chunk are recorded. The last two thirds of the record are split into halves. The means of ln T of the two halves must
 differ by less than twice the standard error of the difference, or by less than 0.1. This standard error must be at most
-0.1. The same must hold for ln P. The error takes chunks as correlated at least as long as the memory of the flow.
+0.1. The same must hold for ln P. The error takes chunks as correlated at least as long as the memory of the flow. Few
+grains fluctuate by more: after the last chunk a flow counts as steady unless the means differ by four errors.
 
 A chunk lasts a quarter of a memory, which is measured in the first chunks. So the preparation takes at least three
 memories. A sample lasts six, unless its strain is given. If that is less than four, the status is ``short_sample``.
@@ -60,7 +61,8 @@ _MEASURING_CHUNKS = 4  # whose averages give the length of the chunks after them
 _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
-_LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing
+_LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing before the last chunk
+_LAST_LIMITS = 4.0, np.inf  # of ratio and error, after the last chunk
 
 
 class Batch(NamedTuple):
@@ -300,7 +302,11 @@ def _until_steady(batch: Batch, drive: Drive) -> Batch:
         record.append(np.log(np.stack([means["granular_temperature"], means["pressure"]])))
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
-            level = [steady[k] or all(_is_level(late[:, q, k], correlation[k]) for q in (0, 1)) for k in range(count)]
+            limits = (_LARGEST_STEADY_RATIO, _LARGEST_STEADY_ERROR) if chunks < _MOST_CHUNKS else _LAST_LIMITS
+            level = [
+                steady[k] or all(_is_level(late[:, q, k], correlation[k], *limits) for q in (0, 1))
+                for k in range(count)
+            ]
             steady = steady | (np.array(level) & ~waiting)
     status = np.where(steady, Status.ok, Status.not_steady)
     return batch._replace(status=np.maximum(batch.status, status))
@@ -324,12 +330,15 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     return _sheared(batch, relaxation, drive) if relaxation.any() else batch
 
 
-def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
-    """Whether the means of the two halves of a series agree, and the error of their difference is small."""
+def _is_level(
+    series: np.ndarray,
+    least_correlation: float = 0.0,
+    largest_ratio: float = _LARGEST_STEADY_RATIO,
+    largest_error: float = _LARGEST_STEADY_ERROR,
+) -> bool:
+    """Whether the means of the two halves of a series agree, and the error of their difference is small enough."""
     difference, error = drift(series, least_correlation)
-    return bool(
-        error <= _LARGEST_STEADY_ERROR and abs(difference) <= max(_LARGEST_STEADY_RATIO * error, _LARGEST_STEADY_DRIFT)
-    )
+    return bool(error <= largest_error and abs(difference) <= max(largest_ratio * error, _LARGEST_STEADY_DRIFT))
 
 
 def _averages(batch: Batch, tally: Tally) -> dict[str, np.ndarray]:
