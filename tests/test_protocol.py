@@ -101,10 +101,12 @@ def test_noise_that_hides_any_drift_is_refused() -> None:
 
 
 def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
-    rng, limits = np.random.default_rng(3), steady_state._LAST_LIMITS
-    noise = 0.5 * rng.normal(size=(500, 40))
-    assert np.mean([steady_state._is_level(one, 0.5, *limits) for one in noise]) > 0.99
-    assert not any(steady_state._is_level(one, 0.5, *limits) for one in noise + np.linspace(0.0, 4.0, 40))
+    noise = 0.5 * np.random.default_rng(3).normal(size=(500, 40))
+    drifting, relaxing = noise + np.linspace(0.0, 4.0, 40), noise + 4.0 * np.exp(-np.linspace(0.0, 2.0, 40))
+    assert np.mean([steady_state._is_level_noise(one, 0.5) for one in noise]) > 0.99
+    for series in (drifting, relaxing):
+        assert np.mean([steady_state._is_level_noise(one, 0.5) for one in series]) < 0.01
+    assert not steady_state._is_level_noise(np.full(40, np.nan))
 
 
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:

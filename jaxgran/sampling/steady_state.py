@@ -8,7 +8,8 @@ The test for a steady state is statistical. The flow is sheared in chunks, and t
 chunk are recorded. The last two thirds of the record are split into halves. The means of ln T of the two halves must
 differ by less than twice the standard error of the difference, or by less than 0.1. This standard error must be at most
 0.1. The same must hold for ln P. The error takes chunks as correlated at least as long as the memory of the flow. Few
-grains fluctuate by more: after the last chunk a flow counts as steady unless the means differ by four errors.
+grains fluctuate by more: after the last chunk a flow counts as steady unless the means differ by four errors, which are
+those of the noise about a straight line.
 
 A chunk lasts a quarter of a memory, which is measured in the first chunks. So the preparation takes at least three
 memories. A sample lasts six, unless its strain is given. If that is less than four, the status is ``short_sample``.
@@ -62,7 +63,7 @@ _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
 _LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing before the last chunk
-_LAST_LIMITS = 4.0, np.inf  # of ratio and error, after the last chunk
+_LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
 
 
 class Batch(NamedTuple):
@@ -302,11 +303,8 @@ def _until_steady(batch: Batch, drive: Drive) -> Batch:
         record.append(np.log(np.stack([means["granular_temperature"], means["pressure"]])))
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
-            limits = (_LARGEST_STEADY_RATIO, _LARGEST_STEADY_ERROR) if chunks < _MOST_CHUNKS else _LAST_LIMITS
-            level = [
-                steady[k] or all(_is_level(late[:, q, k], correlation[k], *limits) for q in (0, 1))
-                for k in range(count)
-            ]
+            judge = _is_level if chunks < _MOST_CHUNKS else _is_level_noise
+            level = [steady[k] or all(judge(late[:, q, k], correlation[k]) for q in (0, 1)) for k in range(count)]
             steady = steady | (np.array(level) & ~waiting)
     status = np.where(steady, Status.ok, Status.not_steady)
     return batch._replace(status=np.maximum(batch.status, status))
@@ -330,15 +328,21 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     return _sheared(batch, relaxation, drive) if relaxation.any() else batch
 
 
-def _is_level(
-    series: np.ndarray,
-    least_correlation: float = 0.0,
-    largest_ratio: float = _LARGEST_STEADY_RATIO,
-    largest_error: float = _LARGEST_STEADY_ERROR,
-) -> bool:
-    """Whether the means of the two halves of a series agree, and the error of their difference is small enough."""
+def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
+    """Whether the means of the two halves of a series agree, and the error of their difference is small."""
     difference, error = drift(series, least_correlation)
-    return bool(error <= largest_error and abs(difference) <= max(largest_ratio * error, _LARGEST_STEADY_DRIFT))
+    return bool(
+        error <= _LARGEST_STEADY_ERROR and abs(difference) <= max(_LARGEST_STEADY_RATIO * error, _LARGEST_STEADY_DRIFT)
+    )
+
+
+def _is_level_noise(series: np.ndarray, least_correlation: float = 0.0) -> bool:
+    """Whether the means of the two halves of a long series agree within its noise, which may be large."""
+    place = np.arange(len(series)) - (len(series) - 1) / 2
+    slope = np.sum(place * series) / np.sum(place**2)
+    difference, _ = drift(series)
+    _, error = drift(series - slope * place, least_correlation)
+    return bool(abs(difference) <= max(_LARGEST_LAST_RATIO * error, _LARGEST_STEADY_DRIFT))
 
 
 def _averages(batch: Batch, tally: Tally) -> dict[str, np.ndarray]:
