@@ -61,8 +61,12 @@ BENCHMARKS = (
     Benchmark(
         "paper",
         "Where in the plane of restitution and packing fraction are binary collisions all there is?",
-        (9, 0.5),
-        ("paper.nc", "paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_clusters.png"),
+        (20, 0.5),
+        (
+            "paper.nc",
+            *("paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_losses.png"),
+            *("paper_clusters.png", "paper_errors.png", "paper_rheology.png"),
+        ),
     ),
     Benchmark(
         "quick_map",
