@@ -44,7 +44,7 @@ def run(output: Output) -> None:
     plan = QUICK if output.quick else FULL
     data = jg.ratio_map(**plan, workers=usable_cores())
     rows = []
-    for mixture, flows in (("uniform", data), ("bidisperse", bidisperse(plan))):
+    for mixture, flows in (("uniform", data), ("bidisperse", bidisperse(plan, data))):
         output.write_picture(friction_figure(flows), f"dense_rheology_{mixture}", dpi=200)
         for least in LOOSEST:
             chosen = flows.sel(packing_fraction=flows.packing_fraction >= least)
@@ -57,14 +57,15 @@ def run(output: Output) -> None:
     output.write_rows("dense_rheology", head, "rows", rows)
 
 
-def bidisperse(plan: Mapping[str, Any]) -> xr.Dataset:
-    """What a friction law needs, measured in the mixture of two sizes at one restitution."""
+def bidisperse(plan: Mapping[str, Any], like: xr.Dataset) -> xr.Dataset:
+    """What a friction law needs, measured in the mixture of two sizes at one restitution, in the form of a map."""
     tasks = [(dict(plan), nu, seed) for nu in reversed(plan["packing_fraction"]) for seed in range(plan["seeds"])]
     with ProcessPoolExecutor(usable_cores(), multiprocessing.get_context("spawn")) as pool:
         samples = list(pool.map(mixture_sample, *zip(*tasks, strict=True)))
     names = ("inertial_number", "macroscopic_friction", "pressure", "force_ratio")
-    found: dict[str, list[float]] = {name: [] for name in (*names, *(f"{name}_stderr" for name in names), CORRELATION)}
-    for start in range(0, len(samples), plan["seeds"]):
+    found: dict[str, list] = {name: [] for name in (*names, *(f"{name}_stderr" for name in names), CORRELATION)}
+    starts = range(0, len(samples), plan["seeds"])
+    for start in starts:
         seeds = samples[start : start + plan["seeds"]]
         values, errors = estimates(seeds)
         for name in names:
@@ -72,10 +73,12 @@ def bidisperse(plan: Mapping[str, Any]) -> xr.Dataset:
             found[f"{name}_stderr"].append(float(errors[name]))
         found[CORRELATION].append(error_correlation_of(seeds, "macroscopic_friction", "inertial_number"))
     dims = ("packing_fraction", "restitution")
-    status = np.array([max(int(one.status) for one in samples)] * len(plan["packing_fraction"]))
+    found["status"] = [max(int(one.status) for one in samples[k : k + plan["seeds"]]) for k in starts]
     variables = {name: (dims, np.array(series)[::-1, None]) for name, series in found.items()}
     coordinates = {"packing_fraction": list(plan["packing_fraction"]), "restitution": [MIXTURE_RESTITUTION]}
-    return xr.Dataset(variables | {"status": (dims, status[:, None])}, coordinates, {"timestep": plan["timestep"]})
+    made = xr.Dataset(variables, coordinates, {**like.attrs, "restitution": MIXTURE_RESTITUTION})
+    made.status.attrs = like.status.attrs
+    return made
 
 
 def mixture_sample(plan: Mapping[str, Any], nu: float, seed: int) -> jg.Sample:
