@@ -18,6 +18,8 @@ from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
 from .model.state import State
 from .model.status import Status
+from .page.document import Page
+from .page.explore import explore
 from .plotting.errors import dominating_errors
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
@@ -38,6 +40,7 @@ __all__ = [
     "Fields",
     "Grains",
     "InputError",
+    "Page",
     "RestitutionFit",
     "Sample",
     "ShearFlow",
@@ -52,6 +55,7 @@ __all__ = [
     "cooling",
     "count_events",
     "dominating_errors",
+    "explore",
     "fields_at",
     "fit_closure",
     "fit_restitution",

@@ -80,8 +80,8 @@ def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() 
     _, clusters, binaries, _ = drawn(scene, Scale(1.0, 2.0))
     assert len(clusters.get_segments()) == 2 * 9 and len(binaries.get_segments()) == 9
     widths = {*clusters.get_linewidths(), *binaries.get_linewidths()}
-    assert max(widths) == flow._WIDEST
-    np.testing.assert_allclose(sorted(widths), flow._WIDEST * np.array([0.25, 0.5, 1.0]))
+    assert max(widths) == flow.WIDEST_LINE
+    np.testing.assert_allclose(sorted(widths), flow.WIDEST_LINE * np.array([0.25, 0.5, 1.0]))
     middle = binaries.get_segments()[4]  # the image that is not shifted
     start, end = (scene.centres[k] for k in (4, 3))
     np.testing.assert_allclose(middle[0], start)

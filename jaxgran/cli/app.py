@@ -1,4 +1,4 @@
-"""Command line: ``jaxgran map``, ``plot``, ``run``, ``fit`` and ``info``. ``terminal`` lists the exit statuses."""
+"""Command line: ``jaxgran map``, ``plot``, ``explore``, ``run``, ``fit``, ``info``. Exit statuses: ``terminal``."""
 
 import os
 import sys
@@ -11,6 +11,7 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jaxgran
 from jaxgran.cli.arguments import examples
+from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
 from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
@@ -35,6 +36,7 @@ EXAMPLES = {
 COMMANDS = {
     "map": (map_command, "Map the force ratio over a plane of flows.", MAP_EXAMPLES),
     "plot": (plot_command, "Draw the figures of a map again.", PLOT_EXAMPLES),
+    "explore": (explore_command, "Write a page to look into a map.", EXPLORE_EXAMPLES),
     "run": (run_command, "Run one flow, average it, film it.", RUN_EXAMPLES),
     "fit": (fit_command, "Infer a restitution, or the law of a map.", FIT_EXAMPLES),
     "info": (info_command, "Print what a bug report needs.", INFO_EXAMPLES),

@@ -27,19 +27,10 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.environment import usable_cores
 from jaxgran.model.checks import InputError, shown
+from jaxgran.model.status import MEANINGS
 
 _MOST_NAMED = 6  # points of a map in one sentence
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
-_MEANING_OF_STATUS = {
-    "iteration_limit": "some contact solve ended above the tolerance",
-    "not_steady": "temperature or pressure still drifted, sample a longer strain or prepare longer with --equilibrate",
-    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
-    "infeasible": "no impulses satisfy the contact law, the packing is jammed",
-    "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
-    "nonfinite": "a position, velocity or impulse is not a finite number",
-    "failed": "its processes died again and again, perhaps for lack of memory; add --resume to try once more",
-    "not_run": "the point is missing",
-}
 
 
 class Outcome(NamedTuple):
@@ -283,7 +274,5 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
     if bad:
         which = "the flow has" if data.status.size == 1 else "points marked * have"
         words = "; ".join(f"{name.replace('_', ' ')}: {_some(points)}" for name, points in bad.items())
-        meanings = "; ".join(
-            f"{name.replace('_', ' ')}: {_MEANING_OF_STATUS[name]}" for name in bad if name in _MEANING_OF_STATUS
-        )
+        meanings = "; ".join(f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS)
         stop(f"finished, but {which} a bad status. {words}. What that means: {meanings}.", BAD_STATUS)

@@ -1,4 +1,4 @@
-"""The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
+"""The command ``run``: one flow, its averages, and its frames as a trajectory, movie or page."""
 
 import math
 import os
@@ -37,6 +37,8 @@ _LAST_GROUP = "Quality of the run"
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
     "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
+    "The same as a page for a browser, which pauses and steps": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
+    "--page flow.html",
     "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 --packing-fraction 0.7 "
     "--trajectory flow.gsd --every 0.01",
 }
@@ -68,6 +70,9 @@ def run_command(
     movie: Annotated[
         Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
     ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="HTML file that plays the flow in a browser, with its running averages.")
+    ] = None,
     output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files, whatever they hold.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
@@ -77,7 +82,7 @@ def run_command(
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
     require_one(strain, error)
-    if strain is None and error is None and (trajectory is not None or movie is not None):
+    if strain is None and error is None and any(x is not None for x in (trajectory, movie, page)):
         strain = _RECORDED_STRAIN
     given = {"grains": grains, "timestep": step, "strain": strain, "error": error}
     chosen = {
@@ -88,11 +93,11 @@ def run_command(
         **chosen_for(error),
         **{name: value for name, value in given.items() if value is not None},
     }
-    for name, file in (("trajectory", trajectory), ("movie", movie)):
+    for name, file in (("trajectory", trajectory), ("movie", movie), ("page", page)):
         if file is not None and os.path.isfile(file) and not overwrite:
             raise InputError(f"{name} must be a new file, or --overwrite be given: {shown(str(file))} is there.")
-    recorder, frames = _recorder(trajectory, movie, every, strain or _RECORDED_STRAIN)
-    record = None if recorder is None else recorder.recording
+    recorder, frames, film = _recorder(trajectory, movie, page, every, strain or _RECORDED_STRAIN)
+    record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
     data, interrupted, written = measured(chosen, "auto", 1, output, quiet, record=record, overwrite=overwrite)
     print_table(_summary_table(data))
     print_budget(data)
@@ -102,35 +107,48 @@ def run_command(
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
             _write_movie(movie, frames, quiet)
+        if film is not None and page is not None:
+            film.page().save(page)
+            say(f"wrote {page}: {len(film.frames.scenes)} frames")
     finish(data, [output] if output and written else [], interrupted)
 
 
-def _recorder(trajectory: Path | None, movie: Path | None, every: float | None, strain: float):
-    """The recorder of the flow and the frames of its movie; None and None if no file is asked for."""
-    if trajectory is None and movie is None:
+def _recorder(trajectory: Path | None, movie: Path | None, page: Path | None, every: float | None, strain: float):
+    """The recorder of the flow, the frames of its movie, and the film of its page; None if no file is asked for."""
+    if trajectory is None and movie is None and page is None:
         if every is not None:
             raise InputError(
-                "--every is the strain between frames: add --trajectory FILE.gsd or --movie FILE.gif to have any."
+                "--every is the strain between frames: add --trajectory FILE.gsd, --movie FILE.gif or --page FILE.html "
+                "to have any."
             )
-        return None, None
+        return None, None, None
     configured_jax()
+    from jaxgran.io.atomic import require_place
     from jaxgran.io.trajectory import check_trajectory, write_frame
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
     if every is not None:
-        most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
+        most_frames = MOST_RECORDED if movie is None and page is None else MOST_DRAWN
         least, most = strain / most_frames, strain
         words = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
         require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)
-    keep, frames = [], Frames()
+    keep, frames, film = [], Frames(), None
     if trajectory is not None:
         check_trajectory(trajectory)
         keep.append(partial(write_frame, trajectory))
     if movie is not None:
         check_movie(movie)
         keep.append(frames.keep)
-    return Recorder(strain / 100 if every is None else every, *keep), frames
+    if page is not None:
+        from jaxgran.page.document import require_plotly
+        from jaxgran.page.film import Film
+
+        require_place(page, "page", ".html")
+        require_plotly()
+        film = Film()
+        keep.append(film.frames.keep)
+    return Recorder(strain / 100 if every is None else every, *keep), frames, film
 
 
 def _write_movie(movie: Path, frames, quiet: bool) -> None:

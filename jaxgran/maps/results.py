@@ -35,8 +35,11 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
         temporary.write_bytes(content.getvalue() + _MARK + hashlib.sha256(content.getbuffer()).digest())
 
 
-def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
-    """Read a dataset of ``write_dataset``, without variables of given endings; InputError if the file is not one."""
+def read_dataset(path: Path, without: tuple[str, ...] = (), needed: tuple[str, ...] = (*RATIO, "status")) -> xr.Dataset:
+    """Read a dataset of ``write_dataset``, without variables of given endings; InputError if the file is not one.
+
+    A file is one if it has the axes of a map and the variables that are needed.
+    """
     if not os.path.isfile(path):
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
@@ -47,7 +50,7 @@ def read_dataset(path: Path, without: tuple[str, ...] = ()) -> xr.Dataset:
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
-    problem = what_lacks(data, *RATIO, "status")
+    problem = what_lacks(data, *needed)
     if problem:
         raise InputError(f"{shown(str(path))} is not a ratio map: {problem}.")
     return data

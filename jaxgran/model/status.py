@@ -24,3 +24,16 @@ class Status(IntEnum):
 
 DEEP_OVERLAP = 1e-2  # σ
 DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by less than 2 %
+
+MEANINGS = {
+    "iteration_limit": "some contact solve ended above the tolerance",
+    "short_sample": "the sample lasts only a few memories of the flow, so its errors may be too small",
+    "not_steady": "temperature or pressure still drifted, sample a longer strain or prepare longer with --equilibrate",
+    "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
+    "infeasible": "no impulses satisfy the contact law, the packing is jammed",
+    "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
+    "nonfinite": "a position, velocity or impulse is not a finite number",
+    "failed": "its processes died again and again, perhaps for lack of memory; add --resume to try once more",
+    "not_run": "the point is missing",
+}
+"""What each status means for a user, and what to do."""

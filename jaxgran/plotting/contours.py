@@ -22,9 +22,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import StrMethodFormatter
 
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
-
-EXCESS_LEVELS = (0.05, 0.10, 0.25, 0.50, 1.00)
-"""Contour values of the excess of the force ratio over one, as in Figure 2."""
+from jaxgran.plotting.encoding import EXCESS_LEVELS
 
 _EXCESS_COLOUR = "#00803c"
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic

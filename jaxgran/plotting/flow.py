@@ -24,6 +24,16 @@ from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import centred, minimum_image
 from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, force_lines, scientific
+from jaxgran.plotting.encoding import (
+    BINARY_COLOUR,
+    CLUSTER_COLOUR,
+    GRAIN_EDGE,
+    GRAIN_RAMPS,
+    THINNEST_LINE,
+    WIDEST_LINE,
+    deepest,
+    widest,
+)
 
 Colour = Literal["speed", "pressure"]
 
@@ -31,17 +41,9 @@ COLOUR_LABELS: dict[str, str] = {
     "speed": r"peculiar speed $|c|$  ($\sigma\dot\gamma$)",
     "pressure": r"contact pressure of a grain  ($m\dot\gamma^2$)",
 }
-COLOURS = {
-    "speed": LinearSegmentedColormap.from_list("speed", ["#ffffff", "#cfe4f0", "#8fbfd9"]),
-    "pressure": LinearSegmentedColormap.from_list("pressure", ["#ffffff", "#fbe3c0", "#eeb46c"]),
-}
-_CLUSTER: dict[str, Any] = {"color": "#1a1a1a", "capstyle": "round"}
-BINARY_COLOUR = "#e0552f"
+COLOURS = {name: LinearSegmentedColormap.from_list(name, ramp) for name, ramp in GRAIN_RAMPS.items()}
+_CLUSTER: dict[str, Any] = {"color": CLUSTER_COLOUR, "capstyle": "round"}
 _BINARY: dict[str, Any] = {"color": BINARY_COLOUR, "capstyle": "round"}
-_WIDEST = 5.0  # points, line of the largest force
-_THINNEST = 0.35  # points, line of the smallest force
-_COLOUR_SHARE = 0.98  # of the grains below the deepest colour
-_WIDTH_SHARE = 0.95  # of the forces below the widest line
 _LEGEND: dict[str, Any] = {
     "fontsize": SMALL_SIZE,
     "frameon": False,
@@ -172,12 +174,7 @@ def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
     scenes = list(scenes)
     values = np.concatenate([getattr(scene, colour) for scene in scenes])
     forces = np.concatenate([scene.force for scene in scenes])
-    return Scale(_quantile(values[values > 0], _COLOUR_SHARE), _quantile(forces, _WIDTH_SHARE))
-
-
-def _quantile(values: np.ndarray, share: float) -> float:
-    """The value below which a share of the values lies, or one if there are no values."""
-    return float(np.quantile(values, share)) if values.size else 1.0
+    return Scale(deepest(values), widest(forces))
 
 
 def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None) -> None:
@@ -211,7 +208,7 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Scalar
         array=getattr(scene, colour)[which],
         cmap=COLOURS[colour],
         norm=Normalize(0, scale.colour),
-        edgecolor="#8c8c8c",
+        edgecolor=GRAIN_EDGE,
         linewidth=0.4,
         zorder=1,
     )
@@ -221,7 +218,7 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Scalar
             scene.starts[chosen],
             scene.branches[chosen],
             shifts,
-            np.clip(_WIDEST * scene.force[chosen] / scale.force, _THINNEST, _WIDEST),
+            np.clip(WIDEST_LINE * scene.force[chosen] / scale.force, THINNEST_LINE, WIDEST_LINE),
             zorder=order,
             **style,
         )
@@ -270,11 +267,11 @@ def _frame(axes: Axes, scene: Scene) -> None:
 
 def force_key(scale: Scale) -> Sequence[Line2D]:
     """The legend of the lines, with the force of the widest line."""
-    widest = rf"$F\geq{scientific(float(f'{scale.force:.1e}'))}\,m\sigma\dot\gamma^2$"
+    largest = rf"$F\geq{scientific(float(f'{scale.force:.1e}'))}\,m\sigma\dot\gamma^2$"
     keys = (
         (_CLUSTER["color"], 2.5, "in clusters of 3 or more grains"),
         (_BINARY["color"], 2.5, "binary collisions"),
-        ("#c4c4c4", _WIDEST, f"widest: {widest}"),
+        ("#c4c4c4", WIDEST_LINE, f"widest: {largest}"),
     )
     return [Line2D([], [], color=colour, linewidth=width, label=label) for colour, width, label in keys]
 

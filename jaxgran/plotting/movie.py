@@ -6,6 +6,7 @@ largest force known, which set the scale of colours and widths in all frames.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.animation import FFMpegWriter
@@ -19,7 +20,8 @@ from jaxgran.files import replaced
 from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError, shown
 from jaxgran.plotting.drawing import empty_figure
-from jaxgran.plotting.flow import BINARY_COLOUR, COLOURS, Colour, Scene, common_scale, draw_picture, scene_of
+from jaxgran.plotting.encoding import BINARY_COLOUR
+from jaxgran.plotting.flow import COLOURS, Colour, common_scale, draw_picture, scene_of
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
 _WIDTH = 5.6  # inches
@@ -33,13 +35,17 @@ _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how 
 
 
 class Frames:
-    """The frames of a movie, kept as they are recorded; a recording that starts again at step 0 empties them."""
+    """The frames of a film, kept as they are recorded; a recording that starts again at step 0 empties them.
 
-    def __init__(self):
+    ``view`` is what is kept of a snapshot.
+    """
+
+    def __init__(self, view: Callable[[Snapshot], Any] = scene_of):
+        self._view = view
         self._begin()
 
     def _begin(self) -> None:
-        self.scenes: list[Scene] = []
+        self.scenes: list[Any] = []
         self.strains: list[float] = []
         self._recorded = 0  # frames
         self._stride = 1  # recorded frames per frame kept
@@ -51,7 +57,7 @@ class Frames:
         if len(self.scenes) == MOST_DRAWN:
             self.scenes, self.strains, self._stride = self.scenes[::2], self.strains[::2], 2 * self._stride
         if self._recorded % self._stride == 0:
-            self.scenes.append(scene_of(seen))
+            self.scenes.append(self._view(seen))
             self.strains.append(step * (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).item())
         self._recorded += 1
 

@@ -1,0 +1,32 @@
+"""The command ``explore``: a map as a page for a browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jaxgran.cli.terminal import say_written
+
+EXPLORE_EXAMPLES = {
+    "A page beside the map": "jaxgran explore jaxgran_map.nc",
+    "With another name": "jaxgran explore ratio.nc --output page.html",
+}
+
+
+def explore_command(
+    file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
+    output: Annotated[
+        Path | None, typer.Option(help="HTML file of the page. [default: the name of the dataset with .html]")
+    ] = None,
+) -> None:
+    """Write a page to look into a map with a browser: one file that needs nothing else."""
+    from jaxgran.io.atomic import require_place
+    from jaxgran.maps.results import read_dataset
+    from jaxgran.page.document import require_plotly
+    from jaxgran.page.explore import explore
+
+    path = file.with_suffix(".html") if output is None else output
+    require_place(path, "output", ".html")
+    require_plotly()
+    explore(read_dataset(file, needed=()), path)
+    say_written([path])

@@ -1,0 +1,81 @@
+"""One file for a browser: Plotly, scripts, style and data in a page that asks for nothing else.
+
+Names and attributes of a file are text to a page, never markup. The data stand in it as JSON whose ``<``, ``>`` and
+``&`` are escaped. The scripts put them into the page by ``textContent``. And the page forbids itself every request.
+"""
+
+import base64
+import gzip
+import html
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jaxgran.files import replaced
+from jaxgran.model.checks import InputError
+
+_ESCAPED = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&"}
+_MARK = re.compile(r"\{\{(\w+)\}\}")
+_FRAME_HEIGHT = 1000  # pixels, of a page in a notebook
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page for a browser. A notebook shows it if it is the last line of a cell."""
+
+    text: str
+
+    def save(self, path: str | Path) -> None:
+        """Write the page to a file, whole or not at all."""
+        with replaced(Path(path)) as temporary:
+            temporary.write_text(self.text, encoding="utf-8")
+
+    def __repr__(self) -> str:
+        return f"Page({len(self.text) / 1e6:.1f} MB)"
+
+    def _repr_html_(self) -> str:
+        frame = f'style="width: 100%; height: {_FRAME_HEIGHT}px; border: 0"'
+        return f'<iframe title="jaxgran" {frame} srcdoc="{html.escape(self.text)}"></iframe>'
+
+
+def require_plotly() -> None:
+    """Raise an InputError if Plotly is not installed."""
+    try:
+        import plotly.offline  # noqa: F401
+    except ImportError:
+        raise InputError("a page needs Plotly: pip install 'jaxgran[explore]'.") from None
+
+
+def document(name: str, scripts: tuple[str, ...], title: str, data: Mapping[str, Any]) -> Page:
+    """A page from the template ``NAME.html`` beside this file.
+
+    Args:
+      name: of the template.
+      scripts: names of the scripts beside this file, in order.
+      title: of the window.
+      data: what the scripts read, in types of JSON.
+
+    Raises:
+      InputError: (a ValueError) Plotly is not installed.
+    """
+    require_plotly()
+    from plotly.offline import get_plotlyjs
+
+    library = gzip.compress(get_plotlyjs().encode(), mtime=0)  # a third of its size, also when it is written as text
+    parts = {
+        "title": html.escape(title),
+        "style": _text("page.css"),
+        "data": json.dumps(data, separators=(",", ":"), allow_nan=False).translate(_ESCAPED),
+        "library": base64.b64encode(library).decode(),
+        "script": "\n".join(_text(script) for script in scripts),
+    }
+    return Page(_MARK.sub(lambda mark: parts[mark[1]], _text(f"{name}.html")))
+
+
+def _text(name: str) -> str:
+    """The content of a file beside this one."""
+    return files("jaxgran.page").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,30 @@
+"""A map as a page to look into: the plane, curves through a point, its numbers, and its grains."""
+
+from pathlib import Path
+
+import xarray as xr
+
+from jaxgran.page.document import Page, document
+from jaxgran.page.map_data import map_data
+
+_SCRIPTS = ("page.js", "grains.js", "charts.js", "table.js", "map.js")
+
+
+def explore(data: xr.Dataset, output: str | Path | None = None) -> Page:
+    """A page to look into a map with a browser. It is one file, and needs neither a network nor a running program.
+
+    A notebook shows the page if this call is the last line of a cell.
+
+    Args:
+      data: dataset of a map, as ``ratio_map`` returns it and ``read_dataset`` reads it. Every number at its points is
+        shown, also one that you have added.
+      output: file to write the page to, or None.
+
+    Raises:
+      InputError: (a ValueError) the data are no map, or Plotly is not installed.
+    """
+    found = map_data(data)
+    page = document("map", _SCRIPTS, found["title"], found)
+    if output is not None:
+        page.save(output)
+    return page

@@ -1,0 +1,249 @@
+"""What a page of a map holds: every average at every point, with its errors, theory and status, and the instants."""
+
+from collections.abc import Iterator
+from typing import Any, get_args
+
+import numpy as np
+import xarray as xr
+
+from jaxgran.maps.schema import FINEST, require_map
+from jaxgran.model.checks import InputError
+from jaxgran.model.choices import Activation, Engine, Solver
+from jaxgran.model.status import MEANINGS
+from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
+from jaxgran.plotting.encoding import EXCESS_LEVELS
+
+MOST_POINTS = 2500
+"""Points of a page; of a larger map a part of the restitutions and packing fractions is shown."""
+
+_MOST_PARTS = 100  # pairs of a number of grains and a time step
+_DIGITS = 7  # of a number
+_LONGEST_TEXT = 200  # characters of a name or attribute
+_AXES = {
+    "grains": "number of grains N",
+    "timestep": "time step dt (1/γ̇)",
+    "packing_fraction": "packing fraction ν",
+    "restitution": "restitution α",
+}
+_PLANE = ("packing_fraction", "restitution")
+_TENSOR_AXES = ("axis_a", "axis_b")
+_COMPANIONS = ("_stderr", "_error", "_correlation_strain", "_error_timestep", "_error_size", "_error_tolerance")
+_LEFT_OUT = ("status", "point_grains", "memory")
+_NAMED = {"activation": get_args(Activation), "solver": get_args(Solver), "engine": get_args(Engine)}
+_SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
+
+
+def map_data(data: xr.Dataset) -> dict[str, Any]:
+    """The numbers of a map in types of JSON, by point: number of grains, time step, packing fraction, restitution.
+
+    =============  =====================================================================================
+    key            content
+    =============  =====================================================================================
+    axes           the dimensions, outermost first: name, label and values; numbers of grains and time
+                   steps have one value if the map has one, and none if it is not known
+    observables    name, meaning and unit; values; and where the map has them standard errors, whole
+                   errors, predictions of kinetic theory and numbers of effective samples
+    status         the status of each point; meanings of the statuses
+    instants       grains and forces of each point, see ``grain_data``
+    again          what the command needs that measures a point again, if the map was made by this program
+    about, notes   sentences: what the numbers belong to, and what is left out
+    =============  =====================================================================================
+
+    Raises:
+      InputError: (a ValueError) the data are no map, or have nothing to show.
+    """
+    require_map(data)
+    data, notes = _thinned(data.sortby([name for name in _AXES if name in data.dims]))
+    dims = [name for name in _AXES if name in data.dims]
+    names = [str(name) for name in data.data_vars if _is_shown(data, str(name))]
+    observables = [one for name in names for one in _observables(data, name, dims)]
+    if not observables:
+        raise InputError("data must be the dataset of a ratio map, and it has no number at its points.")
+    instants, more = _instants(data, dims)
+    return {
+        "title": _text(data.attrs.get("title", "Map of sheared grains")),
+        "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
+        "observables": observables,
+        "status": _statuses(data, dims),
+        "meanings": MEANINGS,
+        "excessLevels": list(EXCESS_LEVELS),
+        "instants": instants,
+        "encoding": ENCODING,
+        "again": _again(data, dims),
+        "about": _about(data),
+        "notes": notes + more,
+    }
+
+
+def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
+    """The map with at most ``MOST_POINTS`` points, and a sentence if there were more."""
+    sizes = [data.sizes.get(name, 1) for name in _AXES]
+    parts, points = int(np.prod(sizes[:2])), int(np.prod(sizes))
+    if parts > _MOST_PARTS:
+        raise InputError(
+            f"a page shows at most {_MOST_PARTS} numbers of grains and time steps together, not {parts}: select some."
+        )
+    if points <= MOST_POINTS:
+        return data, []
+    rows, columns = sizes[2:]
+    most = MOST_POINTS // parts
+    few_rows = max(min(rows, int(np.sqrt(most * rows / columns))), min(rows, most // columns), 1)
+    few_columns = min(columns, max(most // few_rows, 1))
+    for name, few in zip(_PLANE, (min(few_rows, most), few_columns), strict=True):
+        data = data.isel({name: np.unique(np.linspace(0, data.sizes[name] - 1, few).round().astype(int))})
+    shown = f"{data.sizes['packing_fraction']} of {rows} packing fractions and {data.sizes['restitution']} of {columns}"
+    return data, [f"The map has {points} points. This page shows a part of them: {shown} restitutions."]
+
+
+def _is_shown(data: xr.Dataset, name: str) -> bool:
+    """Whether a variable is a number at every point, and not part of another one."""
+    variable = data[name]
+    dims = set(variable.dims) - set(FINEST)
+    belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
+    belongs |= name.startswith("theory_") and name.removeprefix("theory_") in data
+    ours = name in _LEFT_OUT or name.startswith("snapshot_") or "flag_values" in variable.attrs
+    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *_TENSOR_AXES}) and not (belongs or ours)
+
+
+def _observables(data: xr.Dataset, name: str, dims: list[str]) -> Iterator[dict[str, Any]]:
+    """The entry of a variable, or those of its components."""
+    about = data[name].attrs
+    parts = {
+        "value": name,
+        "error": f"{name}_stderr",
+        "whole": f"{name}_error",
+        "theory": f"theory_{name}",
+        "samples": f"{name}_correlation_strain",
+    }
+    for component, chosen in _components(data[name]).items():
+        columns = {
+            part: _column(data[there].isel(chosen), data, dims) for part, there in parts.items() if there in data
+        }
+        if "samples" in columns and "strain_by_seed" in data:
+            strain = _column(data.strain_by_seed.sum("seed"), data, dims)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                columns["samples"] = strain / columns["samples"]
+        else:
+            columns.pop("samples", None)
+        yield {
+            "name": _text(name + component),
+            "meaning": _text(about.get("long_name", name.replace("_", " "))) + component.replace("_", ", "),
+            "unit": _unit(about.get("units", "")),
+            **{part: _numbers(values) for part, values in columns.items()},
+        }
+
+
+def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
+    """The components of a tensor by their name, or of a scalar: itself."""
+    if not set(_TENSOR_AXES) <= set(variable.dims):
+        return {"": {}}
+    sizes = [variable.sizes[axis] for axis in _TENSOR_AXES]
+    return {f"_{'xyz'[a]}{'xyz'[b]}": {"axis_a": a, "axis_b": b} for a, b in np.ndindex(*sizes) if max(a, b) < 3}
+
+
+def _column(variable: xr.DataArray, data: xr.Dataset, dims: list[str]) -> np.ndarray:
+    """The values of a variable by point; one without numbers of grains, such as an estimate, is the same at all."""
+    missing = {name: data[name] for name in dims if name not in variable.dims}
+    return variable.expand_dims(missing).transpose(*dims).values.astype(float).ravel()
+
+
+def _statuses(data: xr.Dataset, dims: list[str]) -> list[str]:
+    """The name of the status of every point."""
+    if "status" not in data or not set(_PLANE) <= set(data.status.dims):
+        return ["ok"] * int(np.prod([data.sizes[name] for name in dims]))
+    flags = np.atleast_1d(data.status.attrs.get("flag_values", [])).tolist()
+    names = dict(zip(flags, str(data.status.attrs.get("flag_meanings", "")).split(), strict=False))
+    codes = _column(data.status, data, dims)
+    return [_text(names.get(code, f"status {code:g}")) for code in codes.tolist()]
+
+
+def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
+    """Grains and forces of every point, and a sentence if some are left out; None if the map has none."""
+    names = ("x", "y", "radius", "speed", "pair_i", "pair_j", "force", "clustered", "side", "tilt", "window")
+    if not all(f"snapshot_{name}" in data for name in names):
+        return None, []
+    columns = {}
+    for name in names:
+        variable = data[f"snapshot_{name}"].transpose(*dims, ...).values
+        columns[name] = variable.reshape(-1, *variable.shape[len(dims) :])
+    found, large = [], 0
+    for point in zip(*columns.values(), strict=True):
+        here = dict(zip(names, point, strict=True))
+        grains, pairs = int(np.isfinite(here["radius"]).sum()), int((here["pair_i"] >= 0).sum())
+        large += grains > MOST_GRAINS
+        if not 0 < grains <= MOST_GRAINS:
+            found.append(None)
+            continue
+        speed, force = here["speed"][:grains], here["force"][:pairs]
+        found.append(
+            grain_data(
+                positions=np.stack([here["x"], here["y"]], axis=-1)[:grains],
+                radii=here["radius"][:grains],
+                speed=speed,
+                pairs=np.stack([here["pair_i"], here["pair_j"]], axis=-1)[:pairs],
+                force=force,
+                clustered=here["clustered"][:pairs] > 0,
+                **{name: float(here[name]) for name in ("side", "tilt", "window")},
+                scale=scale_of(speed, force),
+            )
+        )
+    return found, [f"Instants of more than {MOST_GRAINS} grains are not drawn."] if large else []
+
+
+def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
+    """Seeds, sampled strain of a seed at every point, and options; None where the file does not tell.
+
+    A reader will paste the command into a shell. So it has nothing but numbers, and names that this program knows.
+    """
+    if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "strain_by_seed" not in data:
+        return None
+    options = {}
+    for name, accepted in _NAMED.items():
+        value = data.attrs.get(f"{name}_asked", data.attrs.get(name, accepted[0]))
+        if value not in accepted:
+            return None
+        options[name] = value
+    try:
+        options["tolerance"] = f"{float(data.attrs['tolerance']):g}"
+        seeds = int(data.attrs["seeds"])
+    except (TypeError, ValueError):
+        return None
+    words = [f"--{name} {value}" for name, value in options.items() if value != "auto"]
+    strain = _column(data.strain_by_seed.mean("seed"), data, dims)
+    return {"seeds": seeds, "options": " ".join(words), "strain": _numbers(strain)}
+
+
+def _about(data: xr.Dataset) -> str:
+    """The sentence that says what the numbers belong to."""
+    known = [
+        f"{data.attrs[name]} {words}"
+        for name, words in (("activation", "activation"), ("seeds", "seeds"))
+        if name in data.attrs
+    ]
+    return _text(", ".join(known))
+
+
+def _axis(data: xr.Dataset, name: str) -> list[float]:
+    """The values of a dimension; for the number of grains and the time step of a map that has one, its attribute."""
+    if name in data.dims:
+        return data[name].values.tolist()
+    value = np.ravel(data.attrs.get(name, []))
+    return [value[0].item()] if value.size == 1 and value.dtype.kind in "iuf" else []
+
+
+def _unit(units: Any) -> str:
+    """A unit with its signs; nothing for a pure number."""
+    text = _text(units)
+    for word, sign in _SIGNS.items():
+        text = text.replace(word, sign)
+    return "" if text == "1" else text
+
+
+def _text(value: Any) -> str:
+    """An attribute or a name as a short line."""
+    return " ".join(str(value).split())[:_LONGEST_TEXT]
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    """Numbers to a few digits, or None where they are not finite."""
+    return [float(f"{x:.{_DIGITS}g}") if np.isfinite(x) else None for x in values.tolist()]
