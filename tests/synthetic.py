@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxgran.analysis.instant import Instant
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import Tally
@@ -33,6 +34,22 @@ def random_replica(rng: np.random.Generator, settings: MapSettings, status: int 
     """Return a replica of a map with random sums, the same area for all and a strain of 3 before the sample."""
     tally, grains = random_tally(rng, BLOCKS, status=status), settings.flows()[point].grains
     return Replica(Sample(tally, np.float64(100.0), np.float64(1.0), grains), int(status), 3.0)
+
+
+def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
+    """Return an instant of grains at random places in a cell of side 10, with pairs of random forces."""
+    rng = np.random.default_rng(seed)
+    return Instant(
+        positions=rng.uniform(-5, 5, (grains, 2)),
+        radii=rng.uniform(0.3, 0.7, grains),
+        speed=rng.gamma(2.0, 1.0, grains),
+        pairs=np.sort(rng.permuted(np.tile(np.arange(grains), (pairs, 1)), axis=1)[:, :2], axis=1),
+        force=rng.gamma(1.0, 30.0, pairs),
+        clustered=rng.random(pairs) < 0.5,
+        side=10.0,
+        tilt=0.2,
+        window=0.002,
+    )
 
 
 def one_sentence(message: str) -> bool:

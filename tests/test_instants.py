@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import random_replica, snapshot_of
+from synthetic import random_instant, random_replica, snapshot_of
 
-from jaxgran.analysis.instant import Instant, averaged, instant_of
+from jaxgran.analysis.instant import averaged, instant_of
 from jaxgran.maps import instants, sweep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
@@ -24,21 +24,6 @@ from jaxgran.model.status import Status
 from jaxgran.plotting.flow import scene_of
 
 SETTINGS = MapSettings((0.5, 0.9), (0.8,), grains=32, seeds=2, timestep=5e-4, equilibrate=0.5, strain=1.6)
-
-
-def made_up(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
-    rng = np.random.default_rng(seed)
-    return Instant(
-        positions=rng.uniform(-5, 5, (grains, 2)),
-        radii=rng.uniform(0.3, 0.7, grains),
-        speed=rng.gamma(2.0, 1.0, grains),
-        pairs=np.sort(rng.permuted(np.tile(np.arange(grains), (pairs, 1)), axis=1)[:, :2], axis=1),
-        force=rng.gamma(1.0, 30.0, pairs),
-        clustered=rng.random(pairs) < 0.5,
-        side=10.0,
-        tilt=0.2,
-        window=0.002,
-    )
 
 
 def test_instant_of_a_series_is_what_a_picture_of_it_shows() -> None:
@@ -98,7 +83,7 @@ def test_instant_is_a_packing_of_the_flow_whose_forces_act_between_grains_that_t
 def test_bad_replicas_give_no_instant(with_instants) -> None:
     found = {key: replica for key, replica in with_instants.items()}
     found[0, 0] = found[0, 0]._replace(status=int(Status.nonfinite))
-    found[0, 1] = found[0, 1]._replace(instant=made_up(3))
+    found[0, 1] = found[0, 1]._replace(instant=random_instant(3))
     assert first_of_points(found)[0].side == 10.0
     found[0, 1] = found[0, 1]._replace(status=int(Status.infeasible))
     assert set(first_of_points(found)) == {1}
@@ -107,7 +92,7 @@ def test_bad_replicas_give_no_instant(with_instants) -> None:
 def kept(settings: MapSettings) -> dict[Key, Replica]:
     """Made-up replicas of a map; one point has no instant, and they have different numbers of grains and pairs."""
     rng = np.random.default_rng(0)
-    found = {(point, 0): made_up(point, 20 + point, 3 * point) for point in (0, 1, 3)}
+    found = {(point, 0): random_instant(point, 20 + point, 3 * point) for point in (0, 1, 3)}
     return {(p, s): random_replica(rng, settings)._replace(instant=found.get((p, s))) for p in range(4) for s in (0, 1)}
 
 
@@ -156,7 +141,7 @@ def test_dataset_has_the_instant_of_each_point_and_keeps_it_through_a_file_and_a
 
 def test_map_of_120_points_of_a_thousand_grains_has_less_than_three_megabytes(tmp_path: Path) -> None:
     """A quarter of it is written. The rest of the dataset takes half a megabyte."""
-    variables = instant_variables(("point",), (30,), {k: made_up(k, 1000, 900) for k in range(30)})
+    variables = instant_variables(("point",), (30,), {k: random_instant(k, 1000, 900) for k in range(30)})
     write_dataset(xr.Dataset(variables), tmp_path / "map.nc")
     assert 4 * (tmp_path / "map.nc").stat().st_size < 2.4e6
 

@@ -5,7 +5,7 @@
 const RING = { symbol: "circle-open", size: 15, color: "#b2182b", line: { width: 2 } };
 const SCALE = [[0, "#f7fafc"], [0.35, "#bdd7ea"], [0.7, "#6ba3d0"], [1, "#2b6cab"]]; // dark enough in grey, light enough for black lines
 const EXCESS_LINEAR_BELOW = 0.01; // as in the contours of Figure 2
-const EXCESS_STEPS = 12; // of the interpolation between two points
+const EXCESS_STEPS = 6; // of the interpolation between two points
 
 const flat = (rows) => rows.flat();
 const shown = (value) => value !== null && Number.isFinite(value);
@@ -91,7 +91,7 @@ function planeTraces(view, levelCount, excessLevels) {
   if (isPlane && known.length) {
     traces.push({
       type: "contour", x, y, z, ...colours, hoverinfo: "skip", name: "observable", connectgaps: false,
-      contours: { start: levels.start, end: levels.end, size: levels.size, coloring: "heatmap", showlabels: !log, labelfont: { size: 11, color: "#345" } },
+      contours: { start: levels.start, end: levels.end, size: levels.size, coloring: "fill", showlabels: !log, labelfont: { size: 11, color: "#345" } },
       line: { color: "rgba(40,60,80,0.55)", width: 0.8 },
     });
     if (excessLevels) traces.push(...excessTraces(view.excess, x, y, excessLevels));

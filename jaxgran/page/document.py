@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -63,17 +64,22 @@ def document(name: str, scripts: tuple[str, ...], title: str, data: Mapping[str,
       InputError: (a ValueError) Plotly is not installed.
     """
     require_plotly()
-    from plotly.offline import get_plotlyjs
-
-    library = gzip.compress(get_plotlyjs().encode(), mtime=0)  # a third of its size, also when it is written as text
     parts = {
         "title": html.escape(title),
         "style": _text("page.css"),
         "data": json.dumps(data, separators=(",", ":"), allow_nan=False).translate(_ESCAPED),
-        "library": base64.b64encode(library).decode(),
+        "library": _library(),
         "script": "\n".join(_text(script) for script in scripts),
     }
     return Page(_MARK.sub(lambda mark: parts[mark[1]], _text(f"{name}.html")))
+
+
+@cache
+def _library() -> str:
+    """Plotly in the browser, compressed and as text: a third of its size."""
+    from plotly.offline import get_plotlyjs
+
+    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode()
 
 
 def _text(name: str) -> str:

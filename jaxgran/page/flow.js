@@ -2,6 +2,7 @@
 "use strict";
 
 const FRAMES_PER_SECOND = 12;
+const MARKED = 3; // of so many frames one is marked in the charts while the flow plays, as that takes longest
 const { frames, averages } = pageData;
 const strains = pageData.strain;
 let now = 0;
@@ -39,6 +40,7 @@ function showFrame(k) {
   drawGrains(element("grains"), frames[now], pageData.encoding);
   element("frame").value = now;
   element("strain").textContent = `strain ${strains[now].toFixed(3)}, frame ${now + 1} of ${frames.length}`;
+  if (playing && now % MARKED) return;
   const marked = averages.map((_, one) => averages.length + one);
   Plotly.restyle("averages", { x: averages.map(() => [strains[now]]), y: averages.map((one) => [one.values[now]]) }, marked);
 }

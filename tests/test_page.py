@@ -1,0 +1,216 @@
+"""A page has every number of its map, and what stands in a file is text to it."""
+
+import base64
+import html
+import json
+import math
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from made_up_maps import ratio_dataset, with_grains, with_timesteps
+from pages import MARKUP, made_up_film, page_map
+from synthetic import one_sentence, random_instant
+
+import jaxgran as jg
+from jaxgran.maps.instants import instant_variables
+from jaxgran.model.checks import InputError
+from jaxgran.page.document import document
+from jaxgran.page.film import AVERAGES
+from jaxgran.page.grain_data import grain_data, scale_of
+from jaxgran.page.map_data import MOST_POINTS, map_data
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+
+
+@pytest.fixture(scope="module")
+def found() -> dict:
+    return map_data(page_map())
+
+
+def written(page: jg.Page) -> dict:
+    """The data in the text of a page."""
+    text = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.text)
+    assert text is not None
+    return json.loads(text[1])
+
+
+def assert_same_numbers(shown: list, expected: np.ndarray) -> None:
+    """To six digits; None where there is no number."""
+    numbers = np.array([math.nan if x is None else x for x in shown])
+    np.testing.assert_allclose(numbers, np.ravel(expected), rtol=5e-7, atol=0)
+
+
+def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
+    data, by_name = page_map().sortby("timestep"), {one["name"]: one for one in found["observables"]}
+    dims = ("timestep", "packing_fraction", "restitution")
+    strain = data.strain_by_seed.sum("seed")
+    for name, (_, unit) in OBSERVABLES.items():
+        if name in TENSORS:
+            for a, b in np.ndindex(2, 2):
+                assert_same_numbers(by_name[f"{name}_{'xy'[a]}{'xy'[b]}"]["value"], data[name].values[..., a, b])
+            continue
+        one = by_name[name]
+        assert one["meaning"] == OBSERVABLES[name][0] and (unit == "1") == (one["unit"] == "")
+        assert_same_numbers(one["value"], data[name].transpose(*dims).values)
+        assert_same_numbers(one["error"], data[f"{name}_stderr"].transpose(*dims).values)
+        for part, there in (("theory", f"theory_{name}"), ("whole", f"{name}_error")):
+            assert (part in one) == (there in data)
+            if part in one:
+                assert_same_numbers(one[part], data[there].values)
+        if name not in EXTREME_OBSERVABLES:
+            assert_same_numbers(one["samples"], (strain / data[f"{name}_correlation_strain"]).values)
+    assert [axis["values"] for axis in found["axes"]] == [[64], [5e-4, 1e-3], [0.5, 0.6], [0.5, 0.7, 0.9]]
+    assert not [name for name in by_name if re.search("_stderr|_seed|_error$|snapshot|status", name)]
+
+
+def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:
+    """Point 8 of the settings was not run; the shorter time step comes first on a page."""
+    assert found["status"] == ["ok", "deep_overlap", "not_run", *["ok"] * 9]
+    assert [one is None for one in found["observables"][0]["value"]] == [k == 2 for k in range(12)]
+    assert [one is None for one in found["instants"]] == [k == 2 for k in range(12)]
+    assert {"deep_overlap", "not_run"} <= set(found["meanings"])
+
+
+def test_instant_is_packed_without_visible_loss() -> None:
+    one = random_instant(1, grains=50, pairs=9)
+    scale = scale_of(one.speed, one.force)
+    packed = grain_data(**one._asdict(), scale=scale)
+    raw = base64.b64decode(packed["data"])
+    n, p = packed["grains"], packed["pairs"]
+    x, y, i, j = np.split(np.frombuffer(raw[: 4 * (n + p)], "<u2"), [n, 2 * n, 2 * n + p])
+    radius, speed, force, clustered = np.split(np.frombuffer(raw[4 * (n + p) :], np.uint8), [n, 2 * n, 2 * n + p])
+    cell = np.stack([one.positions[:, 0] - one.tilt * one.positions[:, 1], one.positions[:, 1]], axis=-1) / one.side
+    assert np.all(np.abs((np.stack([x, y], axis=-1) / 65536 - cell + 0.5) % 1 - 0.5) <= 1 / 65536)
+    np.testing.assert_array_equal(np.stack([i, j], axis=-1), one.pairs)
+    np.testing.assert_array_equal(clustered, one.clustered)
+    np.testing.assert_allclose(radius / 255 * packed["radius"], one.radii, atol=one.radii.max() / 500)
+    np.testing.assert_allclose(speed / 255, np.minimum(one.speed / scale.speed, 1), atol=1 / 500)
+    np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
+
+
+@pytest.mark.parametrize(("alphas", "nus"), [(1, 1), (4, 1), (1, 3)])
+def test_map_of_one_point_or_one_row_has_a_page(alphas: int, nus: int) -> None:
+    page = written(jg.explore(ratio_dataset(alphas, nus)))
+    assert [len(axis["values"]) for axis in page["axes"]] == [1, 1, nus, alphas]
+    assert len(page["observables"][0]["value"]) == len(page["status"]) == alphas * nus
+    assert page["again"] is None  # this file does not tell how it was made
+
+
+def test_map_of_another_program_shows_its_own_names() -> None:
+    values = ("restitution", "packing_fraction"), np.arange(6.0).reshape(2, 3)
+    other = xr.Dataset({"stress of mine": values}, {"restitution": [0.9, 0.5], "packing_fraction": [0.1, 0.2, 0.3]})
+    page = map_data(other)
+    (one,) = page["observables"]
+    assert (one["name"], one["unit"]) == ("stress of mine", "") and "error" not in one
+    assert one["value"] == [3, 0, 4, 1, 5, 2]  # by packing fraction, then restitution, both rising
+    assert page["status"] == ["ok"] * 6 and page["axes"][0]["values"] == page["axes"][1]["values"] == []
+
+
+def test_several_numbers_of_grains_are_an_axis_and_an_estimate_without_them_is_shown_at_each() -> None:
+    data = with_grains(ratio_dataset(2, 2), 64, 256)
+    data["limit"] = data.pressure[0].drop_vars("grains")
+    page = map_data(data)
+    assert page["axes"][0]["values"] == [64, 256]
+    (limit,) = (one for one in page["observables"] if one["name"] == "limit")
+    assert_same_numbers(limit["value"], np.stack([data.limit.values] * 2))
+
+
+def test_million_points_are_thinned_with_a_word_about_it() -> None:
+    page = map_data(ratio_dataset(1000, 1000))
+    axes = [axis["values"] for axis in page["axes"][2:]]
+    assert 0.9 * MOST_POINTS < len(axes[0]) * len(axes[1]) == len(page["status"]) <= MOST_POINTS
+    assert (axes[0][0], axes[0][-1], axes[1][0], axes[1][-1]) == (0.3, 0.8, 0.1, 0.9)
+    (note,) = page["notes"]
+    assert one_sentence(note.replace("points. This", "points: this")) and "1000000 points" in note
+    assert len(map_data(ratio_dataset(1, 100_000))["status"]) == MOST_POINTS
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (3, "must be the dataset of a ratio map, and this is a int"),
+        (xr.Dataset(), "it has no packing_fraction, restitution"),
+        (ratio_dataset()[["status"]], "it has no number at its points"),
+        (with_timesteps(ratio_dataset(1, 1), *np.geomspace(1e-5, 1e-3, 101).tolist()), "at most 100 numbers of grains"),
+    ],
+    ids=["number", "nothing", "only statuses", "too many time steps"],
+)
+def test_what_cannot_be_shown_is_refused_in_one_sentence(data, words: str) -> None:
+    with pytest.raises(InputError, match=words) as refused:
+        jg.explore(data)
+    assert one_sentence(str(refused.value))
+
+
+def test_a_page_without_plotly_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    with pytest.raises(InputError, match="pip install 'jaxgran\\[explore\\]'"):
+        jg.explore(ratio_dataset())
+
+
+def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
+    page = jg.explore(page_map())
+    assert "hacked = 1</script>" not in page.text and "<img" not in page.text and "<u>name" not in page.text
+    assert written(page)["title"] == MARKUP
+    assert written(page)["observables"][-1]["name"] == "own <u>name</u>"
+    assert f"<title>{html.escape(MARKUP)}</title>" in page.text
+    assert page.text.count("<script") == page.text.count("</script>") == 3
+
+
+def test_page_forbids_itself_every_request() -> None:
+    for name in ("map", "flow"):
+        template = files("jaxgran.page").joinpath(f"{name}.html").read_text(encoding="utf-8")
+        policy = re.search(r'Content-Security-Policy" content="(.*?)"', template)
+        assert policy is not None and policy[1].startswith("default-src 'none';")
+        assert "http:" not in template and "https:" not in template and "connect-src" not in policy[1]
+
+
+@pytest.mark.parametrize("name", ["activation", "solver_asked", "tolerance", "seeds"])
+def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> None:
+    data = page_map()
+    again = map_data(data)["again"]
+    assert again["options"] == "--activation midpoint --solver barzilai-borwein --tolerance 0.0001"
+    assert_same_numbers(again["strain"], data.strain_by_seed.mean("seed").sortby("timestep").values)
+    assert map_data(data.assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
+
+
+def test_page_of_120_points_of_a_thousand_grains_has_less_than_six_megabytes() -> None:
+    data = ratio_dataset(10, 12)
+    instants = dict.fromkeys(range(120), random_instant(0, 1000, 900))
+    variables = instant_variables(("packing_fraction", "restitution"), (12, 10), instants)
+    page = jg.explore(data.assign(variables))
+    assert len(written(page)["instants"]) == 120
+    assert len(page.text) < 6e6
+
+
+def test_explore_writes_a_page_that_a_notebook_shows(tmp_path: Path) -> None:
+    page = jg.explore(ratio_dataset(), tmp_path / "map.html")
+    assert (tmp_path / "map.html").read_text(encoding="utf-8") == page.text
+    frame = page._repr_html_()
+    assert frame.startswith("<iframe") and html.escape(page.text) in frame
+    assert "MB" in repr(page)
+
+
+def test_film_has_the_running_averages_of_its_frames() -> None:
+    film = made_up_film()
+    page = written(film.page())
+    assert page["strain"] == pytest.approx([0.0, 10, 20, 30, 40]) and len(page["frames"]) == 5
+    assert [one["values"][0] for one in page["averages"]] == [None] * len(AVERAGES)
+    sums = film._sum
+    assert sums is not None
+    assert page["averages"][0]["values"][-1] == pytest.approx((sums.impulse / sums.binary_impulse).item(), rel=1e-6)
+    assert len({one["force"] for one in page["frames"]}) == 1  # one scale
+    assert "N = 16" in page["about"] and "α = 0.1, ν = 0.8" in page["title"]
+
+
+def test_film_of_many_grains_keeps_a_part_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("jaxgran.page.film._MOST_DRAWN_GRAINS", 40)
+    page = written(made_up_film().page())
+    assert len(page["frames"]) == len(page["strain"]) == 3
+
+
+def test_data_of_a_page_have_no_numbers_that_json_lacks() -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        document("map", (), "title", {"value": math.nan})
