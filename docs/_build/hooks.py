@@ -1,7 +1,8 @@
 """What the site shows from outside ``docs``: charts, a drawing of the folders, contributing and the change log.
 
 Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
-``charts/architecture.svg``, is made from the imports of the code at every build. ``{OBSERVABLES}`` in a page stands for
+``charts/architecture.svg``, is made from the imports of the code at every build. ``charts/paper.html``, the paper's map
+as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
 the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{BENCHMARKS}`` for the table of
 ``benchmarks/registry.py``.
 """
@@ -16,6 +17,9 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from jaxgran.maps.results import read_dataset
+from jaxgran.page.explore import explore
+
 ROOT = Path(__file__).parents[2]
 CHARTS = ROOT / "benchmarks" / "results"
 PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
@@ -26,6 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for chart in sorted(CHARTS.glob("*.png")):
         files.append(File.generated(config, f"charts/{chart.name}", abs_src_path=str(chart)))
     files.append(File.generated(config, "charts/architecture.svg", content=architecture.picture()))
+    files.append(File.generated(config, "charts/paper.html", content=explore(read_dataset(CHARTS / "paper.nc")).text))
     for page, source in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     return files
