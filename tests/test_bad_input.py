@@ -394,7 +394,10 @@ def test_any_file_and_folder_of_plot_are_refused_in_one_sentence(file: str, fold
 
 
 @few(max_examples=40)
-@given(st.sampled_from(["map", "run", "plot", "info"]), st.lists(texts.filter(lambda x: x != "--help"), min_size=1))
+@given(
+    st.sampled_from(["map", "run", "plot", "explore", "info"]),
+    st.lists(texts.filter(lambda x: x != "--help"), min_size=1),
+)
 def test_any_words_after_a_command_are_refused_in_one_sentence(command: str, words: list[str]) -> None:
     assert accepts_or_refuses(command, *words).status == 2
 

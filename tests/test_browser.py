@@ -6,15 +6,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from command_line import jaxgran, made_up_replicas
+from command_line import jaxgran
 from pages import MARKUP, browser, made_up_film, open_page, page_map
 
 import jaxgran as jg
-from jaxgran.maps import sweep
-from jaxgran.model.status import Status
+from jaxgran.maps.settings import MapSettings
 
 
 @pytest.fixture(scope="module")
@@ -269,10 +269,13 @@ def test_copied_are_the_table_and_a_command_that_runs(
     assert float(command[command.index("--strain") + 1]) == pytest.approx(
         4 * float(page_map().strain_by_seed.sel(here(map_page)).mean()), rel=0.01
     )
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, seed): Status.ok for seed in range(2)}))
-    monkeypatch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
-    outcome = jaxgran(tmp_path, *command[1:])
-    assert outcome.status == 0 and "wrote point.nc" in outcome.err
+    measured = Mock(side_effect=SystemExit(0))
+    monkeypatch.setattr("jaxgran.cli.map.measured", measured)
+    assert jaxgran(tmp_path, *command[1:]).status == 0
+    settings, point = MapSettings(**measured.call_args[0][0]), here(map_page)
+    (flow,) = settings.flows()
+    assert {name: getattr(flow, name) for name in point} == point
+    assert (settings.grains, settings.seeds, settings.activation) == (64, 2, "midpoint")
 
 
 def test_flow_plays_pauses_and_steps(chromium, tmp_path: Path) -> None:

@@ -215,12 +215,8 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
 
 def _about(data: xr.Dataset) -> str:
     """The sentence that says what the numbers belong to."""
-    known = [
-        f"{data.attrs[name]} {words}"
-        for name, words in (("activation", "activation"), ("seeds", "seeds"))
-        if name in data.attrs
-    ]
-    return _text(", ".join(known))
+    words = {"activation": "{} activation", "seeds": "{} seed" if data.attrs.get("seeds") == 1 else "{} seeds"}
+    return _text(", ".join(form.format(data.attrs[name]) for name, form in words.items() if name in data.attrs))
 
 
 def _axis(data: xr.Dataset, name: str) -> list[float]:

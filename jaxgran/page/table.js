@@ -1,7 +1,7 @@
 // The numbers of the chosen point as a table, and as text to copy.
 "use strict";
 
-const COLUMNS = ["observable", "value", "± standard error", "unit", "kinetic theory", "effective samples", "whole error, 95 %"];
+const COLUMNS = ["observable", "value", "± error", "unit", "theory", "samples", "whole error"];
 
 function tableRows(observables, point) {
   return observables.map((one) => {
