@@ -58,6 +58,12 @@ print(f"largest standard error of the force ratio: {float((data.force_ratio_stde
 jg.ratio_curves(data)
 
 # %% [markdown]
+# All numbers of the map as a page: point at the plane to see them, and click to see the curves through a point.
+
+# %%
+jg.explore(data)
+
+# %% [markdown]
 # The same as contours of the excess ⟨F⟩/⟨F_bc⟩ − 1. Below the lowest line kinetic theory can hold; above it cannot.
 
 # %%

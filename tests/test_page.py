@@ -118,6 +118,13 @@ def test_several_numbers_of_grains_are_an_axis_and_an_estimate_without_them_is_s
     assert_same_numbers(limit["value"], np.stack([data.limit.values] * 2))
 
 
+def test_number_of_grains_that_was_chosen_by_point_stands_at_its_point() -> None:
+    data = ratio_dataset(2, 2)
+    page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
+    assert page["grains"] == [64, 90, 128, 256] and [one["name"] for one in page["observables"]] == ["force_ratio"]
+    assert map_data(data)["grains"] is None
+
+
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
     page = map_data(ratio_dataset(1000, 1000))
     axes = [axis["values"] for axis in page["axes"][2:]]

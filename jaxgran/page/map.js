@@ -15,6 +15,7 @@ const pointAt = (row, column) => {
   const part = Math.max(chosen.grains, 0) * Math.max(timesteps.length, 1) + chosen.timestep;
   return (part * fractions.length + row) * restitutions.length + column;
 };
+const grainsAt = (point) => pageData.grains?.[point] ?? sizes[Math.max(chosen.grains, 0)];
 const overPlane = (what) => fractions.map((_, row) => restitutions.map((_, column) => what(pointAt(row, column), row, column)));
 const words = (status) => status.replace(/_/g, " ") + (pageData.meanings[status] ? `: ${pageData.meanings[status]}` : "");
 
@@ -48,7 +49,7 @@ function hoverText(one, row, column) {
     `${one.name.replace(/_/g, " ")} = ${numberText(one.value[point])}${one.error ? ` ± ${numberText(one.error[point], 2)}` : ""} ${one.unit}`,
   ];
   if (one.theory) lines.push(`kinetic theory ${numberText(one.theory[point])}`);
-  if (timesteps.length) lines.push(`dt = ${plain(timesteps[chosen.timestep])}/γ̇${sizes.length ? `, N = ${sizes[chosen.grains]}` : ""}`);
+  if (sizes.length) lines.push(`N = ${grainsAt(point)}${timesteps.length ? `, dt = ${plain(timesteps[chosen.timestep])}/γ̇` : ""}`);
   if (one.samples) lines.push(`${numberText(one.samples[point], 3)} effective samples`);
   lines.push(`status ${pageData.status[point].replace(/_/g, " ")}`);
   return lines.map(escaped).join("<br>");
@@ -72,7 +73,7 @@ function draw() {
 function drawPoint(alpha, nu) {
   const point = pointAt(chosen.row, chosen.column);
   const which = [`α = ${alpha}`, `ν = ${nu}`];
-  if (sizes.length) which.push(`N = ${sizes[chosen.grains]}`);
+  if (sizes.length) which.push(`N = ${grainsAt(point)}`);
   if (timesteps.length) which.push(`dt = ${plain(timesteps[chosen.timestep])}/γ̇`);
   element("which").textContent = which.join(", ");
   element("status").textContent = `Status ${words(pageData.status[point])}.`;
@@ -93,7 +94,7 @@ function commandAgain(point, alpha, nu) {
   const again = pageData.again;
   if (!again || !sizes.length || !timesteps.length || !again.strain[point]) return "";
   const strain = Number((4 * again.strain[point]).toPrecision(3));
-  return `jaxgran map --restitution ${alpha} --packing-fraction ${nu} --grains ${sizes[chosen.grains]} --seeds ${again.seeds}` +
+  return `jaxgran map --restitution ${alpha} --packing-fraction ${nu} --grains ${grainsAt(point)} --seeds ${again.seeds}` +
     ` --timestep ${plain(timesteps[chosen.timestep])} --strain ${strain} ${again.options} --output point.nc`;
 }
 
@@ -174,7 +175,7 @@ function readAddress() {
 function startMap() {
   element("title").textContent = pageData.title;
   const belongs = [];
-  if (sizes.length) belongs.push(`N = ${sizes.join(", ")}`);
+  if (sizes.length) belongs.push(pageData.grains ? `N chosen by point, up to ${sizes[0]}` : `N = ${sizes.join(", ")}`);
   if (timesteps.length) belongs.push(`dt = ${timesteps.map(plain).join(", ")}/γ̇`);
   if (pageData.about) belongs.push(pageData.about);
   element("about").textContent = `${belongs.join(", ")}. Error bars are one standard error of sampling. ` +

@@ -28,7 +28,7 @@ _AXES = {
 _PLANE = ("packing_fraction", "restitution")
 _TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_error", "_correlation_strain", "_error_timestep", "_error_size", "_error_tolerance")
-_LEFT_OUT = ("status", "point_grains", "memory")
+_LEFT_OUT = ("status", "point_grains")
 _NAMED = {"activation": get_args(Activation), "solver": get_args(Solver), "engine": get_args(Engine)}
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
 
@@ -44,6 +44,7 @@ def map_data(data: xr.Dataset) -> dict[str, Any]:
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses
+    grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
     again          what the command needs that measures a point again, if the map was made by this program
     about, notes   sentences: what the numbers belong to, and what is left out
@@ -65,6 +66,7 @@ def map_data(data: xr.Dataset) -> dict[str, Any]:
         "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
         "observables": observables,
         "status": _statuses(data, dims),
+        "grains": _numbers(_column(data.point_grains, data, dims)) if "point_grains" in data else None,
         "meanings": MEANINGS,
         "excessLevels": list(EXCESS_LEVELS),
         "instants": instants,
