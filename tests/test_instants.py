@@ -149,3 +149,13 @@ def test_map_of_120_points_of_a_thousand_grains_has_less_than_three_megabytes(tm
 def test_window_has_at_least_one_time_step_and_at_most_a_thousand(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(instants, "WINDOW", 0.002)
     assert [instants._steps(timestep) for timestep in (0.01, 1e-3, 1e-5, 1e-8)] == [1, 2, 200, 1000]
+
+
+def test_instant_of_a_batch_that_continues_from_its_journal_is_the_same(
+    with_instants, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jaxgran.maps.journal.SECONDS", 0.0)
+    for journal_there in (False, True):
+        assert (tmp_path / "journal.nc").exists() == journal_there
+        done = dict(sweep._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
+        jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_instants[1, 0])
