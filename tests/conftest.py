@@ -4,6 +4,7 @@ The compiled functions of the engine are shared by all tests: one number of grai
 ``compiled_programs`` says where they are kept.
 """
 
+import os
 from dataclasses import replace
 from functools import cache, partial
 
@@ -12,6 +13,7 @@ import hypothesis
 import pytest
 
 compiled_programs.set_up()
+os.environ.pop("COLUMNS", None)  # the processes of xdist are told a width, and tables would have it
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

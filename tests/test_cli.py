@@ -644,7 +644,7 @@ def test_completion_is_offered_and_its_script_calls_the_command(words: list[str]
 @pytest.mark.parametrize(
     ("line", "expected"),
     {
-        "jaxgran ": {"map", "plot", "run", "fit", "info"},
+        "jaxgran ": {"map", "plot", "explore", "run", "fit", "info"},
         "jaxgran p": {"plot"},
         "jaxgran run --m": {"--movie"},
         "jaxgran map --preset ": {"quick", "paper", "dense"},

@@ -31,8 +31,16 @@ def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flo
     np.testing.assert_array_equal(again.positions, end.positions)
 
 
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C as a terminal has it: a shell ignores it for what it runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="no signals to a thread")
-def test_a_sample_of_hours_ends_within_a_second_of_ctrl_c(flowing) -> None:
+def test_a_sample_of_hours_ends_within_a_second_of_ctrl_c(flowing, ctrl_c) -> None:
     state = flowing(0.7)
     _, before = sample(FLOW, state, 0.1)
     sent = []

@@ -130,7 +130,9 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     flow = stack([FLOWS[0]] * 5)
     end = steady_state._until_steady(Batch(flow, start, status, np.zeros(5), np.full(5, 3.2)), None)
     bad = Status.not_steady
-    np.testing.assert_array_equal(end.status, [Status.ok, bad, bad, bad, Status.nonfinite])
+    np.testing.assert_array_equal(
+        end.status, [Status.ok, bad, Status.ok, bad, Status.nonfinite]
+    )  # the third only fluctuates
     strain = np.array(sheared)
     assert np.all(strain[:, 4] == 0)  # no work is done for a replica that is not finite
     np.testing.assert_allclose(end.strain, strain.sum(axis=0))
