@@ -62,8 +62,8 @@ def friction_figure(data: xr.Dataset) -> Figure:
     ======== =============================== =====================================================
     """
     require_map(data, *RATIO, *NEEDED)
-    data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
     law = friction_law(data)
+    data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
     measured = np.isfinite(data.macroscopic_friction.values)
     styles = dict(zip(data.restitution.values.tolist(), curve_styles(data.sizes["restitution"]), strict=True))
     figure = empty_figure(width=8.6, height=4.4 + 0.16 * len(styles))
