@@ -11,7 +11,7 @@ import xarray as xr
 from synthetic import one_sentence
 
 import jaxgran as jg
-from jaxgran.dynamics import plain
+from jaxgran.dynamics import engine, plain
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.maps.dataset import map_dataset
@@ -52,13 +52,29 @@ def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> 
     assert select_engine(of()) == select_engine(of(), state) == "machine_code"
     assert select_engine(of(solver="nesterov"), state) == "jax"
     assert select_engine(of(), single(state)) == "jax"
-    assert select_engine(of(), replace(state, tilt=state.tilt.astype(jnp.float32))) == "jax"
     assert select_engine(of(), state, "events") == "jax"
     found = []
     batch = jax.tree.map(lambda x: x[None], state)
     jax.vmap(lambda one: found.append(select_engine(of(), one)), axis_name=AXIS)(batch)
     jax.vmap(lambda one: found.append(select_engine(of(), one)))(batch)
     assert found == ["jax", "machine_code"]
+
+
+def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
+    mixed = replace(single(flowing(0.7)), side=flowing(0.7).side)
+    for call in (lambda: jg.advance(of(), mixed, STEPS), lambda: jg.sample(of(), mixed, 0.1)):
+        assert refusal(call).startswith("state must be of one precision, and its numbers are float32 and float64: ")
+
+
+def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None:
+    engine._warn_once.cache_clear()
+    state = single(flowing(0.7))
+    assert select_engine(of(), state) == "jax"  # in a session of double precision it was asked for
+    with jax.enable_x64(False):
+        assert select_engine(of("jax"), state) == select_engine(of(solver="jacobi"), state) == "jax"
+        with pytest.warns(match=r"^JAX computes in single precision.*jax_enable_x64"):
+            assert select_engine(of(), state) == "jax"
+        assert select_engine(of(), state) == "jax"
 
 
 def test_jax_takes_whatever_it_is_asked_for(flowing) -> None:
@@ -79,10 +95,6 @@ IMPOSSIBLE = {
     "single precision": (
         lambda state: jg.advance(of("machine_code"), single(state), STEPS),
         "in float32, not machine_code: it computes in float64",
-    ),
-    "several precisions": (
-        lambda state: jg.advance(of("machine_code"), replace(single(state), side=state.side), STEPS),
-        "where the numbers of a state differ in precision, not machine_code",
     ),
     "a named axis": (
         lambda state: jax.vmap(lambda one: jg.advance(of("machine_code"), one, STEPS), axis_name=AXIS)(

@@ -14,10 +14,11 @@ from jaxtyping import Array, Int
 
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import select_engine
-from jaxgran.dynamics.plain import ended, require_advance
+from jaxgran.dynamics.plain import NEEDS_EVENTS, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, Tally, sums_from_row
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.state import State
 
 _CompiledEngine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
@@ -58,9 +59,11 @@ def advance(
       the status ``nonfinite``. On a GPU, a replica whose lists are full stops with ``capacity``.
 
     Raises:
-      InputError: the flow names an engine that cannot do this.
+      InputError: the flow names an engine that cannot do this, or a derivative in reverse mode lacks ``events``.
     """
     require_advance(flow, state, steps)
+    if events is None:
+        flow, state = forward_only((flow, state), NEEDS_EVENTS)
     options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
     engine = select_engine(flow, state, " and ".join(name for name, given in options.items() if given))
     if engine == "jax":

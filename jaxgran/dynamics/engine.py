@@ -30,6 +30,10 @@ from jaxgran.model.state import State
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
 _DEFAULT_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
 _ENGINE_OF_PLATFORM: dict[str, Engine] = {"cpu": "machine_code", "gpu": "thread_block"}
+_SINGLE_PRECISION = (
+    "JAX computes in single precision, in which flows take the engine jax, several times slower than the machine code: "
+    'begin with jax.config.update("jax_enable_x64", True).'
+)
 _SOLVER_OF_ENGINE = {"machine_code": "gauss-seidel, barzilai-borwein where stiff", "thread_block": "barzilai-borwein"}
 
 
@@ -56,6 +60,8 @@ def select_engine(flow: ShearFlow, state: State | None = None, jax_only: str = "
     if obstacle is None:
         return engine
     if flow.engine == "auto":
+        if state is not None and engine == "machine_code" and _only_precision_is_missing(flow, jax_only):
+            _warn_once(_SINGLE_PRECISION)
         return "jax"
     where, why = obstacle
     raise InputError(f"engine must be auto or jax {where}, not {engine}: {why}.")
@@ -77,7 +83,6 @@ def _obstacle(
     engine: Engine, flow: ShearFlow, state: State | None, jax_only: str, device: Any
 ) -> tuple[str, str] | None:
     """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
-    dtypes = _dtypes(state)
     if _ENGINE_OF_PLATFORM.get(device.platform) != engine:
         made_for = "processors" if engine == "machine_code" else "NVIDIA GPUs"
         return f"on a {device.platform.upper()}", f"it is made for {made_for}"
@@ -85,10 +90,8 @@ def _obstacle(
         return f"with {jax_only}", "only the engine jax does that"
     if flow.solver != _DEFAULT_SOLVER:
         return f"with the solver {flow.solver}", "it has a contact solve of its own"
-    if len(dtypes) > 1:
-        return "where the numbers of a state differ in precision", "it computes in one"
-    if engine == "machine_code" and dtypes != {jnp.dtype(jnp.float64)}:
-        return f"in {next(iter(dtypes))}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
+    if engine == "machine_code" and _dtype(state) != jnp.float64:
+        return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
     if engine == "machine_code" and in_batch():
         return f"in a vmap with the axis name {AXIS!r}", "it advances one replica after another, as in jax.lax.map"
     if engine == "thread_block" and flow.grains > MOST_GRAINS:
@@ -96,10 +99,15 @@ def _obstacle(
     return None
 
 
+def _only_precision_is_missing(flow: ShearFlow, jax_only: str) -> bool:
+    """Whether the machine code would advance the flow if double precision were switched on."""
+    other = jax_only or flow.solver != _DEFAULT_SOLVER or in_batch()
+    return not other and not jax.config.read("jax_enable_x64")
+
+
 def _kernel_obstacle(flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
     """The obstacle that a trial of the GPU kernel finds; with the engine "auto", a warning reports it."""
-    dtype = next(iter(_dtypes(state)))
-    problem = _kernel_problem(flow.grains, dtype, device, jax.config.read("jax_enable_x64"))
+    problem = _kernel_problem(flow.grains, _dtype(state), device, jax.config.read("jax_enable_x64"))
     if not problem:
         return None
     if flow.engine == "auto":
@@ -107,8 +115,8 @@ def _kernel_obstacle(flow: ShearFlow, state: State | None, device: Any) -> tuple
     return "here", f"the kernel for GPUs does not run ({problem})"
 
 
-def _dtypes(state: State | None) -> set[jnp.dtype]:
-    return {jnp.dtype(jnp.result_type(float))} if state is None else {x.dtype for x in jax.tree.leaves(state)}
+def _dtype(state: State | None) -> jnp.dtype:
+    return jnp.dtype(jnp.result_type(float)) if state is None else state.positions.dtype
 
 
 def _device() -> Any:

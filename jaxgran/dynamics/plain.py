@@ -33,10 +33,15 @@ from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, kinetic_energy, relative_momentum, require_state, status_if_finite
 from jaxgran.model.status import Status
 
+NEEDS_EVENTS = (
+    "derivatives in reverse mode (jax.grad, jax.vjp) need the length of the loop: take advance(flow, state, steps, "
+    "events=int(count_events(flow, state, steps))), or forward mode (jax.jvp, jax.jacfwd), which needs nothing."
+)
 _FEW_BUFFERS = 3  # contact buffers where derivatives are compiled too, which takes long
 
 
@@ -74,6 +79,7 @@ def advance_observed(
     flow: ShearFlow, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
     """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
+    flow, state = forward_only((flow, state), NEEDS_EVENTS)
     start, body, unfinished = _event_loop(flow, state, steps, True, AdvanceOptions(observe=observe))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
     return *_ended(state, end, unfinished), end.sums.user_sums.sums
@@ -102,6 +108,7 @@ def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: 
 
 def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:
     """Evaluations that an advance takes: the ``events`` that it needs in a loop of fixed length."""
+    flow, state = forward_only((flow, state), "count_events returns a whole number, which has no derivative.")
     start, body, unfinished = _event_loop(flow, state, steps, free_flight, AdvanceOptions())
     counted = jnp.int32(0), start
     return lax.while_loop(lambda at: any_replica(unfinished(at[1])), lambda at: (at[0] + 1, body(at[1])), counted)[0]

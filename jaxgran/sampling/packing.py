@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
@@ -27,6 +28,7 @@ from jaxgran.model.cell import cell_side
 from jaxgran.model.checks import InputError, require_key
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow, require_flow
+from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains, polydisperse, require_grains
 from jaxgran.model.state import State
 
@@ -69,6 +71,10 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     """
     require_flow(flow)
     require_key(key)
+    words = (
+        "a packing has no derivatives in reverse mode (jax.grad, jax.vjp): differentiate what follows from its state."
+    )
+    flow, grains = forward_only((flow, grains), words)
     size_key, place_key = jax.random.split(key)
     generated = grains is None
     if grains is None:
@@ -117,10 +123,12 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
     require_grains(grains, flow.grains)
     if any(isinstance(x, Tracer) for x in (grains.radii, flow.packing_fraction)):
         return
-    radii = jnp.asarray(grains.radii, float)
-    room = float(widest_skin(Grains(radii, radii), cell_side(radii, flow.packing_fraction)))
+    radii = np.asarray(grains.radii, float)
+    with jax.ensure_compile_time_eval():  # the grains are known, also inside of ``jax.jit``
+        sizes = jnp.asarray(radii, float)
+        room = float(widest_skin(Grains(sizes, sizes), cell_side(sizes, flow.packing_fraction)))
     if room < _NARROWEST_SKIN:
-        largest, typical = 2 * float(jnp.max(radii)), 2 * float(jnp.sqrt(jnp.mean(radii**2)))
+        largest, typical = 2 * float(np.max(radii)), 2 * float(np.sqrt(np.mean(radii**2)))
         raise InputError(
             f"the largest diameter must be at most {(largest + room - _NARROWEST_SKIN) / typical:.3g} times the root "
             f"mean square of all in a flow of {flow.grains} grains at packing fraction "
