@@ -1,6 +1,7 @@
 """A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where positions resolve it."""
 
 import re
+import warnings
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -146,11 +147,27 @@ def test_every_average_has_an_error() -> None:
         assert np.all(error > 0), name
 
 
-def test_errors_of_a_batch_are_refused() -> None:
+def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> None:
     both = Sample(random_tally(np.random.default_rng(3), 2, BLOCKS), np.full(2, 100.0), np.ones(2), GRAINS)
-    with pytest.raises(ValueError, match="index it first"):
-        both.errors()
-    assert set(replica(both, 0).errors()) == set(OBSERVABLES)
+    errors = both.errors()
+    assert set(errors) == set(OBSERVABLES)
+    for k, one in enumerate(both):
+        jax.tree.map(np.testing.assert_array_equal, one, replica(both, k))
+        for name, error in one.errors().items():
+            np.testing.assert_array_equal(errors[name][k], error)
+    np.testing.assert_array_equal(both[1:].pressure, both.pressure[1:])
+    with pytest.raises(IndexError):
+        both[2]
+    with pytest.raises(InputError, match=r"^an index takes a replica of a batch, and this is one Sample"):
+        both[0][0]
+
+
+def test_averages_of_a_sample_are_of_numpy_and_those_that_jax_traces(measured) -> None:
+    """JAX would compile dozens of small sums at the first access."""
+    assert all(isinstance(x, np.ndarray | np.generic) for x in measured[1].averages.values())
+    traced = jax.jit(lambda one: (one.averages, one.status))(measured[1])
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-15), traced[0], measured[1].averages)
+    assert traced[1] == measured[1].status
 
 
 @pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), float("inf")])
@@ -184,7 +201,8 @@ def test_float32_measures_what_float64_does_at_a_time_step_it_resolves(state) ->
     # A tenth of a per cent: a hundred steps in which rounding has little time to grow.
     flow = replace(FLOWS[0], timestep=1e-4)
     _, double = sample(flow, state, 1e-2)
-    with jax.enable_x64(False):
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "JAX computes in single precision")
         _, single = sample(flow, in_float32(state), 1e-2)
     assert single.pressure.dtype == jnp.float32
     assert single.status == Status.ok

@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.dynamics.plain import advance
-from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, require_untraced, shown
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -132,6 +132,9 @@ def fit_restitution(
 
 def _checked(strain: Any, states: Any, shear_rate: float) -> tuple[np.ndarray, int]:
     """The strains as an array and the number of grains; an InputError where the trajectory cannot be fitted."""
+    require_untraced(
+        "fit_restitution", "it iterates in Python, so call it for each trajectory", strain, states, shear_rate
+    )
     require_number("shear_rate", shear_rate, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     strain, shape = np.asarray(strain, float), states.velocities.shape if isinstance(states, State) else ()
     if strain.ndim != 1 or len(strain) < 2 or len(shape) != 3 or shape[0] != len(strain):

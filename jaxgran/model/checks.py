@@ -77,11 +77,26 @@ def require_whole(name: str, value: Any, least: int, most: int, why: str) -> Non
         raise InputError(f"{name} must be at most {most}, {why}, not {shown(value)}.")
 
 
+def require_untraced(name: str, instead: str, *values: Any) -> None:
+    """Raise an InputError where JAX traces values of what is computed in Python; ``instead`` says what to do."""
+    import jax
+    from jax.core import Tracer
+
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+        raise InputError(f"{name} is not transformed by jax.jit, jax.vmap, jax.grad and their kin: {instead}.")
+
+
 def require_key(key: Any) -> None:
     """Raise an InputError unless this is a single JAX random key."""
+    if key_shape(key) != ():
+        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")
+
+
+def key_shape(key: Any) -> tuple[int, ...] | None:
+    """The shape of an array of JAX random keys, () for one; None for anything else."""
     import jax
 
-    typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape == (2,)
-    if not typed and not raw:
-        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")
+    if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return key.shape
+    raw = isinstance(key, (jax.Array, np.ndarray)) and key.dtype == np.uint32 and key.shape[-1:] == (2,)
+    return key.shape[:-1] if raw else None

@@ -166,9 +166,22 @@ def require_sheared(flow: ShearFlow) -> None:
     require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
 
 
-def require_flow(flow: Any) -> None:
-    """Raise an InputError unless this is a single ShearFlow, not a batch."""
+def one_of(flow: Any, k: int, count: int) -> ShearFlow:
+    """Flow ``k`` of a batch of ``count``, whose numbers are single ones, the same for all, or arrays of ``count``."""
+    _require_flows(flow)
+    shapes = {np.shape(getattr(flow, name)) for name in _TRACED_FIELDS} - {()}
+    if shapes - {(count,)}:
+        raise InputError(f"flow must have single numbers or arrays of {count}, one for each key, not {shown(shapes)}.")
+    return jax.tree.map(lambda x: np.broadcast_to(x, (count,))[k], flow)
+
+
+def _require_flows(flow: Any) -> None:
     if not isinstance(flow, ShearFlow):
         raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
+
+
+def require_flow(flow: Any) -> None:
+    """Raise an InputError unless this is a single ShearFlow, not a batch."""
+    _require_flows(flow)
     if any(np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS):
         raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")

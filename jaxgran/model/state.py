@@ -1,6 +1,7 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jaxgran.model.batches import replica_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import Row, arrays, display_methods, rounded
 from jaxgran.model.flow import ShearFlow, require_flow
@@ -60,14 +62,24 @@ class State:
 
     __repr__, _repr_html_ = display_methods("State", _rows)
 
+    def __getitem__(self, replica: Any) -> "State":
+        """The state of one replica of a batch, or of several by a slice or a list."""
+        return replica_of(self, replica, np.shape(self.side))
+
 
 def require_state(flow: ShearFlow, state: State) -> None:
-    """Raise an InputError unless these are one flow and one state with its number of grains."""
+    """Raise an InputError unless these are one flow and one state with its number of grains, in one precision."""
     require_flow(flow)
     if not isinstance(state, State) or jnp.shape(state.positions) != (flow.grains, 2):
         raise InputError(
             f"state must be one State of {flow.grains} grains, best from prepare, not "
             f"{f'of positions {jnp.shape(state.positions)}' if isinstance(state, State) else type(state).__name__}."
+        )
+    precisions = sorted({leaf.dtype.name for leaf in jax.tree.leaves(state) if hasattr(leaf, "dtype")})
+    if len(precisions) > 1:
+        raise InputError(
+            f"state must be of one precision, and its numbers are {' and '.join(precisions)}: "
+            "jax.tree.map(lambda x: x.astype(float), state) makes them one."
         )
 
 

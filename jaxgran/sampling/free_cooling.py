@@ -132,7 +132,8 @@ def _require_slow(flow: ShearFlow, state: State) -> None:
     if any(isinstance(x, Tracer) for x in (flow.timestep, *jax.tree.leaves(state))):
         return
     diameters, masses = 2 * np.asarray(state.grains.radii), np.asarray(state.grains.masses)
-    speeds = np.sqrt(2 * float(_temperature(state)) / masses)
+    temperature = np.sum(masses[:, None] * np.asarray(state.velocities) ** 2) / (2 * masses.size)
+    speeds = np.sqrt(2 * temperature / masses)
     rounding = float(np.finfo(state.positions.dtype).eps * np.max(np.asarray(state.side)))
     if float(np.asarray(flow.timestep) * np.max(speeds)) < _SMALLEST_CROSSING * rounding:
         raise InputError(

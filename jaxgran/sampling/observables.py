@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, Tally
+from jaxgran.model.batches import in_numpy
 
 STRESS_UNIT = "m / t^2"  # in two dimensions; t is the time unit of the shear rate, 1/shear rate by default
 
@@ -72,9 +73,11 @@ def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) 
       shear_rate: γ̇, in 1/t.
 
     Returns:
-      Arrays with the leading axes of the tally; tensors have two more axes, (2, 2). The diagonal of a stress Σ^{ab} is
-      positive, and the shear stress is −Σ^{xy}, as in the paper. An average over no contacts is NaN.
+      NumPy arrays, or those of JAX where it traces, with the leading axes of the tally; tensors have two more axes,
+      (2, 2). The diagonal of a stress Σ^{ab} is positive, and the shear stress is −Σ^{xy}, as in the paper. An average
+      over no contacts is NaN.
     """
+    tally, area, shear_rate = in_numpy((tally, area, shear_rate))
     with np.errstate(divide="ignore", invalid="ignore"):  # NumPy warns of these, JAX does not
         return _averages(tally, area, grains, shear_rate, _namespace(*vars(tally).values(), area, shear_rate))
 

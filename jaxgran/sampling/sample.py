@@ -19,7 +19,8 @@ from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.plain import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, require_whole, shown, two_digits
+from jaxgran.model.batches import in_numpy, replica_of
+from jaxgran.model.checks import InputError, require_untraced, require_whole, shown, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
@@ -47,15 +48,15 @@ def _rows(sample: "Sample") -> list[Row]:
     known = arrays(*vars(sample.tally).values(), sample.area, sample.shear_rate)
     if not known or np.ndim(sample.tally.contact_moment) < 3:
         return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
-    in_numpy = jax.tree.map(np.asarray, sample)
-    averages = in_numpy.averages
-    errors = in_numpy.errors() if in_numpy.area.ndim == 0 else {}
+    here = in_numpy(sample)
+    averages = here.averages
+    errors = here.errors() if np.ndim(here.area) == 0 else {}
     return [
-        *[Row("replicas", count) for count in in_numpy.area.shape],
-        Row("grains", in_numpy.grains),
-        Row("strain", rounded(in_numpy._total.duration * in_numpy.shear_rate)),
+        *[Row("replicas", count) for count in np.shape(here.area)],
+        Row("grains", here.grains),
+        Row("strain", rounded(here._total.duration * here.shear_rate)),
         *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _UNITS_OF_SHOWN.items()),
-        Row("status", statuses(in_numpy.status)),
+        Row("status", statuses(here.status)),
     ]
 
 
@@ -76,7 +77,8 @@ class Sample:
     ==========  =========  ====  ============================================
 
     The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
-    default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``.
+    default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``. They are NumPy numbers,
+    and JAX arrays only where JAX traces the sample. ``sample[0]`` is the sample of the first replica of a batch.
     """
 
     tally: Tally
@@ -87,48 +89,52 @@ class Sample:
 
     __repr__, _repr_html_ = display_methods("Sample", _rows)
 
+    def __getitem__(self, replica: Any) -> "Sample":
+        """The sample of one replica of a batch, or of several by a slice or a list."""
+        return replica_of(self, replica, np.shape(self.area))
+
     @property
-    def averages(self) -> dict[str, Array]:
+    def averages(self) -> dict[str, Array | np.ndarray]:
         """All observables over all blocks, by name."""
         return averages(self._total, self.area, self.grains, self.shear_rate)
 
     @property
-    def force_ratio(self) -> Float[Array, "*replicas"]:
+    def force_ratio(self) -> Float[Array | np.ndarray, "*replicas"]:
         """⟨F⟩/⟨F_bc⟩, mean contact force over mean force of binary collisions, dimensionless."""
         return self.averages["force_ratio"]
 
     @property
-    def pressure(self) -> Float[Array, "*replicas"]:
+    def pressure(self) -> Float[Array | np.ndarray, "*replicas"]:
         """Pressure, contact and kinetic, in m/t²."""
         return self.averages["pressure"]
 
     @property
-    def shear_stress(self) -> Float[Array, "*replicas"]:
+    def shear_stress(self) -> Float[Array | np.ndarray, "*replicas"]:
         """Shear stress −Σ^{xy}, contact and kinetic, in m/t²."""
         return self.averages["shear_stress"]
 
     @property
-    def granular_temperature(self) -> Float[Array, "*replicas"]:
+    def granular_temperature(self) -> Float[Array | np.ndarray, "*replicas"]:
         """Granular temperature Σ m c²/(2N), in mσ²/t²."""
         return self.averages["granular_temperature"]
 
     @property
-    def contact_stress(self) -> Float[Array, "*replicas 2 2"]:
+    def contact_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
         """Stress tensor of the contact forces, in m/t²."""
         return self.averages["contact_stress"]
 
     @property
-    def binary_stress(self) -> Float[Array, "*replicas 2 2"]:
+    def binary_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
         """Stress tensor of the contact forces if all collisions were binary, in m/t²."""
         return self.averages["binary_stress"]
 
     @property
-    def kinetic_stress(self) -> Float[Array, "*replicas 2 2"]:
+    def kinetic_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
         """Stress tensor of the peculiar motion, in m/t²."""
         return self.averages["kinetic_stress"]
 
     @property
-    def stress_ratio(self) -> Float[Array, "*replicas 2 2"]:
+    def stress_ratio(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
         """Contact stress over binary stress, by component, dimensionless."""
         return self.averages["stress_ratio"]
 
@@ -139,13 +145,22 @@ class Sample:
 
     @property
     def _total(self) -> Tally:
-        return self.tally.total(axis=jnp.ndim(self.area))
+        return in_numpy(self.tally).total(axis=np.ndim(self.area))
 
     def errors(self) -> dict[str, np.ndarray]:
-        """Standard errors of the averages of one replica, by the names of the observables; see ``standard_errors``."""
-        if jnp.ndim(self.area):
-            raise InputError("errors are those of one replica, and this sample holds a batch: index it first.")
-        return estimates([self])[1]
+        """Standard errors of the averages by the names of the observables, see ``standard_errors``.
+
+        Those of a batch are of each replica by itself, with its axes.
+
+        Raises:
+          InputError: JAX transforms this function.
+        """
+        require_untraced("errors()", "take it of the finished sample", self)
+        here = in_numpy(self)
+        if not np.ndim(here.area):
+            return estimates([here])[1]
+        each = [here[place].errors() for place in range(len(here.area))]
+        return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
 
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
         """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.
@@ -158,10 +173,11 @@ class Sample:
           Values and errors, two pytrees of the form that ``estimate`` returns.
 
         Raises:
-          InputError: the sample was made without ``observe``, or it holds a batch.
+          InputError: the sample was made without ``observe``, or it holds a batch, or JAX transforms this function.
         """
-        if self.own is None or jnp.ndim(self.area):
-            raise InputError("observed() needs one replica, sampled with observe: index a batch first.")
+        if self.own is None or np.ndim(self.area):
+            raise InputError("observed() needs one replica, sampled with observe: sample[0] is the first of a batch.")
+        require_untraced("observed()", "take it of the finished sample", self)
 
         def estimate_of_sums(sums: Any, steps: Array) -> Any:
             return estimate(jax.tree.map(lambda x: x / steps, sums))
@@ -371,7 +387,7 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     """
     if any(isinstance(x, Tracer) for x in (flow.timestep, flow.shear_rate, state.side)):
         return
-    rounding = np.finfo(state.positions.dtype).eps * float(np.max(state.side))
+    rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
     least = _SMALLEST_MOTION * rounding
     if float(np.min(np.asarray(flow.timestep) * np.asarray(flow.shear_rate))) < least:
         raise InputError(

@@ -27,8 +27,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import require_key, require_number
-from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
+from jaxgran.model.checks import key_shape, require_key, require_number, require_untraced
+from jaxgran.model.flow import ShearFlow, one_of, require_flow, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -77,34 +77,44 @@ class Batch(NamedTuple):
 
 
 def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grains: Grains | None = None) -> State:
-    """A flow in its steady state at its time step, ready for ``sample``.
+    """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
+
+    A batch of keys gives as many states, each to rounding that of its own flow and key alone:
+
+        flows = jg.ShearFlow(256, restitution=jnp.array([0.5, 0.7]), packing_fraction=0.7, timestep=1e-3)
+        states = jg.prepare(flows, jax.random.split(jax.random.key(0), 2))
+        first = states[0]
 
     Args:
-      flow: parameters of one flow.
-      key: JAX random key; the same key gives the same state.
+      flow: parameters of one flow; or numbers (replicas,) of several flows.
+      key: JAX random key; the same key gives the same state. Keys (replicas,) prepare a batch.
       equilibrate: strain at the coarse time step, or None to shear until the flow is steady. A given strain is not
         checked here. A map gives the status ``not_steady`` if it is shorter than the memory of the flow.
-      grains: given discs, see ``own_grains``; None for diameters uniform in σ ± ``polydispersity``.
+      grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,) axis; None for
+        diameters uniform in σ ± ``polydispersity``.
 
     Returns:
-      The state after packing, heating, shearing and relaxing.
+      The state after packing, heating, shearing and relaxing; that of a batch has a leading (replicas,) axis.
 
     Raises:
       InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
-        diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains.
-      RuntimeError: the flow did not become steady, or ended with a bad status.
+        diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains. Or JAX
+        transforms this function, which decides in Python when a flow is steady.
+      RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
     """
-    require_flow(flow)
-    require_key(key)
+    flows, keys, discs, single = _replicas("prepare", flow, key, grains)
     if equilibrate is not None:
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
-    batch = prepare_batch(stack([flow]), key[None], equilibrate, grains=_as_batch(flow, grains))
+    batch = prepare_batch(flows, keys, equilibrate, grains=discs)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
-    if batch.status[0] > tolerated:
+    if single and batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), batch.state)
+    failed = [f"{k} ({Status(status).name})" for k, status in enumerate(batch.status) if status > tolerated]
+    if failed:
+        raise RuntimeError(f"not all replicas could be prepared: {', '.join(failed)}.")
+    return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), batch.state)
 
 
 def prepare_batch(
@@ -175,36 +185,54 @@ def sample_batch(
 
 
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
-    """A random packing with Gaussian velocities of a given granular temperature.
+    """A random packing with Gaussian velocities of a given granular temperature; or many of them at once.
 
     It is the start of a free cooling, or of a flow that the user equilibrates.
 
     Args:
-      flow: parameters of one flow, sheared or not.
-      key: JAX random key; the same key gives the same state.
+      flow: parameters of one flow, sheared or not; or numbers (replicas,) of several flows.
+      key: JAX random key; the same key gives the same state. Keys (replicas,) make a batch, as in ``prepare``.
       temperature: exact value of Σ m c²/(2N), in mσ²/t². Grains of every mass have this temperature on average. The
         total momentum is zero.
-      grains: given discs, see ``own_grains``; None for diameters uniform in σ ± ``polydispersity``.
+      grains: given discs, see ``own_grains`` and ``prepare``; None for diameters uniform in σ ± ``polydispersity``.
 
     Raises:
-      InputError: (a ValueError) the temperature is not a positive number, or ``pack`` does not accept the grains.
+      InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or JAX
+        transforms this function.
       RuntimeError: no packing was found.
     """
-    require_flow(flow)
-    require_key(key)
+    flows, keys, discs, single = _replicas("heated", flow, key, grains)
     require_number("temperature", temperature, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    state, found = _heated(stack([flow]), key[None], jnp.asarray([temperature], float), _as_batch(flow, grains))
-    if not found[0]:
+    state, found = _heated(flows, keys, jnp.full(len(keys), temperature, float), discs)
+    if not np.all(found):
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
-    return jax.tree.map(lambda x: jnp.asarray(x[0]), state)
+    return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), state)
 
 
-def _as_batch(flow: ShearFlow, grains: Grains | None) -> Grains | None:
-    """Given grains as a batch of one replica; InputError if they do not suit the flow."""
+def _replicas(
+    name: str, flow: ShearFlow, key: Array, grains: Grains | None
+) -> tuple[ShearFlow, Array, Grains | None, bool]:
+    """Flows, keys and given grains with a leading (replicas,) axis, and whether they are those of one replica.
+
+    InputError if the key is not one or several, if the others do not suit it, or if JAX transforms the function.
+    """
+    within = jnp.zeros(())  # traced inside of ``jax.jit``, whatever the arguments are
+    require_untraced(name, "give it a batch of keys, and numbers (replicas,) of the flow", flow, key, grains, within)
+    shape = key_shape(key)
+    if shape is None or len(shape) > 1 or shape == (0,):
+        require_key(key)
+    single, count = shape == (), 1 if not shape else shape[0]
+    if single:
+        require_flow(flow)
+    flows = [one_of(flow, k, count) for k in range(count)]
+    keys = key[None] if single else key
     if grains is None:
-        return None
-    require_room(flow, grains)
-    return jax.tree.map(lambda x: jnp.asarray(x, float)[None], grains)
+        return stack(flows), keys, None, single
+    batched = not single and isinstance(grains, Grains) and np.ndim(grains.radii) == 2
+    discs = [jax.tree.map(lambda x, k=k: np.asarray(x)[k], grains) if batched else grains for k in range(count)]
+    for one, its in zip(flows, discs, strict=True):
+        require_room(one, its)
+    return stack(flows), keys, jax.tree.map(lambda *x: jnp.asarray(np.stack(x), float), *discs), single
 
 
 def _heated_replica(
@@ -262,7 +290,7 @@ def _as_sample(batch: Batch, tally: Tally) -> Sample:
 
 def _split(sample: Sample) -> list[Sample]:
     """The samples of the single replicas of a batch."""
-    return [jax.tree.map(lambda x, k=k: x[k], sample) for k in range(len(sample.area))]
+    return [sample[k] for k in range(len(sample.area))]
 
 
 def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, measure: bool = False) -> Batch:

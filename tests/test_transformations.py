@@ -1,0 +1,144 @@
+"""Every public name is transformed by JAX, or says in one sentence that it is not and what is; nothing runs here."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flows import flow_of
+from made_up_maps import known_closure
+from synthetic import one_sentence, snapshot_of
+
+import jaxgran as jg
+from jaxgran.model.checks import InputError
+from jaxgran.model.state import State
+
+COUNT = pytest.GRAINS
+STEPS = jnp.int32(20)
+FLOW = flow_of(0.7)
+COOLED = replace(FLOW, shear_rate=0.0)
+KEY = jax.random.key(0)
+X = 0.6  # a restitution, a packing fraction, a length
+
+
+@cache
+def seen() -> jg.Snapshot:
+    """Two grains in contact, of a series of one time."""
+    series = snapshot_of([[[1.0, 1.0], [2.0, 1.0]]], [[(0, 1, 0.1)]])
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), series)
+
+
+# Functions of one number, and of a state that is closed over.
+TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
+    "advance": lambda x, state: jg.advance(replace(FLOW, restitution=x), state, STEPS),
+    "sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].averages,
+    "snapshot_series": lambda x, state: jg.snapshot_series(replace(FLOW, restitution=x), state, 0.1, 2),
+    "cooling": lambda x, state: jg.cooling(replace(COOLED, restitution=x), state, [0.01, 0.02]),
+    "count_events": lambda x, state: jg.count_events(replace(FLOW, restitution=x), state, STEPS),
+    "pack": lambda x, state: jg.pack(replace(FLOW, packing_fraction=x), KEY, state.grains),
+    "polydisperse": lambda x, _: jg.polydisperse(COUNT, x / 2, KEY),
+    "own_grains": lambda x, _: jg.own_grains(x + jnp.arange(4)),
+    "gaussian": lambda x, _: jg.gaussian(x).second_moment,
+    "lucy": lambda x, _: jg.lucy(x).second_moment,
+    "heaviside": lambda x, _: jg.heaviside(x).second_moment,
+    "grid": lambda x, _: jg.grid(x, 3),
+    "fields_at": lambda x, _: jg.fields_at(seen(), jnp.asarray([[1.0, 1.2]]), jg.gaussian(x)),
+    "predict": lambda x, _: jg.predict(known_closure(), x, 0.7),
+    "restitution_from_stresses": lambda x, _: jg.restitution_from_stresses(known_closure(), 0.7, x, 1.0).restitution,
+}
+NOT_BACKWARD = {"advance", "sample", "snapshot_series", "cooling", "count_events", "pack"}
+NO_DERIVATIVE = {"count_events"}  # a whole number
+LONG = {"advance", "sample", "snapshot_series", "cooling", "pack"}  # to trace with tangents
+
+REFUSED: dict[str, Callable[[Any, State], Any]] = {
+    "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
+    "heated": lambda x, _: jg.heated(FLOW, KEY, grains=jg.own_grains(x * jnp.ones(COUNT))),
+    "fit_restitution": lambda x, state: jg.fit_restitution(np.arange(2.0), jax.tree.map(lambda y: y[None] * x, state)),
+    "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
+    "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].errors(),
+    "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
+}
+
+# Classes, and what takes datasets and files.
+WITHOUT_ARRAYS = {
+    *("Closure", "Cooling", "Fields", "Grains", "InputError", "RestitutionFit", "ShearFlow", "Snapshot", "State"),
+    *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
+    *("fit_closure", "friction_figure", "friction_law", "ratio_against_timestep", "ratio_contours", "ratio_curves"),
+    *("read_trajectory", "save_figures", "theory_errors", "theory_losses"),
+}
+
+
+@pytest.fixture(scope="module")
+def state(flowing) -> State:
+    return flowing(0.7)
+
+
+def test_every_public_name_is_among_these() -> None:
+    assert {*TRANSFORMED, *REFUSED, *WITHOUT_ARRAYS} == set(jg.__all__)
+
+
+@pytest.mark.parametrize("name", TRANSFORMED)
+def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
+    numbers = jnp.asarray([X, X])
+
+    def one(x):
+        return TRANSFORMED[name](x, state)
+
+    def shapes(function, x):
+        return [leaf.shape for leaf in jax.tree.leaves(jax.eval_shape(function, x))]
+
+    batch = [(2, *shape) for shape in shapes(one, X)]
+    assert shapes(jax.vmap(one), numbers) == shapes(lambda x: jax.lax.map(one, x), numbers) == batch
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in TRANSFORMED])
+def test_derivatives_in_forward_mode_apply(name: str, state: State) -> None:
+    values, changes = jax.eval_shape(lambda x: jax.jvp(lambda y: TRANSFORMED[name](y, state), (x,), (1.0,)), X)
+    assert jax.tree.map(lambda x: x.shape, values) == jax.tree.map(lambda x: x.shape, changes)
+
+
+def total(values: Any) -> Any:
+    return sum(jnp.sum(x) for x in jax.tree.leaves(values) if jnp.issubdtype(x.dtype, jnp.floating))
+
+
+@pytest.mark.parametrize("name", sorted(TRANSFORMED.keys() - NOT_BACKWARD))
+def test_derivatives_in_reverse_mode_apply(name: str, state: State) -> None:
+    assert jax.eval_shape(jax.grad(lambda x: total(TRANSFORMED[name](x, state))), X).shape == ()
+
+
+WAYS = {
+    "grad": jax.grad,
+    "grad of jit": lambda function: jax.grad(jax.jit(function)),
+    "vmap of grad": lambda function: lambda x: jax.vmap(jax.grad(function))(jnp.asarray([x])),
+    "grad of vmap": lambda function: jax.grad(lambda x: jnp.sum(jax.vmap(function)(x * jnp.ones(2)))),
+    "grad of lax.map": lambda function: jax.grad(lambda x: jnp.sum(jax.lax.map(function, x * jnp.ones(2)))),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", sorted(NOT_BACKWARD - NO_DERIVATIVE))
+def test_reverse_mode_without_a_length_is_refused_at_once(name: str, way: str, state: State) -> None:
+    """Tracing the loop with its tangents takes ten times as long."""
+    began = time.process_time()
+    with pytest.raises(InputError, match=r"in reverse mode \(jax.grad, jax.vjp\)") as refused:
+        WAYS[way](lambda x: total(TRANSFORMED[name](x, state)))(X)
+    assert one_sentence(str(refused.value))
+    assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("transformed", [jax.jit, jax.grad, lambda f: lambda x: jax.vmap(f)(jnp.asarray([x]))])
+def test_what_computes_in_python_says_so(name: str, transformed: Callable, state: State) -> None:
+    with pytest.raises(InputError) as refused:
+        transformed(lambda x: REFUSED[name](x, state))(X)
+    assert one_sentence(str(refused.value))
+
+
+def test_prepare_within_jit_says_so_whatever_it_is_given() -> None:
+    with pytest.raises(InputError, match=r"^prepare is not transformed by jax.jit.*: give it a batch of keys"):
+        jax.jit(lambda: jg.prepare(FLOW, KEY))()
