@@ -2,6 +2,7 @@
 
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
+from .caches import enable_cache
 from .dynamics.advance import advance
 from .dynamics.plain import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
@@ -55,6 +56,7 @@ __all__ = [
     "cooling",
     "count_events",
     "dominating_errors",
+    "enable_cache",
     "explore",
     "fields_at",
     "fit_closure",

@@ -3,9 +3,49 @@
 import os
 import stat
 import tempfile
+import warnings
 from pathlib import Path
 
 from platformdirs import user_cache_path
+
+from jaxgran.environment import processor_kind
+
+_SHORTEST_COMPILATION = 0.3  # seconds; programs that are compiled faster are not kept
+
+
+def enable_cache() -> Path | None:
+    """Keep compiled programs on disk, so that the next process need not compile them again.
+
+    Call it first, best before JAX is imported. The command line does the same. The programs are in the cache folder of
+    the user, which ``XDG_CACHE_HOME`` may name and ``jaxgran info`` shows. Each kind of processor has a folder of its
+    own, as several machines may share a home folder. If the cache folder cannot be written, a warning names the
+    temporary one in its place.
+
+    Returns:
+      The folder of this processor; None if no folder can be written.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # or XLA logs a long error about tuning hints of kept programs
+    import jax
+
+    if elsewhere():
+        warnings.warn(elsewhere(), stacklevel=2)
+    folder = cache_folder()
+    programs = None if folder is None else folder / processor_kind()
+    jax.config.update("jax_compilation_cache_dir", None if programs is None else str(programs))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
+    return programs
+
+
+def elsewhere() -> str:
+    """Why programs are not kept in the user's cache folder, and where they are, in a sentence; "" if they are there."""
+    folder = cache_folder()
+    if folder == users_folder():
+        return ""
+    instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
+    return (
+        f"the cache folder {str(users_folder())!r} cannot be written ({obstacle(users_folder())}), so {instead}; "
+        "XDG_CACHE_HOME may name another."
+    )
 
 
 def users_folder() -> Path:

@@ -63,3 +63,24 @@ def test_a_command_says_once_where_programs_are_kept(nothing_for_the_user: Path,
     assert ("every run compiles anew" if shared else f"are kept in '{folder}'") in sentence
     (programs,) = (line.split()[2:] for line in done.stdout.splitlines() if line.startswith("compiled programs"))
     assert programs == (["none"] if shared else [str(next(folder.glob("[!m]*"))) + ",", "works"])
+
+
+def test_python_keeps_programs_where_the_command_line_does(tmp_path: Path) -> None:
+    code = """
+import jaxgran as jg
+folder = jg.enable_cache()
+import jax, os
+print(str(folder) == jax.config.values["jax_compilation_cache_dir"], folder.parent)
+print(os.environ["TF_CPP_MIN_LOG_LEVEL"], jax.config.jax_enable_x64)
+"""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout.split() == ["True", str(tmp_path / "jaxgran"), "3", "False"], done.stderr
+
+
+def test_python_is_warned_where_programs_are_kept_elsewhere(nothing_for_the_user: Path) -> None:
+    """In a process of its own, as JAX keeps the folder."""
+    command = [sys.executable, "-W", "error", "-c", "import jaxgran as jg; jg.enable_cache()"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "UserWarning: the cache folder" in done.stderr and str(nothing_for_the_user) in done.stderr

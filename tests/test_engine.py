@@ -11,8 +11,8 @@ import xarray as xr
 from synthetic import one_sentence
 
 import jaxgran as jg
-from jaxgran.dynamics import engine, plain
-from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.dynamics import plain
+from jaxgran.dynamics.engine import _warn_once, select_engine, solver_in_use
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import choices_of, differences, read_dataset, write_dataset
@@ -67,7 +67,7 @@ def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
 
 
 def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None:
-    engine._warn_once.cache_clear()
+    _warn_once.cache_clear()
     state = single(flowing(0.7))
     assert select_engine(of(), state) == "jax"  # in a session of double precision it was asked for
     with jax.enable_x64(False):

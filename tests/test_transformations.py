@@ -42,7 +42,7 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "count_events": lambda x, state: jg.count_events(replace(FLOW, restitution=x), state, STEPS),
     "pack": lambda x, state: jg.pack(replace(FLOW, packing_fraction=x), KEY, state.grains),
     "polydisperse": lambda x, _: jg.polydisperse(COUNT, x / 2, KEY),
-    "own_grains": lambda x, _: jg.own_grains(x + jnp.arange(4)),
+    "own_grains": lambda x, _: jg.own_grains(x + jnp.arange(4.0)),
     "gaussian": lambda x, _: jg.gaussian(x).second_moment,
     "lucy": lambda x, _: jg.lucy(x).second_moment,
     "heaviside": lambda x, _: jg.heaviside(x).second_moment,
@@ -53,7 +53,8 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
 }
 NOT_BACKWARD = {"advance", "sample", "snapshot_series", "cooling", "count_events", "pack"}
 NO_DERIVATIVE = {"count_events"}  # a whole number
-LONG = {"advance", "sample", "snapshot_series", "cooling", "pack"}  # to trace with tangents
+LONG = {"count_events", "pack", "restitution_from_stresses"}  # to trace
+LONG_WITH_TANGENTS = LONG | {"advance", "sample", "snapshot_series", "cooling"}
 
 REFUSED: dict[str, Callable[[Any, State], Any]] = {
     "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
@@ -68,7 +69,15 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 WITHOUT_ARRAYS = {
     *("Closure", "Cooling", "Fields", "Grains", "InputError", "RestitutionFit", "ShearFlow", "Snapshot", "State"),
     *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
-    *("fit_closure", "friction_figure", "friction_law", "ratio_against_timestep", "ratio_contours", "ratio_curves"),
+    *(
+        "enable_cache",
+        "fit_closure",
+        "friction_figure",
+        "friction_law",
+        "ratio_against_timestep",
+        "ratio_contours",
+        "ratio_curves",
+    ),
     *("read_trajectory", "save_figures", "theory_errors", "theory_losses"),
 }
 
@@ -82,7 +91,12 @@ def test_every_public_name_is_among_these() -> None:
     assert {*TRANSFORMED, *REFUSED, *WITHOUT_ARRAYS} == set(jg.__all__)
 
 
-@pytest.mark.parametrize("name", TRANSFORMED)
+def quick(but: set[str]) -> list:
+    """The names; some of them in the slow tests."""
+    return [pytest.param(name, marks=pytest.mark.slow) if name in but else name for name in TRANSFORMED]
+
+
+@pytest.mark.parametrize("name", quick(but=LONG))
 def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
     numbers = jnp.asarray([X, X])
 
@@ -96,7 +110,7 @@ def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
     assert shapes(jax.vmap(one), numbers) == shapes(lambda x: jax.lax.map(one, x), numbers) == batch
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in TRANSFORMED])
+@pytest.mark.parametrize("name", quick(but=LONG_WITH_TANGENTS))
 def test_derivatives_in_forward_mode_apply(name: str, state: State) -> None:
     values, changes = jax.eval_shape(lambda x: jax.jvp(lambda y: TRANSFORMED[name](y, state), (x,), (1.0,)), X)
     assert jax.tree.map(lambda x: x.shape, values) == jax.tree.map(lambda x: x.shape, changes)

@@ -22,8 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
-from jaxgran.caches import cache_folder, obstacle, users_folder
-from jaxgran.environment import devices, processor_kind
+from jaxgran.caches import cache_folder, elsewhere, enable_cache
+from jaxgran.environment import devices
 
 NO_FILE = 1
 INPUT_MISTAKE = 2
@@ -39,8 +39,8 @@ def configured_jax():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", _compilation_cache())
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    _say_cache()
+    enable_cache()
     return jax
 
 
@@ -53,24 +53,16 @@ def require_device() -> None:
 
 
 @cache
-def _compilation_cache() -> str | None:
-    """Folder of compiled programs, one for each kind of processor: several machines may share a home folder.
-
-    If it is not the user's cache folder, a sentence says so once. The caches of figures then go to the same place.
-    """
+def _say_cache() -> None:
+    """Print once if the cache is not in the user's folder. The caches of figures then go to the same place."""
+    if not elsewhere():
+        return
+    say(elsewhere())
+    for words in ("the cache folder", "the machine code is compiled anew"):
+        warnings.filterwarnings("ignore", words)
     folder = cache_folder()
-    if folder != users_folder():
-        instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
-        say(
-            f"the cache folder {str(users_folder())!r} cannot be written ({obstacle(users_folder())}), so {instead}; "
-            "XDG_CACHE_HOME may name another."
-        )
-        warnings.filterwarnings("ignore", "the machine code is compiled anew")
-    if folder is None:
-        return None
-    if folder != users_folder():
+    if folder is not None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
-    return str(folder / processor_kind())
 
 
 def say(sentence: str) -> None:

@@ -284,7 +284,9 @@ def sample(
       strain: strain γ̇t to sample, rounded to whole time steps. A new value does not recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It runs in the engine "jax",
-        which takes 5 to 7 times as long as the machine code on a processor. It is static: a new function recompiles.
+        which takes 5 to 7 times as long as the machine code on a processor. It is static: each new function, such as a
+        lambda that is written anew, costs about 17 s of compilation, so define it once. ``enable_cache`` keeps the
+        program for the next process.
         The contacts are those of a step with an approaching contact, before the impulses act. The size of their
         buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
