@@ -355,9 +355,9 @@ MAP_OPTIONS += [
     "scheduler",
     "preset",
 ]
-MAP_OPTIONS += ["output", "like", "snapshots"]
+MAP_OPTIONS += ["output", "like", "snapshots", "first-seed"]
 RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "engine", "output"]
-RUN_OPTIONS += ["trajectory", "trajectory=x.gsd --every"]
+RUN_OPTIONS += ["seeds", "seed", "tolerance", "solver", "activation", "trajectory", "trajectory=x.gsd --every"]
 ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]
 ENORMOUS += ["a" * 5000, "a" * 5000 + ".nc", "n" * 250 + ".nc", "\udcff.nc", "../..", "/", ".nc", "..nc", "~/x", "x.NC"]
 ENORMOUS += ["n" * 250 + ".gsd", "\udcff.gsd", "x.gsd"]

@@ -717,6 +717,26 @@ def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     assert map_module.kept_choices({"strain": 4.0, "seeds": 4, "grains": 400}, {"error": 0.1}) == {"grains": 400}
 
 
+def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def notes(settings, *_) -> Iterator:
+        asked.append(settings)
+        yield from (
+            ((0, seed), random_replica(np.random.default_rng(seed), settings)) for seed in range(settings.seeds)
+        )
+
+    monkeypatch.setattr(sweep, "replicas", notes)
+    flow = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--strain", "20", "--quiet")
+    words = ("--seeds", "2", "--seed", "7", "--tolerance", "1e-6", "--solver", "jacobi", "--activation", "touching")
+    assert jaxgran(tmp_path, *flow, *words).status == 0
+    (one,) = asked
+    assert (one.seeds, one.first_seed, one.tolerance, one.solver, one.activation) == (2, 7, 1e-6, "jacobi", "touching")
+    outcome = jaxgran(tmp_path, *flow, "--seeds", "2", "--movie", "flow.gif")
+    assert_one_sentence(outcome)
+    assert "leave out --seeds" in outcome.err
+
+
 def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_few_variables(monkeypatch)
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))

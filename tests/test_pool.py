@@ -5,11 +5,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pool_tasks
 import pytest
 
+from jaxgran.maps import pool
 from jaxgran.maps.pool import ATTEMPTS, Died, run_tasks
+from jaxgran.model.checks import InputError
 
 
 def run(function, tasks, workers: int = 2, hear=lambda _: None) -> dict:
@@ -38,6 +41,35 @@ def test_every_task_is_done_and_every_message_heard() -> None:
     heard: list[int] = []
     assert run(pool_tasks.square, [(k,) for k in range(20)], hear=heard.append) == {k: k * k for k in range(20)}
     assert sorted(heard) == list(range(20))
+
+
+STARTS_WORKERS = """
+from jaxgran.maps.pool import require_processes, run_tasks
+require_processes()
+list(run_tasks(print, [(1,), (2,)], 2, print, (), print))
+"""
+
+
+def test_a_script_without_a_guarded_main_part_is_told_so(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(STARTS_WORKERS)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert done.stderr.count("Traceback") == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith(
+        'InputError: workers must be 1 in this script, or it must have its main part under if __name__ == "__main__":.'
+    )
+
+
+def test_a_program_from_standard_input_is_told_to_be_a_file() -> None:
+    done = subprocess.run([sys.executable], input=STARTS_WORKERS, capture_output=True, text=True)
+    assert "workers must be 1 in a program that is read from standard input: save it as a file" in done.stderr
+
+
+def test_a_daemonic_process_has_no_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "current_process", lambda: SimpleNamespace(daemon=True))
+    with pytest.raises(InputError, match="^workers must be 1 in a daemonic process"):
+        pool.require_processes()
 
 
 def test_a_dead_worker_is_replaced_and_its_task_repeated(tmp_path: Path) -> None:

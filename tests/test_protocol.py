@@ -233,6 +233,41 @@ def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) 
         prepare(FLOWS[0], jax.random.key(0))
 
 
+def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
+    """Whether numbers of the flow are single or of the batch, and with grains of all or of each."""
+    flows = replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9]))
+    states = prepare(flows, keys, equilibrate=0.5)
+    assert_same_bits(states, jax.tree.map(jnp.asarray, batch.state))
+    assert_same_bits(states[1], prepare(FLOWS[1], keys[1], equilibrate=0.5))
+    grains = states.grains
+    given = steady_state._replicas("prepare", flows, keys, jax.tree.map(lambda x: x[0], grains))[2]
+    np.testing.assert_array_equal(given.radii, jnp.stack([grains.radii[0]] * 2))
+    assert_same_bits(steady_state._replicas("prepare", flows, keys, grains)[2], grains)
+
+
+@pytest.mark.parametrize(
+    ("flow", "count", "words"),
+    [
+        (replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])), None, "flow must be one ShearFlow"),
+        (replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])), 3, "flow must have single numbers or arrays of 3"),
+        (FLOWS[0], (2, 2), "key must be a random key"),
+        (FLOWS[0], 0, "key must be a random key"),
+    ],
+)
+def test_keys_that_do_not_suit_the_flow_are_one_sentence(flow: ShearFlow, count, words: str) -> None:
+    key = jax.random.key(0) if count is None else jax.random.split(jax.random.key(0), count)
+    with pytest.raises(InputError, match=f"^{words}") as refused:
+        prepare(flow, key)
+    assert one_sentence(str(refused.value))
+
+
+def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = batch._replace(status=np.array([Status.ok, Status.not_steady]))
+    monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
+    with pytest.raises(RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"):
+        prepare(FLOWS[0], keys)
+
+
 def test_nan_in_one_replica_ends_as_nonfinite_and_leaves_the_others_bit_identical(batch) -> None:
     velocities = jnp.asarray(batch.state.velocities).at[1, 5, 0].set(jnp.nan)
     broken = batch._replace(state=replace(batch.state, velocities=velocities))

@@ -187,6 +187,23 @@ def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest
         sweep._run_task(settings, [(0, 0), (0, 1)])
 
 
+def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
+    second = dict(replicas(replace(settings, seeds=1, first_seed=1), batch=2))
+    assert_same_bits(second, {(point, 0): results[point, 1] for point in range(2)})
+
+
+def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def found(settings, *_):
+        yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.not_steady)
+        yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.short_sample, 1)
+
+    monkeypatch.setattr(sweep, "replicas", found)
+    words = r"^points of the map have a bad status. not steady: \(restitution 0.5, packing fraction 0.6\). What that means: "
+    with pytest.warns(match=words), pytest.warns(match=r"^short sample at \(restitution 0.9.*Add strain=\d+\.$"):
+        ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
+    assert "2/2 points" in capsys.readouterr().err
+
+
 def test_replicas_of_a_point_differ(results) -> None:
     ratios = {float(replica.sample.pressure) for replica in results.values()}
     assert len(ratios) == 4

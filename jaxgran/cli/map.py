@@ -49,6 +49,9 @@ def map_command(
         str | None, typer.Option(help="Grains of a replica, or a list that adds a dimension: 256,1000,4000.")
     ] = None,
     seeds: Annotated[int | None, typer.Option(help="Replicas of each point.")] = None,
+    first_seed: Annotated[
+        int | None, typer.Option(help="Number of the first replica: others begin from other grains. [default: 0]")
+    ] = None,
     timestep: Annotated[
         str | None,
         typer.Option(help="Time step of the sample, in 1/shear rate, auto, or a list that adds a dimension."),
@@ -101,6 +104,7 @@ def map_command(
         "packing_fraction": None if packing_fraction is None else number_list(packing_fraction, "packing_fraction"),
         "grains": whole_numbers(grains, "grains"),
         "seeds": seeds,
+        "first_seed": first_seed,
         "timestep": numbers_or_auto(timestep, "timestep"),
         "equilibrate": equilibrate,
         "strain": strain,

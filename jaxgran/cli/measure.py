@@ -1,6 +1,5 @@
 """Runs a map or a single flow: progress, checkpoint, dataset, and the messages at the end."""
 
-import math
 import os
 import shlex
 import sys
@@ -12,7 +11,6 @@ from pathlib import Path
 from threading import Thread
 from typing import Any, Literal, NamedTuple
 
-from jaxgran.cli.progress import progress
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import (
     BAD_STATUS,
@@ -26,10 +24,9 @@ from jaxgran.cli.terminal import (
     stop_interrupted,
 )
 from jaxgran.environment import usable_cores
+from jaxgran.maps.progress import progress
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.status import MEANINGS
 
-_MOST_NAMED = 6  # points of a map in one sentence
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 
 
@@ -169,25 +166,6 @@ def _say_resumed(checkpoint, count: int) -> None:
         say(f"damaged and computed anew: {', '.join(checkpoint.damaged)}.")
 
 
-def _bad_points(data) -> dict[str, list[str]]:
-    """The points with a bad status, in words, by the name of the status."""
-    from jaxgran.maps.schema import parts
-
-    names = dict(
-        zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
-    )
-    bad: dict[str, list[str]] = {}
-    for part in parts(data):
-        which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
-        which += f", time step {part.attrs['timestep']:g}" if "timestep" in data.dims else ""
-        for nu in part.packing_fraction.values:
-            for alpha in part.restitution.values:
-                name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
-                if name != "ok":
-                    bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g}{which})")
-    return bad
-
-
 def _say_imprecise(data) -> None:
     """Print the largest whole error beside its target, and the sampled strains, if a target was given."""
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
@@ -199,28 +177,6 @@ def _say_imprecise(data) -> None:
     say(
         f"whole relative errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
         f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
-    )
-
-
-def _some(points: list[str]) -> str:
-    """The first points of a list, and how many more there are."""
-    more = len(points) - _MOST_NAMED
-    return ", ".join(points[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _say_short(data, points: list[str]) -> None:
-    """Print which samples are shorter than a few memories, and the strain that would do."""
-    from jaxgran.sampling.memory import FEWEST_MEMORIES
-
-    if not points:
-        return
-    code = data.status.attrs["flag_meanings"].split().index("short_sample")
-    short = data.status == data.status.attrs["flag_values"][code]
-    enough = FEWEST_MEMORIES * float(data.memory.where(short).max())
-    which = "" if data.status.size == 1 else f" at {_some(points)}"
-    say(
-        f"short sample{which}: it lasts less than {FEWEST_MEMORIES:g} memories of the flow, so its errors may be too "
-        f"small. Add --strain {math.ceil(enough)}."
     )
 
 
@@ -260,11 +216,15 @@ def _say_retried(data) -> None:
 
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
     """Print what was written and what went wrong, and exit with the matching status."""
+    from jaxgran.maps.verdict import bad_points, in_words, short_in_words
+
     say_written(written)
     _say_imprecise(data)
     _say_retried(data)
-    bad = _bad_points(data)
-    _say_short(data, bad.pop("short_sample", []))
+    bad = bad_points(data)
+    short = bad.pop("short_sample", [])
+    if short:
+        say(short_in_words(data, short, "--strain "))
     if interrupted:
         missing = len(bad.get("not_run", []))
         started = can_resume and bool((data.status_by_seed >= 0).any())
@@ -273,6 +233,4 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
         stop_interrupted(f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}")
     if bad:
         which = "the flow has" if data.status.size == 1 else "points marked * have"
-        words = "; ".join(f"{name.replace('_', ' ')}: {_some(points)}" for name, points in bad.items())
-        meanings = "; ".join(f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS)
-        stop(f"finished, but {which} a bad status. {words}. What that means: {meanings}.", BAD_STATUS)
+        stop(f"finished, but {which} a bad status. {in_words(bad)}", BAD_STATUS)

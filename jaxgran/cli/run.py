@@ -10,11 +10,11 @@ import typer
 
 from jaxgran.cli.arguments import RelativeError, chosen_for, numbers_or_auto, require_one
 from jaxgran.cli.measure import finish, measured, print_budget
-from jaxgran.cli.progress import counted
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, say
+from jaxgran.maps.progress import counted
 from jaxgran.model.checks import InputError, require_number, shown
-from jaxgran.model.choices import Engine
+from jaxgran.model.choices import Activation, Engine, Solver
 from jaxgran.model.display import with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
@@ -55,6 +55,16 @@ def run_command(
     timestep: Annotated[
         str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or auto. [default: 1e-3]")
     ] = None,
+    seeds: Annotated[int, typer.Option(help="Independent replicas, averaged together.")] = 1,
+    seed: Annotated[int, typer.Option(help="Number of the first replica: another one begins from other grains.")] = 0,
+    tolerance: Annotated[
+        str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
+    ] = None,
+    solver: Annotated[
+        Solver | None,
+        typer.Option(help="Method of the contact solve in the engine jax. [default: barzilai-borwein]"),
+    ] = None,
+    activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     engine: Annotated[Engine, typer.Option(help="Program that advances the flow.")] = "auto",
     trajectory: Annotated[
         Path | None,
@@ -82,13 +92,30 @@ def run_command(
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
     require_one(strain, error)
-    if strain is None and error is None and any(x is not None for x in (trajectory, movie, page)):
+    residual = numbers_or_auto(tolerance, "tolerance")
+    if isinstance(residual, tuple):
+        raise InputError(f"tolerance must be one number or auto, not {shown(tolerance)}.")
+    frames_wanted = any(x is not None for x in (trajectory, movie, page))
+    if seeds > 1 and frames_wanted:
+        raise InputError(
+            "--trajectory, --movie and --page show one replica: leave out --seeds, or choose one by --seed."
+        )
+    if strain is None and error is None and frames_wanted:
         strain = _RECORDED_STRAIN
-    given = {"grains": grains, "timestep": step, "strain": strain, "error": error}
+    given = {
+        "grains": grains,
+        "timestep": step,
+        "strain": strain,
+        "error": error,
+        "tolerance": residual,
+        "solver": solver,
+        "activation": activation,
+    }
     chosen = {
         "restitution": (restitution,),
         "packing_fraction": (packing_fraction,),
-        "seeds": 1,
+        "seeds": seeds,
+        "first_seed": seed,
         "engine": engine,
         **chosen_for(error),
         **{name: value for name, value in given.items() if value is not None},
@@ -98,7 +125,7 @@ def run_command(
             raise InputError(f"{name} must be a new file, or --overwrite be given: {shown(str(file))} is there.")
     recorder, frames, film = _recorder(trajectory, movie, page, every, strain or _RECORDED_STRAIN)
     record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
-    data, interrupted, written = measured(chosen, "auto", 1, output, quiet, record=record, overwrite=overwrite)
+    data, interrupted, written = measured(chosen, "auto", None, output, quiet, record=record, overwrite=overwrite)
     print_table(_summary_table(data))
     print_budget(data)
     if recorder is not None and recorder.frames:

@@ -9,15 +9,21 @@ the same result.
 import os
 import pickle
 import signal
+import sys
 import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context, parent_process
+from multiprocessing import current_process, get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
+from jaxgran.model.checks import InputError
+
+_UNGUARDED = 97  # exit status of a worker that begins with the script of its parent, down to the start of workers
+_GUARDED = 'its main part under if __name__ == "__main__":'
+_LAST_WORDS = 1.0  # seconds from the end of a worker's pipe to its exit
 ATTEMPTS = 3  # workers that may die of a task before it is given up
 _READY = "ready"
 _MESSAGE = "message"
@@ -25,6 +31,26 @@ _RESULT = "result"
 _ERROR = "error"
 _DEAD = "dead"
 T = TypeVar("T")
+
+
+def require_processes() -> None:
+    """Raise an InputError where this process cannot start workers.
+
+    A worker imports the script of its parent before it has a task. If that script starts workers again, since its main
+    part is not guarded, the worker ends, and its parent raises an InputError.
+    """
+    process = current_process()
+    if getattr(process, "_inheriting", False):  # what ``multiprocessing`` sets while a process imports that script
+        raise SystemExit(_UNGUARDED)
+    if process.daemon:
+        raise InputError(
+            "workers must be 1 in a daemonic process, such as those of multiprocessing.Pool: the processes of "
+            "concurrent.futures.ProcessPoolExecutor may have workers."
+        )
+    if str(getattr(sys.modules["__main__"], "__file__", "")).startswith("<"):
+        raise InputError(
+            f"workers must be 1 in a program that is read from standard input: save it as a file, with {_GUARDED}."
+        )
 
 
 class Died(Exception):
@@ -58,6 +84,11 @@ class _Worker:
         except (EOFError, OSError):
             return _DEAD, None
 
+    def exit_status(self) -> int | None:
+        """The exit status of a worker that has closed its pipe."""
+        self.process.join(_LAST_WORDS)
+        return self.process.exitcode
+
     def end(self) -> None:
         self.process.kill()
         self.process.join()
@@ -87,6 +118,7 @@ def run_tasks(
 
     Raises:
       ChildProcessError: workers die before they have a task.
+      InputError: the script of this process starts workers outside of its main part.
       Exception: that of a task, with the traceback of the worker as a note.
     """
     waiting = deque(range(len(tasks)))
@@ -116,6 +148,8 @@ def run_tasks(
                     worker.task, unfinished = None, unfinished - 1
                     yield task, content
                 else:
+                    if worker.exit_status() == _UNGUARDED:
+                        raise InputError(f"workers must be 1 in this script, or it must have {_GUARDED}.")
                     running.remove(worker)
                     worker.end()
                     early_deaths += not worker.ready

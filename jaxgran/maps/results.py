@@ -80,7 +80,14 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.name not in ("strain", "error", "engine", "grains_by_point", "snapshots"):  # not in all files
+            elif field.name not in (
+                "strain",
+                "error",
+                "engine",
+                "grains_by_point",
+                "snapshots",
+                "first_seed",
+            ):  # not in all files
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         chosen["snapshots"] = bool(chosen.get("snapshots"))

@@ -21,6 +21,7 @@ from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, e
 
 _FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
 _LONGEST_EQUILIBRATION = 1e6  # strain before the sample
+_LARGEST_SEED = 2**30
 _ACCEPTED_TIMESTEP = 1e-6  # 1/γ̇; all flows accept it
 
 
@@ -42,6 +43,7 @@ class MapSettings:
     engine: Engine = "auto"
     grains_by_point: tuple[int, ...] | None = None  # in the order of ``flows``; ``grains`` is then the largest
     snapshots: bool = False
+    first_seed: int = 0
 
     def __post_init__(self):
         for name, values in self.axes.items():
@@ -58,6 +60,7 @@ class MapSettings:
             ):
                 raise InputError(f"{name} must be sorted and without repetition, not {shown(list(values))}.")
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
+        require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
         if not isinstance(self.snapshots, bool):
             raise InputError(f"snapshots must be True or False, not {shown(self.snapshots)}.")
         count = math.prod(map(len, self.axes.values())) * self.seeds

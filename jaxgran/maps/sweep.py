@@ -26,7 +26,8 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
-from jaxgran.maps.pool import Died, run_tasks, send
+from jaxgran.maps.pool import Died, require_processes, run_tasks, send
+from jaxgran.maps.progress import progress as meter
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError, shown
@@ -57,6 +58,7 @@ def ratio_map(
     *,
     grains: int | Sequence[int] | Literal["auto"] = 256,
     seeds: int = 2,
+    first_seed: int = 0,
     timestep: float | Sequence[float] | Literal["auto"] = 1e-3,
     equilibrate: float | None = None,
     strain: float | None = None,
@@ -70,6 +72,7 @@ def ratio_map(
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
     report: Report | None = None,
+    progress: bool = False,
 ) -> "xr.Dataset":
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with standard errors.
 
@@ -79,6 +82,8 @@ def ratio_map(
       grains: number of grains of a replica. A sorted list adds a dimension to the map, and estimates for a large
         system.
       seeds: replicas of each point.
+      first_seed: number of the first replica. The random start of a replica follows from its number, so maps with
+        first_seed 0 and 2, of two seeds each, are independent.
       timestep: dt of the sample in units of 1/γ̇. A sorted list adds a dimension to the map. "auto" is the longest one
         with a stress error within ``target_error`` at every point.
       equilibrate: strain before the sample, or None to shear until the flow is steady.
@@ -99,6 +104,7 @@ def ratio_map(
       workers: number of processes; more than one only on a CPU. A script with more than one must have its main part
         under ``if __name__ == "__main__":``.
       report: called with the replica-steps done since the last call.
+      progress: whether to show on standard error how far the map is: a bar on a terminal, lines elsewhere.
 
     Returns:
       The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with standard
@@ -107,12 +113,16 @@ def ratio_map(
 
     Raises:
       InputError: (a ValueError) a parameter is out of range; the message says what is accepted.
+
+    Warns:
+      UserWarning: points have a bad status, or their samples are short; the message names them and says what to do.
     """
     choices = {
         "restitution": restitution,
         "packing_fraction": packing_fraction,
         "grains": grains,
         "seeds": seeds,
+        "first_seed": first_seed,
         "timestep": timestep,
         "equilibrate": equilibrate,
         "strain": strain,
@@ -130,25 +140,42 @@ def ratio_map(
     check_batches(batch, workers)
     if report is not None and not callable(report):
         raise InputError(f"report must be a function of one number, not {shown(report)}.")
-    start, done = perf_counter(), 0.0
+    start, results = perf_counter(), {}
+    with meter([predicted_cost(flow) for flow in settings.flows()], settings.seeds, quiet=not progress) as shown_to:
 
-    def count(steps: float) -> None:
-        nonlocal done
-        done += steps
-        if report is not None:
-            report(steps)
+        def count(steps: float) -> None:
+            shown_to.steps(steps)
+            if report is not None:
+                report(steps)
 
-    results = dict(replicas(settings, batch, workers, count))
+        for key, replica in replicas(settings, batch, workers, count):
+            results[key] = replica
+            shown_to.replica(key[0])
     seconds = perf_counter() - start
     run = {
         "automatic_choice": automatic_choice,
         "wall_time_seconds": seconds,
-        "replica_steps_per_second": done / seconds,
+        "replica_steps_per_second": shown_to.done_steps / seconds,
         "workers": workers,
     }
     from jaxgran.maps.dataset import map_dataset  # here, so that workers need not load xarray
 
-    return map_dataset(settings, results, run)
+    data = map_dataset(settings, results, run)
+    _warn_of_bad_points(data)
+    return data
+
+
+def _warn_of_bad_points(data: "xr.Dataset") -> None:
+    """Warn of what the command line prints at the end of a map."""
+    from jaxgran.maps.verdict import bad_points, in_words, short_in_words
+
+    bad = bad_points(data)
+    bad.pop("failed", None)  # batches that were given up have had a warning of their own
+    short = bad.pop("short_sample", [])
+    if short:
+        warnings.warn(short_in_words(data, short, "strain="), stacklevel=3)
+    if bad:
+        warnings.warn(f"points of the map have a bad status. {in_words(bad).replace('--', '')}", stacklevel=3)
 
 
 def check_batches(batch: int | Literal["auto"], workers: int) -> None:
@@ -162,6 +189,8 @@ def check_batches(batch: int | Literal["auto"], workers: int) -> None:
         raise InputError(f"workers must be at most {_MOST_WORKERS}, not {shown(workers)}.")
     if workers > 1 and jax.default_backend() != "cpu":
         raise InputError("workers must be 1 on an accelerator.")
+    if workers > 1:
+        require_processes()
 
 
 def replicas(
@@ -353,7 +382,7 @@ def _measured(
     """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
-    keys = jnp.asarray(np.stack([_key(seed, point, refinement) for point, seed in task]))
+    keys = jnp.asarray(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)

@@ -1,0 +1,55 @@
+"""What went wrong at the points of a map, in words: for the command line, and for the warnings of ``ratio_map``."""
+
+import math
+from typing import TYPE_CHECKING
+
+from jaxgran.maps.schema import parts
+from jaxgran.model.status import MEANINGS
+from jaxgran.sampling.memory import FEWEST_MEMORIES
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_MOST_NAMED = 6  # points of a map in one sentence
+
+
+def bad_points(data: "xr.Dataset") -> dict[str, list[str]]:
+    """The points whose status is not ok, in words, by the name of the status."""
+    names = dict(
+        zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
+    )
+    bad: dict[str, list[str]] = {}
+    for part in parts(data):
+        which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
+        which += f", time step {part.attrs['timestep']:g}" if "timestep" in data.dims else ""
+        for nu in part.packing_fraction.values:
+            for alpha in part.restitution.values:
+                name = names[int(part.status.sel(packing_fraction=nu, restitution=alpha))]
+                if name != "ok":
+                    bad.setdefault(name, []).append(f"(restitution {alpha:g}, packing fraction {nu:g}{which})")
+    return bad
+
+
+def in_words(bad: dict[str, list[str]]) -> str:
+    """The bad points by status, and what each status means; remedies are named as on the command line."""
+    words = "; ".join(f"{name.replace('_', ' ')}: {_some(points)}" for name, points in bad.items())
+    meanings = (f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS)
+    return f"{words}. What that means: {'; '.join(meanings)}."
+
+
+def short_in_words(data: "xr.Dataset", points: list[str], option: str) -> str:
+    """Which samples are shorter than a few memories, and the strain that would do, by ``option`` and the number."""
+    code = data.status.attrs["flag_meanings"].split().index("short_sample")
+    short = data.status == data.status.attrs["flag_values"][code]
+    enough = FEWEST_MEMORIES * float(data.memory.where(short).max())
+    which = "" if data.status.size == 1 else f" at {_some(points)}"
+    return (
+        f"short sample{which}: it lasts less than {FEWEST_MEMORIES:g} memories of the flow, so its errors may be too "
+        f"small. Add {option}{math.ceil(enough)}."
+    )
+
+
+def _some(points: list[str]) -> str:
+    """The first points of a list, and how many more there are."""
+    more = len(points) - _MOST_NAMED
+    return ", ".join(points[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
