@@ -68,7 +68,7 @@ def test_a_program_from_standard_input_is_told_to_be_a_file() -> None:
 
 def test_a_daemonic_process_has_no_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool, "current_process", lambda: SimpleNamespace(daemon=True))
-    with pytest.raises(InputError, match="^workers must be 1 in a daemonic process"):
+    with pytest.raises(InputError, match=r"^workers must be 1 in a daemonic process"):
         pool.require_processes()
 
 

@@ -198,7 +198,7 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.Monkey
         yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.short_sample, 1)
 
     monkeypatch.setattr(sweep, "replicas", found)
-    words = r"^points of the map have a bad status. not steady: \(restitution 0.5, packing fraction 0.6\). What that means: "
+    words = r"^points of the map have a bad status. not steady: \(restitution 0.5, packing fraction 0.6\). What"
     with pytest.warns(match=words), pytest.warns(match=r"^short sample at \(restitution 0.9.*Add strain=\d+\.$"):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
     assert "2/2 points" in capsys.readouterr().err
