@@ -276,7 +276,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "steps of a batch": (lambda: jg.advance(flow(), SEEN.state, np.array([1, 2])), "a whole number"),
     "one block": (lambda: jg.sample(flow(), SEEN.state, 1.0, 0), "blocks must be a whole number of at least 1"),
     "pack of a batch": (lambda: jg.pack(BATCH, KEY), "one ShearFlow, and this is a batch"),
-    "prepare of a batch": (lambda: jg.prepare(BATCH, KEY), "one ShearFlow, and this is a batch"),
+    "prepare of a batch": (lambda: jg.prepare(BATCH, KEY), "single ones or arrays (1,), one for each key"),
     "prepare with two keys": (lambda: jg.prepare(flow(), jax.random.split(KEY)), "a random key such as"),
     "sample of a batch": (lambda: jg.sample(BATCH, SEEN.state, 1.0), "one ShearFlow, and this is a batch"),
     "sample of a batch of states": (lambda: jg.sample(flow(), SEVERAL.state, 1.0), f"one State of {GRAINS} grains"),

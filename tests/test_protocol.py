@@ -248,8 +248,16 @@ def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
 @pytest.mark.parametrize(
     ("flow", "count", "words"),
     [
-        (replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])), None, "flow must be one ShearFlow"),
-        (replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])), 3, "flow must have single numbers or arrays of 3"),
+        (
+            replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])),
+            None,
+            r"numbers of the flow must be single ones or arrays \(1,\), one for each key, not of the shapes \(2,\)",
+        ),
+        (
+            replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9])),
+            3,
+            r"numbers of the flow must be single ones or arrays \(3,\)",
+        ),
         (FLOWS[0], (2, 2), "key must be a random key"),
         (FLOWS[0], 0, "key must be a random key"),
     ],

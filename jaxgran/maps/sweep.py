@@ -27,7 +27,6 @@ from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.pool import Died, require_processes, run_tasks, send
-from jaxgran.maps.progress import progress as meter
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError, shown
@@ -140,6 +139,8 @@ def ratio_map(
     check_batches(batch, workers)
     if report is not None and not callable(report):
         raise InputError(f"report must be a function of one number, not {shown(report)}.")
+    from jaxgran.maps.progress import progress as meter  # here, so that workers need not load Rich
+
     start, results = perf_counter(), {}
     with meter([predicted_cost(flow) for flow in settings.flows()], settings.seeds, quiet=not progress) as shown_to:
 

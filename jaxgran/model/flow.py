@@ -171,7 +171,10 @@ def one_of(flow: Any, k: int, count: int) -> ShearFlow:
     _require_flows(flow)
     shapes = {np.shape(getattr(flow, name)) for name in _TRACED_FIELDS} - {()}
     if shapes - {(count,)}:
-        raise InputError(f"flow must have single numbers or arrays of {count}, one for each key, not {shown(shapes)}.")
+        raise InputError(
+            f"numbers of the flow must be single ones or arrays ({count},), one for each key, not of the shapes "
+            f"{', '.join(map(str, sorted(shapes)))}."
+        )
     return jax.tree.map(lambda x: np.broadcast_to(x, (count,))[k], flow)
 
 

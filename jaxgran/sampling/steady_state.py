@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import key_shape, require_key, require_number, require_untraced
-from jaxgran.model.flow import ShearFlow, one_of, require_flow, require_sheared
+from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -222,8 +222,6 @@ def _replicas(
     if shape is None or len(shape) > 1 or shape == (0,):
         require_key(key)
     single, count = shape == (), 1 if not shape else shape[0]
-    if single:
-        require_flow(flow)
     flows = [one_of(flow, k, count) for k in range(count)]
     keys = key[None] if single else key
     if grains is None:
