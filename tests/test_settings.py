@@ -45,6 +45,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"grains": (64.0, 256.0)}, "a whole number"),
     ({"grains": [64, 256]}, "a whole number"),  # a list is for ratio_map; settings are tuples
     ({"seeds": 0}, "at least 1"),
+    ({"first_seed": -1}, "at least 0"),
     ({"seeds": True}, "a whole number"),
     ({"timestep": 0.0}, "a positive number"),
     ({"timestep": -1e-3}, "a positive number"),

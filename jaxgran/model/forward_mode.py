@@ -26,7 +26,8 @@ def forward_only(values: T, words: str) -> T:
         real = isinstance(leaf, Tracer) and jnp.issubdtype(leaf.dtype, jnp.floating)
         return _gate.bind(leaf, words=words) if real else leaf
 
-    return jax.tree.map(gated, values)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+    return jax.tree.map(gated, values) if traced else values
 
 
 def _refuse(*_: Any, words: str) -> Any:
