@@ -139,6 +139,8 @@ def ratio_map(
     check_batches(batch, workers)
     if report is not None and not callable(report):
         raise InputError(f"report must be a function of one number, not {shown(report)}.")
+    if not isinstance(progress, bool):
+        raise InputError(f"progress must be True or False, not {shown(progress)}.")
     from jaxgran.maps.progress import progress as meter  # here, so that workers need not load Rich
 
     start, results = perf_counter(), {}
