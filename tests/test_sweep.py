@@ -194,12 +194,12 @@ def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(setti
 
 def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     def found(settings, *_):
-        yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.not_steady)
-        yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.short_sample, 1)
+        yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
+        yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
 
     monkeypatch.setattr(sweep, "replicas", found)
-    words = r"^points of the map have a bad status. not steady: \(restitution 0.5, packing fraction 0.6\). What"
-    with pytest.warns(match=words), pytest.warns(match=r"^short sample at \(restitution 0.9.*Add strain=\d+\.$"):
+    words = r"^points of the map have a bad status. deep overlap: \(restitution 0.5, packing fraction 0.6\). What"
+    with pytest.warns(match=words):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
     assert "2/2 points" in capsys.readouterr().err
 

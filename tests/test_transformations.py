@@ -71,6 +71,7 @@ WITHOUT_ARRAYS = {
     *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
     *(
         "enable_cache",
+        "explore",
         "fit_closure",
         "friction_figure",
         "friction_law",
