@@ -72,6 +72,7 @@ WITHOUT_ARRAYS = {
     *(
         "enable_cache",
         "explore",
+        "Page",
         "fit_closure",
         "friction_figure",
         "friction_law",
