@@ -1,6 +1,6 @@
 """Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow from them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -56,7 +56,7 @@ def _rows(sample: "Sample") -> list[Row]:
         Row("grains", here.grains),
         Row("strain", rounded(here._total.duration * here.shear_rate)),
         *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _UNITS_OF_SHOWN.items()),
-        Row("status", statuses(here.status)),
+        Row("status", statuses(np.asarray(here.status))),
     ]
 
 
@@ -94,7 +94,7 @@ class Sample:
         return replica_of(self, replica, np.shape(self.area))
 
     @property
-    def averages(self) -> dict[str, Array | np.ndarray]:
+    def averages(self) -> Mapping[str, Array | np.ndarray]:
         """All observables over all blocks, by name."""
         return averages(self._total, self.area, self.grains, self.shear_rate)
 
