@@ -115,7 +115,7 @@ def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
 
 MISTAKES = {
     "run --restitution 0.5 --packing-fraction 0.6 --strain 0": "strain must be a positive number",
-    "run --restitution 0.5 --packing-fraction 0.6 --seed 3": "there is no option --seed",
+    "run --restitution 0.5 --packing-fraction 0.6 --colour 3": "there is no option --colour",
     "map --restitution -0.1,0.5": "restitution must be between 0 and 1",
     "map --restitution 0.5,1.1": "restitution must be between 0 and 1",
     "map --restitution nan": "restitution must be between 0 and 1",
