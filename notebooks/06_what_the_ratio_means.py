@@ -90,5 +90,5 @@ xr.Dataset({"chaos": grown.theory_loss_pressure_chaos, "local over granular temp
 # %%
 alphas = [0.2, 0.5, 0.8] if quick else [0.1, 0.3, 0.5, 0.7, 0.9]
 fractions = [0.5, 0.65, 0.75] if quick else [0.3, 0.5, 0.6, 0.7, 0.75, 0.79]
-plane = jg.ratio_map(alphas, fractions, grains=grains, seeds=1, **chosen)
+plane = jg.ratio_map(alphas, fractions, timestep=5e-4, grains=grains, seeds=1, **chosen)
 jg.theory_losses(plane)
