@@ -22,6 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jaxgran.files import replaced
 from jaxgran.maps.schema import FINEST
 from jaxgran.model.checks import InputError, shown
 
@@ -281,13 +282,9 @@ def writable_stem(stem: Path | str) -> Path:
 
 
 def write(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG under a temporary name in the same folder, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Write a figure as PNG; a file that is there is replaced at the end."""
     figure.set_dpi(_FILE_DPI)
     fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
-    try:
+    with replaced(path) as temporary:
         figure.savefig(temporary, format="png", dpi=_FILE_DPI)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
