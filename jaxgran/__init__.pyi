@@ -12,7 +12,7 @@ from .inference.closure_fit import fit_closure
 from .inference.friction_law import friction_law
 from .inference.restitution import RestitutionFit, fit_restitution
 from .inference.stress_inversion import restitution_from_stresses
-from .io.trajectory import Trajectory, read_trajectory
+from .io.trajectory import Trajectory, read_trajectory, write_trajectory
 from .maps.sweep import ratio_map
 from .model.checks import InputError
 from .model.flow import ShearFlow
@@ -85,4 +85,5 @@ __all__ = [
     "snapshot_series",
     "theory_errors",
     "theory_losses",
+    "write_trajectory",
 ]

@@ -18,6 +18,7 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.sweep import predicted_cost, ratio_map, replicas
+from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 
@@ -202,6 +203,26 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.Monkey
     with pytest.warns(match=words):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
     assert "2/2 points" in capsys.readouterr().err
+
+
+def test_a_map_that_is_cut_off_in_python_is_continued(settings, results, tmp_path) -> None:
+    folder, calls = tmp_path / "map.nc.unfinished", []
+
+    def cut_off(_: float) -> None:
+        calls.append(len(list(folder.glob("done-*"))))
+        if calls[-1]:
+            raise RuntimeError("cut off")
+
+    with pytest.raises(RuntimeError, match="cut off"):
+        ratio_map(**SETTINGS, batch=2, report=cut_off, checkpoint=tmp_path / "map.nc")
+    with pytest.raises(InputError, match=r"has tolerance 0\.0001 and not 0\.001"):
+        ratio_map(**SETTINGS, batch=2, tolerance=1e-3, checkpoint=str(tmp_path / "map.nc"))
+    data = ratio_map(**SETTINGS, batch=2, checkpoint=tmp_path / "map.nc")
+    assert data.attrs["resumed_replicas"] == 2 and not folder.exists()
+    expected = map_dataset(settings, results, {})
+    np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
+    with pytest.raises(InputError, match=r"^checkpoint must be a file name, not 3\.$"):
+        ratio_map(**SETTINGS, checkpoint=3)  # type: ignore[arg-type]
 
 
 def test_replicas_of_a_point_differ(results) -> None:

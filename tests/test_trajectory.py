@@ -20,6 +20,7 @@ from jaxgran.io.trajectory import (
     read_trajectory,
     start_trajectory,
     write_frame,
+    write_trajectory,
 )
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError
@@ -115,6 +116,28 @@ def test_a_state_in_single_precision_is_read_back_to_the_bit(seen, tmp_path: Pat
     for a, b in zip(jax.tree.leaves(frame_of(read, 0)), jax.tree.leaves(single.state), strict=True):
         assert a.dtype == np.float32
         np.testing.assert_array_equal(a, b)
+
+
+def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: Path) -> None:
+    path, strains = tmp_path / "flow.gsd", [0.5, 0.512, 0.53]
+    states = jax.tree.map(lambda *x: jnp.stack(x), *(one.state for one in seen.values()))
+    write_trajectory(path, flow, states, strains)
+    read = read_trajectory(path)
+    assert_same_bits(read.state, states)
+    np.testing.assert_array_equal(read.step, [0, 12, 30])
+    start_trajectory(tmp_path / "one.gsd", seen[TILTS[0]])
+    for file in (path, tmp_path / "one.gsd"):
+        with gsd.hoomd.open(file) as frames:
+            forces = frames[0].log["bonds/force"]
+        impulses = np.asarray(seen[TILTS[0]].impulses)
+        np.testing.assert_allclose(forces, impulses[impulses > 0] / 1e-3, rtol=1e-12)
+    with pytest.raises(InputError, match=r"^path must be another file, or overwrite be True: .*flow\.gsd' exists\.$"):
+        write_trajectory(path, flow, states, strains)
+    with pytest.raises(InputError, match=r"^strain must increase by at least one time step"):
+        write_trajectory(path, flow, states, [0.5, 0.5001, 0.53], overwrite=True)
+    with pytest.raises(InputError, match=r"^states must have one leading axis"):
+        write_trajectory(path, flow, seen[0.0].state, strains, overwrite=True)
+    assert_same_bits(read_trajectory(path).state, states)
 
 
 def test_a_flow_goes_on_from_what_is_read(flow, run, recorded) -> None:

@@ -80,7 +80,7 @@ WITHOUT_ARRAYS = {
         "ratio_contours",
         "ratio_curves",
     ),
-    *("read_trajectory", "save_figures", "theory_errors", "theory_losses"),
+    *("read_trajectory", "save_figures", "theory_errors", "theory_losses", "write_trajectory"),
 }
 
 

@@ -28,7 +28,7 @@ log/jaxgran/restitution        (1,)            –       α
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -39,13 +39,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.files import replaced
 from jaxgran.io.atomic import require_place
 from jaxgran.model.cell import centred, remap_tilt, wrap
 from jaxgran.model.checks import InputError, shown
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.model.state import State
+from jaxgran.model.state import State, require_state
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd reject
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
@@ -120,6 +121,51 @@ def write_frame(path: Path, seen: Snapshot, step: int) -> None:
         start_trajectory(path, seen)
     else:
         append_frame(path, seen, step)
+
+
+def write_trajectory(
+    path: str | os.PathLike,
+    flow: ShearFlow,
+    states: State,
+    strain: Sequence[float] | np.ndarray,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Write states of a flow as a GSD file, with the contact forces at each, for other programs and to be read back.
+
+    Args:
+      path: GSD file, with the ending ``.gsd``.
+      flow: parameters of all states. The contact forces are those of its next time step.
+      states: states with a leading (frames,) axis, such as ``state`` of the series of ``snapshot_series``.
+      strain: strain at each frame, shape (frames,), increasing. The file has the whole number of time steps since the
+        first frame.
+      overwrite: whether to replace an existing file.
+
+    Raises:
+      InputError: (a ValueError) the file exists or cannot be written, the states do not have a leading axis or are not
+        of the flow, or the strain does not increase by at least one time step from frame to frame.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise InputError(f"path must be a file name, not {shown(path)}.")
+    path = Path(path)
+    check_trajectory(path)
+    if path.exists() and not overwrite:
+        raise InputError(f"path must be another file, or overwrite be True: {shown(str(path))} exists.")
+    if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
+        raise InputError("states must have one leading axis of frames: stack them, or take those of snapshot_series.")
+    strains = np.asarray(strain, np.float64)
+    if strains.shape != np.shape(states.side):
+        raise InputError(f"strain must have one number for each of the {np.size(states.side)} states.")
+    steps = np.round((strains - strains[0]) / float(flow.shear_rate * flow.timestep))
+    if not np.all(np.diff(steps) >= 1):
+        raise InputError("strain must increase by at least one time step from frame to frame.")
+    frames = [jax.tree.map(lambda x, k=k: x[k], states) for k in range(len(steps))]
+    for state in frames:
+        require_state(flow, state)
+    seen = jax.jit(snapshot)
+    with replaced(path) as temporary:
+        for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
+            _write(temporary, "r+" if k else "x", seen(flow, state), step)
 
 
 def _library() -> tuple[Any, Any]:

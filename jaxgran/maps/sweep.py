@@ -7,9 +7,10 @@ batches, their order or the number of workers.
 """
 
 import math
+import os
 import warnings
 from collections.abc import Callable, Container, Generator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from jaxgran.io.atomic import Damaged
+from jaxgran.io.atomic import Damaged, require_place
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
@@ -72,6 +73,7 @@ def ratio_map(
     workers: int = 1,
     report: Report | None = None,
     progress: bool = False,
+    checkpoint: str | os.PathLike | None = None,
 ) -> "xr.Dataset":
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with standard errors.
 
@@ -104,6 +106,9 @@ def ratio_map(
         under ``if __name__ == "__main__":``.
       report: called with the replica-steps done since the last call.
       progress: whether to show on standard error how far the map is: a bar on a terminal, lines elsewhere.
+      checkpoint: name of a file for this map, such as "map.nc". While the map is run, what is finished is kept in a
+        folder beside it, "map.nc.unfinished". If the run is cut off, the same call continues it, and so does
+        ``jaxgran map --output map.nc --resume`` with the same parameters. The file itself is not written.
 
     Returns:
       The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with standard
@@ -111,7 +116,8 @@ def ratio_map(
       front. It also has the status of each point, and all parameters as attributes.
 
     Raises:
-      InputError: (a ValueError) a parameter is out of range; the message says what is accepted.
+      InputError: (a ValueError) a parameter is out of range; the message says what is accepted. Or the checkpoint is
+        of another map or of other versions, or another process writes it; the message names the difference.
 
     Warns:
       UserWarning: points have a bad status, or their samples are short; the message names them and says what to do.
@@ -143,29 +149,46 @@ def ratio_map(
         raise InputError(f"progress must be True or False, not {shown(progress)}.")
     from jaxgran.maps.progress import progress as meter  # here, so that workers need not load Rich
 
-    start, results = perf_counter(), {}
-    with meter([predicted_cost(flow) for flow in settings.flows()], settings.seeds, quiet=not progress) as shown_to:
+    costs = [predicted_cost(flow) for flow in settings.flows()]
+    with _checkpoint(checkpoint, settings) as kept, meter(costs, settings.seeds, quiet=not progress) as shown_to:
 
         def count(steps: float) -> None:
             shown_to.steps(steps)
             if report is not None:
                 report(steps)
 
-        for key, replica in replicas(settings, batch, workers, count):
+        start = perf_counter()
+        results: dict[Key, Replica | None] = {} if kept is None else dict(kept.done)
+        run: dict[str, Any] = {"automatic_choice": automatic_choice, "workers": workers}
+        if kept is not None:
+            run["resumed_replicas"] = len(results)
+        shown_to.resumed(point for point, _ in results)
+        for key, replica in replicas(settings, batch, workers, count, kept):
             results[key] = replica
             shown_to.replica(key[0])
     seconds = perf_counter() - start
-    run = {
-        "automatic_choice": automatic_choice,
-        "wall_time_seconds": seconds,
-        "replica_steps_per_second": shown_to.done_steps / seconds,
-        "workers": workers,
-    }
+    run |= {"wall_time_seconds": seconds, "replica_steps_per_second": shown_to.done_steps / seconds}
     from jaxgran.maps.dataset import map_dataset  # here, so that workers need not load xarray
 
     data = map_dataset(settings, results, run)
     _warn_of_bad_points(data)
     return data
+
+
+@contextmanager
+def _checkpoint(file: str | os.PathLike | None, settings: MapSettings) -> Generator[Checkpoint | None]:
+    """The checkpoint of a map beside a file, or None; it is removed when the block has run every replica."""
+    if file is None:
+        yield None
+        return
+    if not isinstance(file, (str, os.PathLike)):
+        raise InputError(f"checkpoint must be a file name, not {shown(file)}.")
+    require_place(Path(file), "checkpoint", ".nc")
+    kept = Checkpoint(Path(file), settings, resume=True)
+    try:
+        yield kept
+    finally:
+        kept.close(finished=len(kept.done) == len(settings.flows()) * settings.seeds)
 
 
 def _warn_of_bad_points(data: "xr.Dataset") -> None:
