@@ -82,3 +82,11 @@ def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
     environment = os.environ | {"MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": compiled}
     done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_paper_cites_what_its_bibliography_has_and_shows_figures_that_are_there() -> None:
+    text, bibliography = ((ROOT / "paper" / name).read_text() for name in ("paper.md", "paper.bib"))
+    cited = set(re.findall(r"@([a-z]+\d{4})", text))
+    assert cited == set(re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE))
+    figures = re.findall(r"\]\((\S+\.png)\)", text)
+    assert len(figures) == 2 and all((ROOT / "paper" / figure).is_file() for figure in figures)
