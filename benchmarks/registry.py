@@ -117,6 +117,13 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "pulse",
+        "What does a loose contact solve do to a packing that is pushed at one side?",
+        (2, 0.3),
+        ("pulse.json", "pulse.png"),
+        one_core=True,
+    ),
+    Benchmark(
         "contact_duration",
         "Is a time step a duration of contact of event-driven discs?",
         (10, 1),
