@@ -194,8 +194,8 @@ def draw(rows: list[dict[str, Any]], length: int) -> Figure:
     for row, line, shade in zip(swept, (":", "-.", "--", (0, (6, 1)), "-"), (0.65, 0.5, 0.35, 0.2, 0.0), strict=True):
         times = np.arange(1, len(row["wall"]) + 1)
         wall.plot(times, row["wall"], linestyle=line, color=str(shade), label=f"{row['tolerance']:g}")
-    wall.set(xscale="log", xlabel="time step", ylabel="force on the wall / force of the push", ylim=(-0.05, 1.2))
-    wall.legend(title="tolerance", fontsize="small", loc="center left")
+    wall.set(xscale="log", xlabel="time step", ylabel="force on the wall / force of the push", ylim=(-0.4, 1.2))
+    wall.legend(title="tolerance", fontsize="small", loc="lower center", ncols=5)
     wall.set_title(f"(a) the force arrives late ({SWEEPS})", fontsize="medium")
     for method, (colour, marker, line) in STYLES.items():
         known = [row for row in rows if row["method"] == method]
@@ -210,9 +210,8 @@ def draw(rows: list[dict[str, Any]], length: int) -> Figure:
     speed.set(ylabel="apparent speed (diameters a time step)", ylim=(0.3, 2 * length))
     speed.set_title("(b) a front moves, as if the discs were soft", fontsize="medium")
     force.set(ylabel="rms error of the force on the wall, relative", ylim=(FLOOR / 2, 3))
-    force.text(
-        0.98, 0.03, f"drawn at {FLOOR:g}: less than that", ha="right", fontsize="small", transform=force.transAxes
-    )
+    words = {"fontsize": "small", "ha": "right", "transform": force.transAxes}
+    force.text(0.98, 0.93, f"drawn at {FLOOR:g}: that or less", **words)
     force.set_title("(c) later, the wall feels another force", fontsize="medium")
     creep.set(ylabel="speed of the pushed side (F dt/m)")
     creep.set_title("(d) the pushed side creeps", fontsize="medium")
