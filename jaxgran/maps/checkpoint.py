@@ -19,14 +19,14 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxgran.dynamics.tally import flat_tally, tally_from_flat
+from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
 from jaxgran.maps.instants import as_arrays, from_arrays
 from jaxgran.maps.replica import Key, Replica
@@ -222,7 +222,8 @@ class Checkpoint:
 def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
     versions = {f"version of {name}": version(name) for name in _VERSIONS}
-    identity = {**asdict(settings), **versions, "precision": _precision(), "device": jax.default_backend()}
+    here = {"precision": _precision(), "device": jax.default_backend(), "number of running sums": len(fields(Tally))}
+    identity = {**asdict(settings), **versions, **here}
     return json.loads(json.dumps(identity, default=lambda number: number.item()))
 
 
