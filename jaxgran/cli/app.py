@@ -33,23 +33,49 @@ EXAMPLES = {
     "One flow, with a movie of it": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
     "The options of a command": "jaxgran run --help",
 }
-COMMANDS = {
-    "map": (map_command, "Map the force ratio over a plane of flows.", MAP_EXAMPLES),
-    "plot": (plot_command, "Draw the figures of a map again.", PLOT_EXAMPLES),
-    "explore": (explore_command, "Write a page to look into a map.", EXPLORE_EXAMPLES),
-    "run": (run_command, "Run one flow, average it, film it.", RUN_EXAMPLES),
-    "fit": (fit_command, "Infer a restitution, or the law of a map.", FIT_EXAMPLES),
-    "info": (info_command, "Print what a bug report needs.", INFO_EXAMPLES),
+COMMANDS = {  # with their help here, as python -OO leaves docstrings out
+    "map": (
+        map_command,
+        "Map the force ratio over a plane of flows.",
+        "Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2.",
+        MAP_EXAMPLES,
+    ),
+    "plot": (plot_command, "Draw the figures of a map again.", "Draw the figures of a finished map.", PLOT_EXAMPLES),
+    "explore": (
+        explore_command,
+        "Write a page to look into a map.",
+        "Write a page to look into a map with a browser: one file that needs nothing else.",
+        EXPLORE_EXAMPLES,
+    ),
+    "run": (
+        run_command,
+        "Run one flow, average it, film it.",
+        "Run one flow to its steady state, sample it, and print its averages with their errors.",
+        RUN_EXAMPLES,
+    ),
+    "fit": (
+        fit_command,
+        "Infer a restitution, or the law of a map.",
+        "Infer the restitution of a trajectory, or fit a closure to a map and infer a restitution from stresses.",
+        FIT_EXAMPLES,
+    ),
+    "info": (
+        info_command,
+        "Print what a bug report needs.",
+        "Print versions, processor, devices and folders for a bug report.",
+        INFO_EXAMPLES,
+    ),
 }
 
 app = typer.Typer(
+    help="Flows of rigid, frictionless discs in simple shear by contact dynamics.",
     epilog=examples(EXAMPLES),
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for name, (command, short_help, command_examples) in COMMANDS.items():
-    app.command(name, short_help=short_help, epilog=examples(command_examples))(command)
+for name, (command, short_help, long_help, command_examples) in COMMANDS.items():
+    app.command(name, help=long_help, short_help=short_help, epilog=examples(command_examples))(command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -64,7 +90,7 @@ def command_line(
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Flows of rigid, frictionless discs in simple shear by contact dynamics."""
+    """Options before the command."""
 
 
 def main() -> None:

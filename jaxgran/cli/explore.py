@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxgran.cli.terminal import say_written
+from jaxgran.model.checks import InputError, shown
 
 EXPLORE_EXAMPLES = {
     "A page beside the map": "jaxgran explore jaxgran_map.nc",
@@ -18,15 +19,20 @@ def explore_command(
     output: Annotated[
         Path | None, typer.Option(help="HTML file of the page. [default: the name of the dataset with .html]")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the output, whatever it holds.")] = False,
 ) -> None:
-    """Write a page to look into a map with a browser: one file that needs nothing else."""
     from jaxgran.io.atomic import require_place
     from jaxgran.maps.results import read_dataset
     from jaxgran.page.document import require_plotly
-    from jaxgran.page.explore import explore
+    from jaxgran.page.explore import explore, shows_same_map
 
     path = file.with_suffix(".html") if output is None else output
     require_place(path, "output", ".html")
     require_plotly()
-    explore(read_dataset(file, needed=()), path)
+    page = explore(read_dataset(file, needed=()))
+    if path.exists() and not overwrite and not shows_same_map(path, page):
+        raise InputError(
+            f"output must be another file, or --overwrite be given: {shown(str(path))} is no page of this map."
+        )
+    page.save(path)
     say_written([path])

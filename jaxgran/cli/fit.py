@@ -33,7 +33,6 @@ def fit_command(
     shear_stress: Annotated[float | None, typer.Option(help="Its shear stress, in m γ̇².")] = None,
     relative_error: Annotated[float, typer.Option(help="Relative standard error of these stresses.")] = 0.0,
 ) -> None:
-    """Infer the restitution of a trajectory, or fit a closure to a map and infer a restitution from stresses."""
     require_number("relative_error", relative_error, lambda x: (x >= 0) & (x <= 1), "between 0 and 1")
     configured_jax()
     stresses = {"packing_fraction": packing_fraction, "pressure": pressure, "shear_stress": shear_stress}

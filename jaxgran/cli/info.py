@@ -15,7 +15,6 @@ _SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # first letters of
 
 
 def info_command() -> None:
-    """Print versions, processor, devices and folders for a bug report."""
     jax = configured_jax()
     lines = {
         "jaxgran": environment.versions(["jaxgran"])["jaxgran"] + _commit(),

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +22,7 @@ from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, require_device, say, say_written
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, shown
-from jaxgran.model.choices import Activation, Engine, Solver
+from jaxgran.model.choices import Activation, Engine, FileFormat, Solver
 from jaxgran.model.display import with_error
 
 MAP_EXAMPLES = {
@@ -34,6 +35,7 @@ NOT_DRAWN = ("_by_seed", "_correlation_strain")  # endings of variables that no 
 PLOT_EXAMPLES = {
     "The figures of a map, in its folder": "jaxgran plot jaxgran_map.nc",
     "In another folder": "jaxgran plot ratio.nc --output figures",
+    "For a manuscript with captions of its own": "jaxgran plot ratio.nc --output figures --format pdf --no-caption",
 }
 
 
@@ -88,6 +90,7 @@ def map_command(
         Path | None,
         typer.Option(help="NetCDF file; the figures go beside it. [default: jaxgran_map.nc, or jaxgran_map_PRESET.nc]"),
     ] = None,
+    format: Annotated[FileFormat, typer.Option(help="Format of the figures.")] = "png",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the output, whatever it holds.")] = False,
     like: Annotated[
         Path | None, typer.Option(help="Dataset whose map is repeated; other options override its parameters.")
@@ -95,7 +98,6 @@ def map_command(
     resume: Annotated[bool, typer.Option("--resume", help="Continue an unfinished map of this output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
-    """Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2."""
     if scheduler is not None and workers is not None:
         raise InputError("--scheduler and --workers exclude each other: give one of them.")
     require_one(strain, error)
@@ -136,7 +138,7 @@ def map_command(
     from jaxgran.maps.schema import parts, shear_stress_ratio
     from jaxgran.plotting.map_figures import save_figures
 
-    pictures = [] if interrupted else save_figures(data, output.with_suffix(""))
+    pictures = [] if interrupted else save_figures(data, output.with_suffix(""), format)
     for part in parts(data):
         print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
         print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
@@ -149,18 +151,26 @@ def map_command(
 
 def plot_command(
     file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
-    output: Annotated[Path | None, typer.Option(help="Folder of the figures. [default: that of the dataset]")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the figures, made if it is not there. [default: that of the dataset]")
+    ] = None,
+    format: Annotated[FileFormat, typer.Option(help="Format of the figures.")] = "png",
+    dpi: Annotated[int, typer.Option(help="Dots per inch of a PNG, 50 to 1200.")] = 200,
+    caption: Annotated[
+        bool, typer.Option("--caption/--no-caption", help="Parameters of the run and notes under the axes.")
+    ] = True,
 ) -> None:
-    """Draw the figures of a finished map."""
     from jaxgran.maps.output import remove_pictures
     from jaxgran.maps.results import read_dataset
     from jaxgran.plotting.map_figures import save_figures
 
     data = read_dataset(file, without=NOT_DRAWN)
     folder = file.parent if output is None else output
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
     if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
-        raise InputError(f"output must be a folder that exists and can be written to, not {shown(str(folder))}.")
-    pictures = save_figures(data, folder / file.stem)
+        raise InputError(f"output must be a folder that can be made and written to, not {shown(str(folder))}.")
+    pictures = save_figures(data, folder / file.stem, format, dpi, caption)
     remove_pictures(folder / file.name, but=pictures)
     say_written(pictures)
 

@@ -87,7 +87,6 @@ def run_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files, whatever they hold.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
 ) -> None:
-    """Run one flow to its steady state, sample it, and print its averages with their errors."""
     step = numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
         raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")

@@ -3,11 +3,14 @@
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import get_args
 
 from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError
+from jaxgran.model.choices import FileFormat
 
 PICTURES = ("curves", "contours", "timestep", "size", "theory", "losses", "clusters", "errors", "rheology")
+FORMATS = get_args(FileFormat)
 
 
 def check_output(path: Path) -> None:
@@ -22,11 +25,13 @@ def check_output(path: Path) -> None:
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
-    """Remove the pictures beside a dataset, but for some: they show the map that was there before."""
-    for file in set(_pictures(path)).difference(but):
-        file.unlink(missing_ok=True)
+    """Remove the pictures beside a dataset that show the map there was before: all but some, in whatever format."""
+    kept = {file.with_suffix("") for file in but}
+    for file in _pictures(path):
+        if file.with_suffix("") not in kept:
+            file.unlink(missing_ok=True)
 
 
 def _pictures(path: Path) -> list[Path]:
     """The files of the pictures of a dataset; not all need to exist."""
-    return [path.with_name(f"{path.stem}_{name}.png") for name in PICTURES]
+    return [path.with_name(f"{path.stem}_{name}.{ending}") for name in PICTURES for ending in FORMATS]

@@ -4,6 +4,7 @@ from typing import Literal
 
 Activation = Literal["midpoint", "touching"]
 Engine = Literal["auto", "machine_code", "jax", "thread_block"]
+FileFormat = Literal["png", "pdf", "svg"]  # of a figure
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83

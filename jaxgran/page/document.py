@@ -21,6 +21,7 @@ from jaxgran.model.checks import InputError
 
 _ESCAPED = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&"}
 _MARK = re.compile(r"\{\{(\w+)\}\}")
+_DATA = re.compile(r'<script id="data" type="application/json">(.*?)</script>', re.DOTALL)
 _FRAME_HEIGHT = 1000  # pixels, of a page in a notebook
 
 
@@ -72,6 +73,16 @@ def document(name: str, scripts: tuple[str, ...], title: str, data: Mapping[str,
         "script": "\n".join(_text(script) for script in scripts),
     }
     return Page(_MARK.sub(lambda mark: parts[mark[1]], _text(f"{name}.html")))
+
+
+def data_of(text: str) -> dict[str, Any] | None:
+    """What the scripts of a page read; None if a text is no page of this program."""
+    found = _DATA.search(text)
+    try:
+        data = json.loads(found[1]) if found else None
+    except json.JSONDecodeError:
+        return None
+    return data if isinstance(data, dict) else None
 
 
 @cache

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import xarray as xr
 
-from jaxgran.page.document import Page, document
+from jaxgran.page.document import Page, data_of, document
 from jaxgran.page.map_data import map_data
 
+_OF_THE_MAP = ("title", "axes", "about", "again")  # data of a page that the parameters of its map decide
 _SCRIPTS = ("page.js", "grains.js", "charts.js", "table.js", "map.js")
 
 
@@ -28,3 +29,10 @@ def explore(data: xr.Dataset, output: str | Path | None = None) -> Page:
     if output is not None:
         page.save(output)
     return page
+
+
+def shows_same_map(path: Path, page: Page) -> bool:
+    """Whether a file is a page of a map with the parameters of that of another page, perhaps with other numbers."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    there, here = ([data.get(name) for name in _OF_THE_MAP] for data in (data_of(x) or {} for x in (text, page.text)))
+    return there == here

@@ -1,7 +1,6 @@
-"""Contours in the plane of 1 − α and ν: interpolation, levels, labels that do not overlap, and the excess on top.
+"""Contours in the plane of 1 − α and ν: levels, labels that do not overlap, and the excess on top.
 
-A quantity is interpolated bilinearly between the grid points of a map. A cell is hatched if one of its corners has no
-value.
+A quantity is interpolated between the grid points of a map. A cell is hatched if one of its corners has no value.
 """
 
 from __future__ import annotations
@@ -19,41 +18,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 from matplotlib.ticker import StrMethodFormatter
 
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
 from jaxgran.plotting.encoding import EXCESS_LEVELS
+from jaxgran.plotting.interpolation import interpolated, refined_axes
 
 _EXCESS_COLOUR = "#00803c"
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
 _LABEL_DISTANCE = 28.0  # points between the middles of two labels, slightly more than the length of a label
-_SUBDIVISIONS = 12  # steps of the bilinear interpolation between neighbouring grid points
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
 
 
 # ----------------------------------------------------------------------------------------------- plane
-
-
-def refined_axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 − α and ν at the points of an interpolated field."""
-    axes = 1.0 - data.restitution.values, data.packing_fraction.values
-    x, y = (_refinement(len(axis)) @ axis for axis in axes)
-    return x, y
-
-
-def interpolated(field: np.ndarray) -> np.ma.MaskedArray:
-    """Return a field interpolated bilinearly to a finer grid, masked where a missing point would contribute."""
-    rows, columns = (_refinement(count) for count in field.shape)
-    missing = ~np.isfinite(field)
-    values = rows @ np.where(missing, 0.0, field) @ columns.T
-    return np.ma.masked_array(values, mask=rows @ missing @ columns.T > 0.0)
-
-
-def _refinement(count: int) -> np.ndarray:
-    """Return the matrix (fine, count) of linear interpolation onto a subdivided axis."""
-    position = np.linspace(0.0, count - 1.0, (count - 1) * _SUBDIVISIONS + 1)
-    return np.maximum(0.0, 1.0 - np.abs(position[:, None] - np.arange(count)))
 
 
 def contour_variable(excess: np.ndarray) -> np.ndarray:
@@ -151,6 +130,16 @@ def label_contours(
         )
         for label in labels:
             label.set_path_effects([withStroke(linewidth=2, foreground="white")])
+            _move_inside(label, axes)
+
+
+def _move_inside(label: Text, axes: Axes) -> None:
+    """Move a label that reaches over the frame into it."""
+    box, frame = label.get_window_extent(), axes.bbox
+    over = np.maximum(0.0, frame.min - box.min) - np.maximum(0.0, box.max - frame.max)
+    if over.any():
+        place = axes.transData.transform(label.get_position()) + over
+        label.set_position(axes.transData.inverted().transform(place))
 
 
 def _thinned(path: MplPath) -> np.ndarray:

@@ -15,18 +15,20 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox
 
 from jaxgran.files import replaced
 from jaxgran.maps.schema import FINEST
 from jaxgran.model.checks import InputError, shown
 
 LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+FILE_DPI = 200  # dots per inch of a picture, unless another number is given
 LABEL_SIZE = 9.0  # points, font of the labels of axes
 TICK_SIZE = 8.0  # points, font of the numbers at the ticks
 SMALL_SIZE = 7.0  # points, font of legends and captions
@@ -35,7 +37,8 @@ ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
-_FILE_DPI = 200
+_CAPTION = "caption"  # names the text under the axes
+_UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 _MARKERS = "os^DvP<X>ph*"
 _LINE_STYLES = ("-", (0, (5, 1.5)), (0, (4, 1.2, 1, 1.2)), (0, (2, 1)), (0, (1, 1)))
 _RING: dict[str, Any] = {
@@ -112,8 +115,8 @@ def curve_styles(count: int) -> list[dict[str, Any]]:
 def draw_points(
     axes: Axes, x: np.ndarray, y: np.ndarray, bad: np.ndarray, style: dict[str, Any], **errors: Any
 ) -> None:
-    """Draw a curve with its error bars; a point whose status is not `ok` is an open symbol in a ring."""
-    axes.errorbar(x, y, **style, **errors, markersize=4, linewidth=1.1, elinewidth=0.8, capsize=2)
+    """Draw a curve with its error bars, without caps; a point whose status is not `ok` is an open symbol in a ring."""
+    axes.errorbar(x, y, **style, **errors, markersize=4, linewidth=1.1, elinewidth=0.8)
     axes.plot(
         x[bad],
         y[bad],
@@ -130,7 +133,7 @@ def draw_points(
 def mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
     """Put a ring around points whose status is not `ok`."""
     if len(x):
-        axes.plot(x, y, **_RING, zorder=5)
+        axes.plot(x, y, **_RING, zorder=5, clip_on=False)
 
 
 def curve_key(style: dict[str, Any], label: str) -> Line2D:
@@ -246,7 +249,7 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
             where = {"transform": axes.transAxes, "ha": "center"}
             axes.text(0.5, 0.6, "no measured values", fontsize=LABEL_SIZE, bbox=box, **where)
     caption = "\n".join(line for line in (_run_description(data.attrs), *notes) if line)
-    figure.supxlabel(caption, fontsize=SMALL_SIZE)
+    figure.supxlabel(caption, fontsize=SMALL_SIZE, gid=_CAPTION)
 
 
 def _run_description(attrs: dict) -> str:
@@ -281,10 +284,24 @@ def writable_stem(stem: Path | str) -> Path:
     return stem
 
 
-def write(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG; a file that is there is replaced at the end."""
-    figure.set_dpi(_FILE_DPI)
+def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True) -> Path:
+    """Write a figure in the format of its ending; a file that is there is replaced at the end.
+
+    The same figure gives the same file: no date and no random name is in it. Without its caption a figure is lower.
+    """
+    figure.set_dpi(dpi)
     fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
-    with replaced(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=_FILE_DPI)
+    kind = path.suffix.removeprefix(".")
+    area = None if caption else _cut_caption(figure)
+    with replaced(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
+        figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches=area, metadata=_UNDATED.get(kind))
     return path
+
+
+def _cut_caption(figure: Figure) -> Bbox:
+    """Hide the caption, and return what is above it, in inches."""
+    width, height = figure.get_size_inches()
+    (caption,) = figure.findobj(lambda artist: artist.get_gid() == _CAPTION)
+    top = caption.get_window_extent().y1 / figure.dpi
+    caption.set_visible(False)
+    return Bbox.from_extents(0.0, top, width, height)

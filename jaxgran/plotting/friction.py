@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxgran.inference.friction_law import (
     LARGEST_INERTIAL_NUMBER,
@@ -39,6 +38,7 @@ from jaxgran.plotting.drawing import (
     status_note,
     suspect,
 )
+from jaxgran.plotting.log_axis import number_log_axis
 
 _FRICTION_NOTE = (
     r"$\mu=\mu_0+aI^b$ and $\nu=\nu_c-kI^c$, fitted to the filled symbols: status ok, "
@@ -73,9 +73,7 @@ def friction_figure(data: xr.Dataset) -> Figure:
         for alpha, style in styles.items():
             _draw_flows(axes, data.sel(restitution=alpha), name, style)
         axes.set_xlabel(r"inertial number $I$", fontsize=LABEL_SIZE)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+        number_log_axis(axes.xaxis, *axes.get_xlim())
     left.set_ylabel(r"macroscopic friction $\mu$", fontsize=LABEL_SIZE)
     right.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     _add_laws(left, law, styles, lambda one: one.friction, r"$\mu_0$, $a$, $b$")

@@ -22,6 +22,7 @@ from jaxgran.plotting.drawing import (
     require_plane,
     status_note,
 )
+from jaxgran.plotting.interpolation import left_out_note
 from jaxgran.plotting.theory import draw_errors, noise_keys
 
 PANELS = {
@@ -65,12 +66,13 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
     figure = empty_figure(width=7.4, height=6.8)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
     measured = np.isfinite(data[f"theory_loss_{stress}_pairs"].values)
-    panels, noisy, over = [], False, {}
+    panels, fields, noisy, over = [], [], False, {}
     for axes, (factor, title) in zip(grid.flat, PANELS.items(), strict=True):
         value, error = (data[f"theory_loss_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(value > 0, np.log(value), np.nan)
             lines, hidden = draw_errors(axes, data, logarithm, error / value)
+        fields.append(logarithm)
         over = draw_excess(axes, data)
         panels.append((axes, lines, over.values()))
         noisy |= hidden
@@ -81,7 +83,8 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
         axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
     note = _NOTE.format(stress.replace("_", " "))
-    finish(figure, data, measured, [note, status_note(data), missing_note(measured, " (hatched)")])
+    found = left_out_note(data, fields, "each factor")
+    finish(figure, data, measured, [note, found, status_note(data), missing_note(measured, " (hatched)")])
     fix_layout(figure)
     for axes, lines, others in panels:
         label_contours(axes, list(lines.items()), others, room=4.0)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, require_map
-from jaxgran.model.checks import InputError
-from jaxgran.plotting.drawing import is_plane, writable_stem, write
+from jaxgran.model.checks import InputError, require_whole, shown
+from jaxgran.model.choices import FileFormat
+from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
 from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
 from jaxgran.plotting.losses import has_losses, theory_losses
@@ -21,10 +23,12 @@ from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, th
 from jaxgran.plotting.two_processes import do_all
 
 
-def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
-    """Write as PNG every figure for which a map has the data, and return the paths written.
+def save_figures(
+    data: xr.Dataset, stem: Path | str, format: FileFormat = "png", dpi: int = FILE_DPI, caption: bool = True
+) -> list[Path]:
+    """Write every figure for which a map has the data, and return the paths written.
 
-    Each file is written whole or not at all.
+    Each file is written whole or not at all. The same map gives the same bytes.
 
     ======================= ==================================================================
     file                    written if the map has
@@ -43,11 +47,18 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
     ======== ============= =====================================================================
     data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
     stem     path          folder and beginning of the names; the folder must exist
+    format   text          "png", "pdf" or "svg", which is also the ending of the names
+    dpi      int           dots per inch of a PNG, 50 to 1200; the other formats have none
+    caption  bool          whether the parameters of the run and the notes stand under the axes
     returns  list of Path  the files written, in the order above
-    raises   ValueError    the data are not a map, or no files can be written there
+    raises   ValueError    the data are not a map, a choice is not one of these, or no files can be
+                           written there
     ======== ============= =====================================================================
     """
     require_map(data, *RATIO)
+    if format not in get_args(FileFormat):
+        raise InputError(f"format must be png, pdf or svg, not {shown(format)}.")
+    require_whole("dpi", dpi, 50, 1200, "as no print shows more")
     stem = writable_stem(stem)
     figures = {
         "curves": (True, ratio_curves),
@@ -60,13 +71,13 @@ def save_figures(data: xr.Dataset, stem: Path | str) -> list[Path]:
         "errors": (is_plane(data) and has_errors(data), dominating_errors),
         "rheology": (has_friction_law(data), friction_figure),
     }
-    drawn = {stem.with_name(f"{stem.name}_{name}.png"): draw for name, (possible, draw) in figures.items() if possible}
+    drawn = {stem.with_name(f"{stem.name}_{name}.{format}"): draw for name, (possible, draw) in figures.items() if possible}
     for path in drawn:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    do_all([partial(_draw, draw, data, path) for path, draw in drawn.items()])
+    do_all([partial(_draw, draw, data, path, dpi, caption) for path, draw in drawn.items()])
     return list(drawn)
 
 
-def _draw(draw: Callable[[xr.Dataset], Figure], data: xr.Dataset, path: Path) -> None:
-    write(draw(data), path)
+def _draw(draw: Callable[[xr.Dataset], Figure], data: xr.Dataset, path: Path, dpi: int, caption: bool) -> None:
+    write(draw(data), path, dpi, caption)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -20,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
 from jaxgran.maps.schema import RATIO, finest, require_map, shear_stress_ratio, what_lacks
 from jaxgran.model.checks import InputError
@@ -32,9 +33,7 @@ from jaxgran.plotting.contours import (
     draw_plane,
     excess_field,
     excess_value,
-    interpolated,
     label_contours,
-    refined_axes,
 )
 from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
@@ -58,11 +57,15 @@ from jaxgran.plotting.drawing import (
     status_note,
     suspect,
 )
+from jaxgran.plotting.interpolation import interpolated, interpolation_error, left_out_note, refined_axes
+from jaxgran.plotting.log_axis import number_log_axis
 
 MOST_TOGETHER = 8  # curves in one panel of the figures against the time step and the number of grains
 _LOG_SPAN = 2.5  # largest over smallest force ratio at and above which the axis is logarithmic
 _SHEAR_LABEL = r"shear-stress ratio $\Sigma^{xy}/\Sigma^{xy}_{\mathrm{bc}}$"
 _BAND = "#e08214"
+_BETWEEN: dict[str, Any] = {"facecolor": "#2b8cbe", "alpha": 0.25, "linewidth": 0.0}
+_LEAST_CONTOURED = 0.02  # excess above which the error of interpolation is quoted, below the lowest level
 
 
 def ratio_curves(data: xr.Dataset) -> Figure:
@@ -111,8 +114,9 @@ def ratio_contours(data: xr.Dataset) -> Figure:
 
     The contoured variable is asinh(excess/0.01). It is logarithmic for an excess well above 0.01, and linear
     below, where noise may make the excess negative. It is interpolated bilinearly between the grid points. A
-    cell with a missing corner is hatched. The band of a level contains the points whose excess differs from
-    the level by at most the interpolated standard error.
+    cell with a missing corner is hatched. A level has two bands: of the points whose excess differs from it by at
+    most the interpolated standard error, and of those where it differs by at most the error of interpolation, as
+    estimated from points that are left out.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) as in :func:`ratio_curves`
@@ -134,14 +138,18 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     style = {"colors": "black", "linewidths": 1.1, "zorder": 3}
     drawn = {level: draw_level(axes, x, y, field, excess_value(level), **style) for level in EXCESS_LEVELS}
     lines = {level: line for level, line in drawn.items() if line is not None}
+    widths = interpolation_error(data, contour_variable(excess))
+    between = _draw_interpolation(axes, x, y, field, widths, lines)
     banded = _draw_bands(axes, x, y, excess, stderr, lines)
     draw_plane(axes, data, field, measured)
     axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
-    band: list[Artist] = [Patch(facecolor=_BAND, alpha=0.45, label="± standard error")]
-    add_plane_legend(figure, data, measured, band * banded)
+    bands: list[Artist] = [Patch(facecolor=_BAND, alpha=0.45, label="± standard error")] * banded
+    bands += [Patch(**_BETWEEN, label="± interpolation")] * between
+    add_plane_legend(figure, data, measured, bands)
     absent = [level for level in EXCESS_LEVELS if level not in lines]
-    notes = [_contour_note(absent), status_note(data), missing_note(measured, " (hatched)")]
+    found = left_out_note(data, [contour_variable(excess)], "its excess", excess > _LEAST_CONTOURED)
+    notes = [_contour_note(absent), found, status_note(data), missing_note(measured, " (hatched)")]
     finish(figure, data, measured, notes)
     fix_layout(figure)
     label_contours(axes, [(f"{level:.2f}", line) for level, line in lines.items()])
@@ -222,11 +230,7 @@ def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
     if span < _LOG_SPAN:
         return
     axes.set_yscale("log")
-    subs = (1, 1.5, 2, 3, 4, 6, 8) if span < 12 else (1, 2, 5)
-    axes.yaxis.set_major_locator(LogLocator(subs=subs))
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    number_log_axis(axes.yaxis, *axes.get_ylim())
 
 
 # ----------------------------------------------------------------------------------------- time steps
@@ -290,6 +294,18 @@ def _draw_bands(
             axes.contourf(x, y, in_errors, [-1.0, 1.0], colors=[_BAND], alpha=0.45, zorder=2)
             drawn = True
     return drawn
+
+
+def _draw_interpolation(
+    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, widths: np.ndarray, levels: Iterable[float]
+) -> bool:
+    """Shade where the contour variable agrees with a level within the error of interpolation; return if anywhere."""
+    distances = [abs(field - excess_value(level)) for level in levels]
+    if not distances or not widths.any():
+        return False
+    inside = widths - np.ma.min(np.ma.stack(distances), axis=0)
+    axes.contourf(x, y, inside, [0.0, 1e9], colors=[_BETWEEN["facecolor"]], alpha=_BETWEEN["alpha"], zorder=1.5)
+    return bool(inside.max() > 0.0)
 
 
 def _contour_note(absent: Sequence[float]) -> str:

@@ -25,9 +25,7 @@ from jaxgran.plotting.contours import (
     draw_plane,
     excess_keys,
     excess_style,
-    interpolated,
     label_contours,
-    refined_axes,
 )
 from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
@@ -49,6 +47,8 @@ from jaxgran.plotting.drawing import (
     status_note,
     suspect,
 )
+from jaxgran.plotting.interpolation import interpolated, left_out_note, refined_axes
+from jaxgran.plotting.log_axis import number_log_axis
 
 ERROR_LEVELS = {
     "÷10": np.log(0.1),
@@ -75,6 +75,7 @@ _STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_",
 _NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
 _SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
+_LEAST_SHARE = 0.02  # share of clusters above which the error of interpolation is quoted, below the lowest level
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 _CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
 _THEORY_NOTE = (
@@ -150,7 +151,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
     figure = empty_figure(width=7.6, height=5.9)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
-    panels, noisy, over = [], False, {}
+    panels, fields, noisy, over = [], [], False, {}
     measured = np.ones(data.force_ratio.shape, bool)
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, fontsize=LABEL_SIZE)
@@ -161,12 +162,14 @@ def theory_errors(data: xr.Dataset) -> Figure:
         measured &= np.isfinite(parts["total"][0])
         for axes, (value, error) in zip(row, parts.values(), strict=True):
             lines, hidden = draw_errors(axes, data, value, error)
+            fields.append(value)
             over = draw_excess(axes, data)
             panels.append((axes, lines, over.values()))
             noisy |= hidden
         row[0].set_ylabel(f"{_QUANTITIES[quantity]}\n{NU_LABEL}", fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
-    finish(figure, data, measured, [_THEORY_NOTE, status_note(data), missing_note(measured, " (hatched)")])
+    found = left_out_note(data, fields, "each quotient")
+    finish(figure, data, measured, [_THEORY_NOTE, found, status_note(data), missing_note(measured, " (hatched)")])
     fix_layout(figure)
     for axes, lines, over in panels:
         label_contours(axes, list(lines.items()), over, room=4.0)
@@ -244,7 +247,9 @@ def cluster_shares(data: xr.Dataset) -> Figure:
         add_ring_legend(figure, data, "outside upper right")
     _add_share_legend(figure, data)
     beyond = f"{left_out} of {measured.size} points have an excess too small for its axis" if left_out else ""
-    finish(figure, data, measured, [_CLUSTER_NOTE, beyond, status_note(data), missing_note(measured)])
+    share = data.cluster_pressure_share.values
+    found = left_out_note(data, [share], "the pressure", share > _LEAST_SHARE) if plane else ""
+    finish(figure, data, measured, [_CLUSTER_NOTE, beyond, found, status_note(data), missing_note(measured)])
     fix_layout(figure)
     if plane:
         label_contours(axes["m"], [(f"{level:.2f}", line) for level, line in lines.items()], over.values())
@@ -258,7 +263,7 @@ def _draw_shares(axes: Axes, data: xr.Dataset, name: str) -> None:
     excess, share, bad = data.force_ratio.values - 1.0, data[name].values, suspect(data)
     x_error, y_error = data.force_ratio_stderr.values, data[f"{name}_stderr"].values
     for k, style in enumerate(styles):
-        errors = {"xerr": x_error[:, k], "yerr": y_error[:, k], "elinewidth": 0.8, "capsize": 2}
+        errors = {"xerr": x_error[:, k], "yerr": y_error[:, k], "elinewidth": 0.8}
         line = {"color": style["color"], "linestyle": style["linestyle"], "linewidth": 0.9}
         axes.errorbar(excess[:, k], share[:, k], **errors, **line, zorder=2)
     colours = [style["color"] for style in styles]
@@ -279,7 +284,9 @@ def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
     excess, stderr = data.force_ratio.values - 1.0, np.nan_to_num(data.force_ratio_stderr.values)
     shown = excess >= _LEAST_EXCESS
     if shown.any():
-        axes.set_xlim(excess[shown].min() / 1.6, (excess + stderr)[shown].max() * 1.3)
+        low, high = excess[shown].min() / 1.6, (excess + stderr)[shown].max() * 1.3
+        axes.set_xlim(low, high)
+        number_log_axis(axes.xaxis, low, high)
     return shown
 
 
