@@ -82,14 +82,15 @@ figure, axis = plt.subplots(figsize=(5.5, 3.6), layout="constrained")
 difference = 100 * (np.array(pressure[:-1]) / pressure[-1] - 1)
 bars = 100 * np.hypot(error[:-1], error[-1]) / pressure[-1]
 milliseconds = 1e3 * np.array(seconds[:-1])
-axis.errorbar(milliseconds, difference, bars, fmt="ko", capsize=3, label="pressure, against the shortest step")
+axis.errorbar(milliseconds, difference, bars, fmt="ko", label="pressure, against the shortest step")
 axis.plot(milliseconds, [-100 * x for x in bound[:-1]], "k:", label="bound")
 axis.plot(milliseconds, [100 * x for x in bound[:-1]], "k:")
 for x, y, dt in zip(milliseconds, difference, timesteps, strict=False):
-    axis.annotate(f"dt = {dt:g}", (x, y), xytext=(6, 6), textcoords="offset points", fontsize="small")
+    place = {"xytext": (5, 0), "textcoords": "offset points", "rotation": 90, "va": "center"}
+    axis.annotate(f"dt = {dt:g}", (x, y), **place, fontsize="small")
 axis.axhline(0, color="0.6", lw=1)
 axis.margins(x=0.15)
 axis.set_xlabel("time for a unit of strain (ms)")
 axis.set_ylabel("error of the pressure (%)")
-axis.legend(frameon=False)
+figure.legend(loc="outside upper center", ncols=2, frameon=False)
 plt.show()

@@ -34,7 +34,8 @@ RUN = ("../README.md", *(page for page in PAGES if python_of(page)))
 
 def test_navigation_names_every_page_once() -> None:
     named = re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
-    assert sorted(named) == sorted([*PAGES, "contributing.md", "changelog.md"])
+    notebooks = [f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")]
+    assert sorted(named) == sorted([*PAGES, *notebooks, "contributing.md", "changelog.md"])
 
 
 def test_every_public_name_is_in_the_reference() -> None:

@@ -1,4 +1,4 @@
-"""What the site shows from outside ``docs``: charts, a drawing of the folders, contributing and the change log.
+"""What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, contributing, the changes.
 
 Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
 ``charts/architecture.svg``, is made from the imports of the code at every build. ``charts/paper.html``, the paper's map
@@ -12,6 +12,7 @@ import runpy
 from pathlib import Path
 
 import architecture
+import notebooks
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
@@ -31,6 +32,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, f"charts/{chart.name}", abs_src_path=str(chart)))
     files.append(File.generated(config, "charts/architecture.svg", content=architecture.picture()))
     files.append(File.generated(config, "charts/paper.html", content=explore(read_dataset(CHARTS / "paper.nc")).text))
+    for name in notebooks.NAMES:
+        markdown, beside = notebooks.shown(name)
+        files.append(File.generated(config, f"notebooks/{name}.md", content=markdown))
+        for file, content in beside.items():
+            files.append(File.generated(config, f"notebooks/{file}", content=content))
     for page, source in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     return files

@@ -1,0 +1,68 @@
+"""Notebooks as pages: their text and code, and what they showed where they were run.
+
+The notebooks of the project have no outputs. The environment variable ``JAXGRAN_NOTEBOOKS`` names a folder with
+notebooks that were run (``pytest --nbmake --overwrite`` on a copy); their outputs are shown then.
+"""
+
+import base64
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).parents[2]
+RUN = "JAXGRAN_NOTEBOOKS"  # environment variable: folder of notebooks that were run
+LONGEST = 50_000  # characters of HTML that stand in the page itself; longer HTML is a file in a frame
+BARE = "*The site was built without running this notebook, so it has no outputs.*"
+NAMES = [path.stem for path in sorted((ROOT / "notebooks").glob("*.ipynb"))]
+
+
+class Shown(NamedTuple):
+    """The Markdown of a notebook, and the files beside it by their names."""
+
+    markdown: str
+    files: dict[str, bytes]
+
+
+def shown(name: str) -> Shown:
+    """The page of a notebook of this project."""
+    folder = Path(os.environ.get(RUN) or ROOT / "notebooks")
+    return page_of(json.loads((folder / f"{name}.ipynb").read_text(encoding="utf-8")), name)
+
+
+def page_of(notebook: dict[str, Any], name: str) -> Shown:
+    """A notebook in the form of its JSON as a page; warnings are left out, as they name folders of a machine."""
+    parts, files, run = [], {}, False
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            run = True
+            parts.append(_output(output, f"{name}_{len(files)}", files))
+    if not run:
+        parts.insert(1, BARE)
+    return Shown("\n\n".join(part for part in parts if part), files)
+
+
+def _output(output: dict[str, Any], name: str, files: dict[str, bytes]) -> str:
+    """The Markdown of one output of a cell; a picture or a long text becomes a file."""
+    if output["output_type"] == "stream":
+        return "" if output["name"] == "stderr" else _text(output["text"])
+    data = output.get("data", {})
+    if "image/png" in data:
+        files[f"{name}.png"] = base64.b64decode("".join(data["image/png"]))
+        return f"![What the cell above draws]({name}.png)"
+    if "text/html" in data:
+        html = "".join(data["text/html"])
+        if len(html) <= LONGEST:
+            return f'<div class="output">{html}</div>'
+        files[f"{name}.html"] = html.encode()
+        return f'<iframe class="page" title="What the cell above shows" src="../{name}.html"></iframe>'
+    return _text(data.get("text/plain", ""))
+
+
+def _text(lines: str | list[str]) -> str:
+    return f"```text\n{''.join(lines).rstrip()}\n```"
