@@ -67,16 +67,22 @@ def chart(output: Output) -> None:
     rows = measured(collection(output.quick), output.quick)
     print(table(rows))
     head = {"cap": QUICK_CAP if output.quick else CAP, "relaxation": RELAXATION}
-    output.write_rows("methods", head, "summary", summary(rows))
-    flows = [group for group in dict.fromkeys(row.group for row in rows) if group not in _CONSTRUCTED]
+    lines = summary(rows)
+    output.write_rows("methods", head, "summary", lines)
+    write_charts(output, lines)
+    output.write_picture(draw_profile(rows), "methods", "_profile.png")
+
+
+def write_charts(output: Output, lines: list[dict]) -> None:
+    """Write the charts of the lines of ``methods.json``."""
+    flows = [group for group in dict.fromkeys(line["group"] for line in lines) if group not in _CONSTRUCTED]
     solvable = [group for group in _CONSTRUCTED if group != INFEASIBLE]
     for name, groups, precision in (
         ("", flows, "float64"),
         ("_constructed", solvable, "float64"),
         ("_float32", flows, "float32"),
     ):
-        output.write_picture(draw(rows, groups, precision), "methods", f"{name}.png", dpi=110)
-    output.write_picture(draw_profile(rows), "methods", "_profile.png")
+        output.write_picture(draw(lines, groups, precision), "methods", f"{name}.png")
 
 
 def measured(networks: dict[str, list[Network]], quick: bool) -> list[Row]:
@@ -272,51 +278,50 @@ def table(rows: list[Row], tolerances: tuple[float, float] = (1e-4, 1e-6)) -> st
 
 _COLUMNS = (
     ("residual", "products", "relative residual", "products with W"),
-    ("residual", "seconds", "relative residual", "time of a solve (ms)"),
     ("stress_error", "seconds", "relative error of the stress moment", "time of a solve (ms)"),
-    ("force_ratio_error", "seconds", "relative error of the force ratio", "time of a solve (ms)"),
 )
 
 
-def draw(rows: list[Row], groups: list[str], precision: str) -> Figure:
-    """A row of panels for each group: cost against accuracy, by method.
+def draw(lines: list[dict], groups: list[str], precision: str) -> Figure:
+    """A row of panels for each group: cost against accuracy, by method, from the lines of ``summary``.
 
     Markers are medians over the networks, thin lines reach up to the worst. Above the grey line: failures, a marker
     where the median solve fails, a dash where only some do.
     """
-    figure = Figure(figsize=(15, 2.7 * len(groups) + 0.9), layout="constrained")
+    figure = Figure(figsize=(7.5, 2.4 * len(groups) + 1.2), layout="constrained")
     panels = figure.subplots(len(groups), len(_COLUMNS), squeeze=False)
-    members = _grouped([row for row in rows if row.precision == precision])
     for group, line in zip(groups, panels, strict=True):
+        solves = [one for one in lines if (one["group"], one["precision"]) == (group, precision)]
         for axes, (accuracy, cost, x_label, y_label) in zip(line, _COLUMNS, strict=True):
-            _draw_panel(axes, members, group, precision, accuracy, cost)
+            _draw_panel(axes, solves, accuracy, cost)
             axes.set_ylabel(y_label)
             if group == groups[-1]:
                 axes.set_xlabel(x_label)
         line[0].set_title(group, loc="left", fontsize="medium", fontweight="bold")
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(METHODS))
+    figure.legend(handles, labels, loc="outside upper center", ncols=3)
     figure.supxlabel(
-        f"{precision}; markers: median over the networks of a group; thin lines: up to the worst; "
+        f"{precision}; markers: median over the networks of a group; thin lines: up to the worst;\n"
         "above the grey line: failures (a dash where only some networks of the group fail)",
         fontsize="medium",
     )
     return figure
 
 
-def _draw_panel(axes: Axes, members: dict, group: str, precision: str, accuracy: str, cost: str) -> None:
+def _draw_panel(axes: Axes, solves: list[dict], accuracy: str, cost: str) -> None:
     unit = 1e3 if cost == "seconds" else 1.0
-    solves = [row for key, rows in members.items() if key[0] == group for row in rows]
-    failed = 4 * unit * max(getattr(row, cost) for row in solves)
+    failed = 4 * unit * max(value for one in solves for value in one[cost].values() if value is not None)
     axes.set(xscale="log", yscale="log")
     axes.axhline(failed / 2, color="0.6", lw=0.8)
     floor = 1e-16
     for place, (method, (colour, marker, style)) in enumerate(METHODS.items()):
-        lines = [(key[3], rows) for key, rows in members.items() if key[0] == group and key[2] == method]
-        tolerance = np.array([tolerance for tolerance, _ in lines])
-        medians = np.array([unit * _cost(rows, cost) for _, rows in lines])
-        worst = np.array([unit * _cost(rows, cost, max) for _, rows in lines])
-        reached = np.array([np.median([getattr(row, accuracy) for row in rows]) for _, rows in lines])
+        lines = [one for one in solves if one["method"] == method]
+        tolerance = np.array([one["tolerance"] for one in lines])
+        medians, worst = (
+            np.array([np.inf if one[cost][which] is None else unit * one[cost][which] for one in lines])
+            for which in ("median", "worst")
+        )
+        reached = np.array([one[accuracy]["median"] for one in lines], float)
         reached = np.where(np.isfinite(medians) | (accuracy != "residual"), np.maximum(reached, floor), tolerance)
         # Diverged impulses may have any error: they are drawn at the edge of the panel.
         reached = np.clip(np.nan_to_num(reached, nan=10.0), floor, 10.0)

@@ -49,9 +49,9 @@ def collection(quick: bool) -> dict[str, list[Network]]:
     """All networks by group; the quick collection has fewer of them and smaller flows."""
     grains, count = (64, 2) if quick else (256, 6)
     seeds = range(2 if quick else 4)
-    flows = {f"flow φ {nu:g}, α {alpha:g}": flow_networks(nu, alpha, grains, count) for nu, alpha in FLOWS}
+    flows = {f"flow ν {nu:g}, α {alpha:g}": flow_networks(nu, alpha, grains, count) for nu, alpha in FLOWS}
     return flows | {
-        "static packing φ 0.83": [static_packing(grains, seed) for seed in seeds],
+        "static packing ν 0.83": [static_packing(grains, seed) for seed in seeds],
         "chains": [chain(discs) for discs in CHAINS],
         "size ratio 10": [size_ratio(big, seed) for seed in seeds for big in (1, 2, 3)],
         "mass ratio 10⁴": [mass_ratio(side, seed) for seed in seeds for side in (4, 8)],

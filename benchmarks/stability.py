@@ -205,12 +205,12 @@ def draw_default(cells: list[dict]) -> Figure:
     """The default, with the pressure over that of the finest step in every cell, and what a map accepts."""
     cells = [one for one in cells if one["variant"] == "default"]
     alphas = sorted({one["alpha"] for one in cells})
-    figure = Figure(figsize=(1.6 + 4.4 * len(alphas), 5.6), layout="constrained")
-    for axes, alpha in zip(np.atleast_1d(figure.subplots(1, len(alphas), sharey=True)), alphas, strict=True):
+    figure = Figure(figsize=(6.4, 0.9 + 4.4 * len(alphas)), layout="constrained")
+    for axes, alpha in zip(np.atleast_1d(figure.subplots(len(alphas), 1, sharex=True)), alphas, strict=True):
         panel(axes, [one for one in cells if one["alpha"] == alpha], True)
         axes.set_title(f"α = {alpha:g}")
-        axes.set_xlabel("packing fraction ν")
-    figure.axes[0].set_ylabel(r"$\mathrm{d}t\,\sqrt{T}\,/\,\sigma$")
+        axes.set_ylabel(r"$\mathrm{d}t\,\sqrt{T}\,/\,\sigma$")
+    figure.axes[-1].set_xlabel("packing fraction ν")
     legend(
         figure,
         cells,
@@ -228,12 +228,12 @@ def draw_variants(cells: list[dict]) -> Figure:
     shared = set.intersection(*filter(None, places))
     cells = [one for one in cells if (one["nu"], one["crossing"]) in shared]
     alphas, names = sorted({one["alpha"] for one in cells}), list(dict.fromkeys(one["variant"] for one in cells))
-    figure = Figure(figsize=(1.4 + 3.6 * len(alphas), 0.9 + 2.6 * len(names)), layout="constrained")
+    figure = Figure(figsize=(0.8 + 2.2 * len(alphas), 0.9 + 1.7 * len(names)), layout="constrained")
     grid = figure.subplots(len(names), len(alphas), sharex=True, sharey=True, squeeze=False)
     for row, name in zip(grid, names, strict=True):
         for axes, alpha in zip(row, alphas, strict=True):
             panel(axes, [one for one in cells if (one["variant"], one["alpha"]) == (name, alpha)], False)
-            axes.set_title(f"{name}, α = {alpha:g}", fontsize="medium")
+            axes.set_title(f"{name}, α = {alpha:g}", fontsize="small")
         row[0].set_ylabel(r"$\mathrm{d}t\,\sqrt{T}\,/\,\sigma$")
     for axes in grid[-1]:
         axes.set_xlabel("packing fraction ν")
@@ -255,7 +255,7 @@ def panel(axes: Axes, cells: list[dict], detailed: bool) -> None:
         if detailed and np.isfinite(one["pressure_ratio"]):
             ratio = one["pressure_ratio"]
             words = f"{ratio:.2f}" if ratio < 10 else ">10"
-            axes.text(x, y - 0.2, words, ha="center", va="center", color=ink, fontsize=6)
+            axes.text(x, y - 0.2, words, ha="center", va="center", color=ink, fontsize=7)
     if detailed:
         tops = [
             max([crossings.index(one["crossing"]) + 1 for one in cells if one["nu"] == nu and one["accepted"]] or [0])

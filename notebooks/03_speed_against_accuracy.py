@@ -83,10 +83,10 @@ difference = 100 * (np.array(pressure[:-1]) / pressure[-1] - 1)
 bars = 100 * np.hypot(error[:-1], error[-1]) / pressure[-1]
 milliseconds = 1e3 * np.array(seconds[:-1])
 axis.errorbar(milliseconds, difference, bars, fmt="ko", label="pressure, against the shortest step")
-axis.plot(milliseconds, [-100 * x for x in bound[:-1]], "k:", label="bound")
-axis.plot(milliseconds, [100 * x for x in bound[:-1]], "k:")
+axis.plot(milliseconds, [-100 * x for x in bound[:-1]], "k_", ms=16, label="bound")
+axis.plot(milliseconds, [100 * x for x in bound[:-1]], "k_", ms=16)
 for x, y, dt in zip(milliseconds, difference, timesteps, strict=False):
-    place = {"xytext": (5, 0), "textcoords": "offset points", "rotation": 90, "va": "center"}
+    place = {"xytext": (10, 0), "textcoords": "offset points", "rotation": 90, "va": "center"}
     axis.annotate(f"dt = {dt:g}", (x, y), **place, fontsize="small")
 axis.axhline(0, color="0.6", lw=1)
 axis.margins(x=0.15)

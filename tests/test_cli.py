@@ -575,7 +575,7 @@ def test_fit_of_a_map_without_such_a_flow_prints_no_table(known_map: Path, known
 # Help, completion, colours
 
 
-HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (_, _, shown) in app.COMMANDS.items()}}
+HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (*_, shown) in app.COMMANDS.items()}}
 
 
 @pytest.mark.parametrize("command", HELPS)

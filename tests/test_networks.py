@@ -144,7 +144,7 @@ def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_
 
 @pytest.mark.kernels
 def test_gauss_seidel_converges_to_the_exact_velocities(networks, exact_of):
-    for group in ("flow φ 0.8, α 0", "flow φ 0.82, α 0.9", "flow φ 0.6, α 0.5", SIZE_RATIO, HEXAGONAL):
+    for group in ("flow ν 0.8, α 0", "flow ν 0.82, α 0.9", "flow ν 0.6, α 0.5", SIZE_RATIO, HEXAGONAL):
         for network in networks[group]:
             solution = gauss_seidel(network.contacts, network.grains, 1e-10, 20_000)
             reference = exact_of(network)

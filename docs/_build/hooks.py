@@ -8,6 +8,7 @@ the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{BEN
 """
 
 import ast
+import re
 import runpy
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from jaxgran.page.explore import explore
 
 ROOT = Path(__file__).parents[2]
 CHARTS = ROOT / "benchmarks" / "results"
+CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.png)"[^>]*>)')
 PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
 
 
@@ -52,10 +54,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Stop where a table of a docstring was not understood."""
+    """Link charts to their full size; stop where a table of a docstring was not understood."""
     if "====" in html:
         raise PluginError(f"{page.file.src_uri} shows the borders of a table as they are.")
-    return html
+    return CHART.sub(r'<a href="\2" title="in full size">\1</a>', html)
 
 
 def observables() -> str:

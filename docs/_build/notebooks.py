@@ -55,8 +55,8 @@ def _output(output: dict[str, Any], name: str, files: dict[str, bytes]) -> str:
     if "image/png" in data:
         files[f"{name}.png"] = base64.b64decode("".join(data["image/png"]))
         return f"![What the cell above draws]({name}.png)"
-    if "text/html" in data:
-        html = "".join(data["text/html"])
+    html = "".join(data.get("text/html", ""))
+    if html and "xr-text-repr-fallback" not in html:  # xarray's needs a style sheet that the site overrides
         if len(html) <= LONGEST:
             return f'<div class="output">{html}</div>'
         files[f"{name}.html"] = html.encode()

@@ -5,6 +5,7 @@ A quantity is interpolated between the grid points of a map. A cell is hatched i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -76,7 +77,7 @@ def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured:
     axes.plot(x[measured], y[measured], **_DOT, zorder=4)
     axes.plot(x[~measured], y[~measured], **_CROSS, zorder=4)
     bad = suspect(data)
-    mark_bad(axes, x[bad], y[bad])
+    mark_bad(axes, x[bad], y[bad], clip_on=False)
 
 
 def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, entries: Iterable[Artist] = ()) -> None:
@@ -87,7 +88,7 @@ def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, ent
     figure.legend(
         handles=handles,
         loc="outside upper center",
-        ncols=max(4, len(handles)),
+        ncols=len(handles) if len(handles) <= figure.get_figwidth() else math.ceil(len(handles) / 2),
         fontsize=SMALL_SIZE,
         frameon=False,
         handlelength=1.2,

@@ -130,10 +130,10 @@ def draw_points(
     mark_bad(axes, x[bad], y[bad])
 
 
-def mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
-    """Put a ring around points whose status is not `ok`."""
+def mark_bad(axes: Axes, x: np.ndarray, y: np.ndarray, clip_on: bool = True) -> None:
+    """Put a ring around points whose status is not `ok`; unless it is clipped, it may reach over the frame."""
     if len(x):
-        axes.plot(x, y, **_RING, zorder=5, clip_on=False)
+        axes.plot(x, y, **_RING, zorder=5, clip_on=clip_on)
 
 
 def curve_key(style: dict[str, Any], label: str) -> Line2D:

@@ -7,7 +7,6 @@ axes are added. Noise of the points is part of what is measured so.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable
 
 import numpy as np
@@ -55,9 +54,8 @@ def left_out_note(data: xr.Dataset, fields: Iterable[np.ndarray], of: str, count
     known = known[np.isfinite(known)]
     if len(known) < _FEWEST:
         return "Linear between the points, too few to tell with what error"
-    median, large = (f"{100 * value:.2g} %" for value in np.quantile(known, (0.5, 0.9)))
-    note = f"Linear between points: one left out is found from its neighbours to {median} of {of} (in 9 of 10, {large})"
-    return textwrap.fill(note, width=75)
+    median, large = (f"{float(f'{100 * value:.2g}'):g} %" for value in np.quantile(known, (0.5, 0.9)))
+    return f"Linear between points: left out, half are found to {median} of {of}, 9 of 10 to {large}"
 
 
 def _axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:

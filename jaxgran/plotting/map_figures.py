@@ -71,7 +71,9 @@ def save_figures(
         "errors": (is_plane(data) and has_errors(data), dominating_errors),
         "rheology": (has_friction_law(data), friction_figure),
     }
-    drawn = {stem.with_name(f"{stem.name}_{name}.{format}"): draw for name, (possible, draw) in figures.items() if possible}
+    drawn = {
+        stem.with_name(f"{stem.name}_{name}.{format}"): draw for name, (possible, draw) in figures.items() if possible
+    }
     for path in drawn:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")

@@ -21,7 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
 from jaxgran.maps.schema import RATIO, finest, require_map, shear_stress_ratio, what_lacks
 from jaxgran.model.checks import InputError
@@ -99,6 +99,7 @@ def ratio_curves(data: xr.Dataset) -> Figure:
             for value, style in styles
         ]
         axes.set_xlim(padded(data.packing_fraction.values))
+        axes.xaxis.set_major_locator(MaxNLocator(8, steps=(1, 2, 5, 10)))  # two digits, as more would touch
         axes.set_xlabel(NU_LABEL, fontsize=LABEL_SIZE)
         axes.set_ylabel(label, fontsize=LABEL_SIZE)
         axes.tick_params(labelleft=True)
@@ -148,7 +149,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     bands += [Patch(**_BETWEEN, label="± interpolation")] * between
     add_plane_legend(figure, data, measured, bands)
     absent = [level for level in EXCESS_LEVELS if level not in lines]
-    found = left_out_note(data, [contour_variable(excess)], "its excess", excess > _LEAST_CONTOURED)
+    found = left_out_note(data, [contour_variable(excess)], "the excess", excess > _LEAST_CONTOURED)
     notes = [_contour_note(absent), found, status_note(data), missing_note(measured, " (hatched)")]
     finish(figure, data, measured, notes)
     fix_layout(figure)
