@@ -640,13 +640,13 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
     assert files(tmp_path) == before
 
 
-@pytest.mark.parametrize("folder", ["file.txt", "none", "n" * 300])
+@pytest.mark.parametrize("folder", ["file.txt", "file.txt/new", "n" * 300])
 def test_figures_need_a_folder(folder: str, tmp_path: Path) -> None:
     ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
     (tmp_path / "file.txt").write_text("no folder")
     outcome = jaxgran(tmp_path, "plot", "map.nc", f"--output={folder}")
     assert_one_sentence(outcome)
-    assert "a folder that exists and can be written to" in outcome.err
+    assert "a folder that can be made and written to" in outcome.err
     assert files(tmp_path) == {"map.nc", "file.txt"}
 
 

@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import redirect_stdout
@@ -50,6 +52,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting import map_figures, movie
+from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.memory import LEAST_SAMPLE
 
@@ -337,9 +340,23 @@ def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatc
     assert (tmp_path / "small_curves.png").read_bytes() == (folder / "small_curves.png").read_bytes()
 
 
-def test_plot_into_a_folder_that_is_not_there_is_one_sentence(small_map) -> None:
+def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
+    small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder, _ = small_map
-    assert_one_sentence(jaxgran(folder, "plot", "small.nc", "--output", "none"))
+    for draw in ("ratio_contours", "theory_errors", "theory_losses", "cluster_shares", "dominating_errors"):
+        monkeypatch.setattr(map_figures, draw, ratio_curves)
+    leave_out_layout(monkeypatch)
+    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "pdf", "--no-caption")
+    assert jaxgran(folder, *words).status == 0
+    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".pdf") for name in PICTURES}
+    assert files(folder) >= PICTURES
+
+
+@pytest.mark.parametrize("words", [("--dpi", "20"), ("--dpi", "3000"), ("--format", "gif")])
+def test_resolution_and_format_of_plot_are_judged_before_a_folder_is_made(small_map, tmp_path: Path, words) -> None:
+    assert_one_sentence(jaxgran(small_map[0], "plot", "small.nc", "--output", str(tmp_path / "new"), *words))
+    assert not files(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -603,7 +620,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
             for seed in range(settings.seeds):
                 yield (point, seed), random_replica(rng, settings)
 
-    def sketched(_, path: Path) -> Path:
+    def sketched(_, path: Path, *__) -> Path:
         path.touch()
         return path
 
@@ -612,12 +629,21 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(sweep, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
     monkeypatch.setattr("jaxgran.maps.settings._temperature", lambda flows: np.full(np.shape(flows.restitution), 0.1))
-    (tmp_path / "figures").mkdir()
-    plane, again = list(map_module.MAP_EXAMPLES.values())[1], list(map_module.PLOT_EXAMPLES.values())[1]
-    for example in (plane, again):
+    plane, (_, *again) = list(map_module.MAP_EXAMPLES.values())[1], map_module.PLOT_EXAMPLES.values()
+    for example in (plane, *again):
         assert jaxgran(tmp_path, *shlex.split(example)[1:]).status == 0, example
     assert {"ratio.nc", "ratio_contours.png", "figures"} <= files(tmp_path)
-    assert "ratio_curves.png" in files(tmp_path / "figures")
+    assert {"ratio_curves.png", "ratio_curves.pdf"} <= files(tmp_path / "figures")
+
+
+def test_help_is_the_same_where_docstrings_are_left_out() -> None:
+    show = "from jaxgran.cli.app import app; import typer.main; group = typer.main.get_command(app)"
+    show += "; print([group.help, *(one.help for one in group.commands.values())])"
+    outcomes = [
+        subprocess.run([sys.executable, *option, "-c", show], capture_output=True, text=True, check=True).stdout
+        for option in ([], ["-OO"])
+    ]
+    assert outcomes[0] == outcomes[1] and "None" not in outcomes[0]
 
 
 def test_no_command_at_all_is_the_help(tmp_path: Path) -> None:

@@ -26,6 +26,9 @@ FEW = ["force_ratio", "force_ratio_stderr", "status"]
 RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}
 
 
+POINTS_ALONE = 'data.drop_dims(["seed", "axis_a", "axis_b", "snapshot_grain", "snapshot_pair"], errors="ignore")'
+
+
 @pytest.fixture(scope="module")
 def settings() -> MapSettings:
     return MapSettings(ALPHAS, NUS, grains=64, seeds=SEEDS, timestep=5e-4, strain=2.0, activation="touching")
@@ -356,3 +359,14 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
         assert float(point.pressure_error_size / abs(point.pressure)) == pytest.approx(expected)
     write_dataset(found[FEW], tmp_path / "map.nc")
     assert MapSettings(**choices_of(read_dataset(tmp_path / "map.nc"))) == chosen
+
+
+def test_table_of_a_map_has_a_row_for_each_point(data: xr.Dataset) -> None:
+    tutorial = Path(__file__).parents[1] / "docs" / "tutorial.md"
+    assert f"{POINTS_ALONE}.to_dataframe()" in tutorial.read_text(encoding="utf-8")
+    table = eval(POINTS_ALONE, {"data": data}).to_dataframe()
+    assert len(table) == len(ALPHAS) * len(NUS)
+    assert {name for name in OBSERVABLES if name not in TENSORS} <= set(table.columns)
+    np.testing.assert_array_equal(
+        table.loc[0.6, 0.9].pressure, data.pressure.sel(packing_fraction=0.6, restitution=0.9)
+    )

@@ -11,9 +11,18 @@ from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.text import Text
 
-from jaxgran.plotting.map_figures import save_figures
+from jaxgran.maps.results import read_dataset
+from jaxgran.plotting.errors import dominating_errors
+from jaxgran.plotting.friction import friction_figure
+from jaxgran.plotting.losses import theory_losses
+from jaxgran.plotting.map_figures import DRAWN, save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
+from jaxgran.plotting.theory import cluster_shares, theory_errors
+
+PAPER = Path(__file__).parents[1] / "benchmarks" / "results" / "paper.nc"
 
 pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
 
@@ -113,6 +122,27 @@ def test_levels_not_reached_are_named() -> None:
     figure = ratio_contours(data)
     assert set(lines_of_contours(figure)) == {0.05, 0.10}
     assert "not reached: 0.25, 0.50, 1.00" in caption(figure)
+
+
+def test_contours_have_a_band_of_the_error_of_interpolation_between_the_points() -> None:
+    data = ratio_dataset(alphas=3, nus=3)
+    assert "± interpolation" in legend_texts(ratio_contours(data))
+    assert "of the excess" in caption(ratio_contours(data)) and "found to" in caption(ratio_contours(data))
+    assert "± interpolation" not in legend_texts(ratio_contours(ratio_dataset(alphas=2, nus=2)))
+
+
+def test_error_bars_have_no_caps_over_the_marks() -> None:
+    containers = ratio_curves(ratio_dataset()).axes[0].containers
+    assert not any(container.lines[1] for container in containers)
+
+
+def test_labels_of_contours_lie_within_the_frame(page) -> None:
+    for data in (ratio_dataset(2, 2), ratio_dataset(3, 3)):
+        figure = ratio_contours(data.assign(force_ratio=data.force_ratio + 0.5 * (data.force_ratio - 1)))
+        frame = figure.axes[0].bbox.padded(1)
+        for text in figure.axes[0].texts:
+            box = text.get_window_extent()
+            assert frame.contains(*box.min) and frame.contains(*box.max)
 
 
 def test_error_bars_have_the_length_of_the_standard_error() -> None:
@@ -333,6 +363,41 @@ def test_files_are_written_whole(page, tmp_path: Path) -> None:
     assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
     assert sorted(tmp_path.iterdir()) == sorted(written)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
+
+
+@pytest.mark.parametrize(("format", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes, tmp_path: Path) -> None:
+    files = [save_figures(ratio_dataset(2, 2), tmp_path / name, format, dpi=50)[1] for name in ("first", "second")]
+    assert [path.name for path in files] == [f"{name}_contours.{format}" for name in ("first", "second")]
+    first, second = (path.read_bytes() for path in files)
+    assert first.startswith(start) and first == second
+
+
+def test_a_picture_without_caption_has_the_same_axes_and_is_lower(page, tmp_path: Path) -> None:
+    sizes = {}
+    for caption_, dpi in ((True, 100), (False, 100), (True, 50)):
+        path, *_ = save_figures(ratio_dataset(alphas=1), tmp_path / "map", dpi=dpi, caption=caption_)
+        sizes[caption_, dpi] = imread(path).shape[:2]
+    assert sizes[True, 100] == tuple(2 * np.array(sizes[True, 50]))
+    assert sizes[False, 100][1] == sizes[True, 100][1]
+    assert 10 < sizes[True, 100][0] - sizes[False, 100][0] < 40
+
+
+@pytest.mark.parametrize("choice", [{"format": "gif"}, {"format": None}, {"dpi": 49}, {"dpi": 1e9}, {"dpi": "many"}])
+def test_other_formats_and_resolutions_are_refused_in_a_sentence(choice: dict, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        save_figures(ratio_dataset(), tmp_path / "map", **choice)
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_show_all_that_is_read_for_them(tmp_path: Path) -> None:
+    data = read_dataset(PAPER)
+    some, noted = read_dataset(PAPER, only=DRAWN), []
+    assert len(some.variables) < len(data.variables) / 2
+    for draw in (theory_errors, theory_losses, cluster_shares, dominating_errors, friction_figure):
+        figures = [draw(one) for one in (data, some)]
+        noted.append([[text.get_text() for text in figure.findobj(Text)] for figure in figures])
+    assert all(first == second for first, second in noted)
 
 
 def test_line_of_points_writes_only_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,6 +104,32 @@ def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.Monke
     assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
 
 
+def test_pictures_of_another_format_stay_if_they_show_the_same(finished: bytes, tmp_path: Path) -> None:
+    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc", "--format", "svg").status == 0
+    (tmp_path / "jaxgran_map_timestep.pdf").touch()  # of a map with several time steps
+    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc", "--format", "pdf").status == 0
+    shown = {f"jaxgran_map_{name}.{ending}" for name in ("curves", "clusters") for ending in ("png", "svg", "pdf")}
+    assert files(tmp_path) == {"jaxgran_map.nc", *shown}
+    assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
+    assert files(tmp_path) == {"jaxgran_map.nc", "jaxgran_map_curves.png", "jaxgran_map_clusters.png"}
+
+
+def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_path: Path) -> None:
+    page = tmp_path / "jaxgran_map.html"
+    assert jaxgran(tmp_path, "explore", "jaxgran_map.nc").status == 0
+    assert jaxgran(tmp_path, "explore", "jaxgran_map.nc").status == 0
+    first = page.read_bytes()
+    assert jaxgran(tmp_path, *MAP, "--grains", "64", "--output", "other.nc").status == 0
+    for content in (first, b"notes", b""):
+        page.write_bytes(content)
+        outcome = jaxgran(tmp_path, "explore", "other.nc", "--output", page.name)
+        assert_one_sentence(outcome)
+        assert "--output must be another file, or --overwrite be given: 'jaxgran_map.html'" in outcome.err
+        assert page.read_bytes() == content
+    assert jaxgran(tmp_path, "explore", "other.nc", "--output", page.name, "--overwrite").status == 0
+    assert page.read_bytes() not in (first, b"")
+
+
 RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--grains", "32", "--output", "flow.nc")
 
 

@@ -31,7 +31,6 @@ MAP_EXAMPLES = {
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
     "Until the errors are below 10 %, continued after an interruption": "jaxgran map --error 0.1 --resume",
 }
-NOT_DRAWN = ("_by_seed", "_correlation_strain")  # endings of variables that no figure shows; there are many
 PLOT_EXAMPLES = {
     "The figures of a map, in its folder": "jaxgran plot jaxgran_map.nc",
     "In another folder": "jaxgran plot ratio.nc --output figures",
@@ -162,9 +161,10 @@ def plot_command(
 ) -> None:
     from jaxgran.maps.output import remove_pictures
     from jaxgran.maps.results import read_dataset
-    from jaxgran.plotting.map_figures import save_figures
+    from jaxgran.plotting.map_figures import DRAWN, require_file, save_figures
 
-    data = read_dataset(file, without=NOT_DRAWN)
+    require_file(format, dpi)
+    data = read_dataset(file, only=DRAWN)
     folder = file.parent if output is None else output
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

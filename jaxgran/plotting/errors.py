@@ -16,6 +16,9 @@ _PANELS = {
     "pressure": r"pressure $p$",
     "granular_temperature": r"granular temperature $T$",
 }
+BUDGET = [*_PANELS, *(f"{name}_{ending}" for name in _PANELS for ending, _ in ERROR_PARTS.values())]
+"""Averages that are drawn, and the parts of their errors."""
+
 _PARTS = {  # part: its name and mark
     "sampling": ("sampling", "o"),
     "timestep": ("time step", "s"),
@@ -46,8 +49,7 @@ def dominating_errors(data: xr.Dataset) -> Figure:
     require_map(data, *RATIO)
     if not has_errors(data):
         raise InputError("this map has no error budget: it was made by an older version.")
-    budget = [f"{name}_{ending}" for name in _PANELS for ending, _ in ERROR_PARTS.values()]
-    data = finest(ordered(data, *_PANELS, *budget))
+    data = finest(ordered(data, *BUDGET))
     alpha, nu = np.meshgrid(data.restitution.values, data.packing_fraction.values)
     figure = empty_figure(width=3.4 * len(_PANELS) + 0.6, height=4.6)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)

@@ -1,4 +1,4 @@
-"""Numbers at a logarithmic axis: a few at any range, a part of a decade or many, so that none overprints another."""
+"""Numbers at a logarithmic axis: two to seven at any range, a part of a decade or many, so that none overprints another."""
 
 import math
 
@@ -9,7 +9,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, LogLocator, MaxNLoca
 from jaxgran.plotting.drawing import scientific
 
 _IN_A_DECADE = ((1, 1.5, 2, 3, 4, 6, 8), (1, 2, 5), (1, 3), (1,))  # fine to coarse
-_LEAST = 3  # numbers at an axis
+_LEAST = 2  # numbers at an axis
 _MOST, _MOST_LONG = 7, 5  # numbers at an axis; 3 × 10⁻⁴ takes more room than 0.3 or 10⁻⁴
 _PLAIN = 1e-3, 1e4  # a range within these limits is written without powers of ten
 _ROUNDING = 1e-9  # relative, of the ends of a range
@@ -37,6 +37,6 @@ def log_numbers(low: float, high: float, most: int) -> np.ndarray:
         if len(numbers) <= most:
             break
     if len(numbers) < _LEAST:
-        steps = MaxNLocator(most - 2).tick_values(low, high)
+        steps = MaxNLocator(most - 1, steps=(1, 2, 4, 5, 10)).tick_values(low, high)
         return steps[(steps >= low) & (steps <= high)]
     return numbers[:: math.ceil(len(numbers) / _MOST)]

@@ -72,8 +72,8 @@ SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
 _STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
-_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
-_SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
+STRESSES_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
+SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
 _LEAST_SHARE = 0.02  # share of clusters above which the error of interpolation is quoted, below the lowest level
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
@@ -87,12 +87,12 @@ _THEORY_NOTE = (
 
 def has_theory(data: xr.Dataset) -> bool:
     """Return whether a map has the variables that :func:`theory_errors` draws."""
-    return not what_lacks(data, *RATIO, *_NEEDED)
+    return not what_lacks(data, *RATIO, *STRESSES_NEEDED)
 
 
 def has_clusters(data: xr.Dataset) -> bool:
     """Return whether a map has the variables that :func:`cluster_shares` draws."""
-    return not what_lacks(data, *RATIO, *_SHARES)
+    return not what_lacks(data, *RATIO, *SHARES)
 
 
 # ---------------------------------------------------------------------------------------------- theory
@@ -145,7 +145,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *_NEEDED)
+    require_map(data, *RATIO, *STRESSES_NEEDED)
     require_plane(data)
     data = finest(ordered(data, *_STRESSES, "stress_ratio"))
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
@@ -225,7 +225,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     returns  Figure                          error bars are one standard error, in both directions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *_SHARES)
+    require_map(data, *RATIO, *SHARES)
     data = finest(ordered(data, "cluster_pressure_share", "cluster_shear_share"))
     shares = {"pressure": "cluster_pressure_share", "shear stress": "cluster_shear_share"}
     measured = np.isfinite(data.cluster_pressure_share.values)
