@@ -367,8 +367,8 @@ def test_files_are_written_whole(page, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("format", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes, tmp_path: Path) -> None:
-    files = [save_figures(ratio_dataset(2, 2), tmp_path / name, format, dpi=50)[1] for name in ("first", "second")]
-    assert [path.name for path in files] == [f"{name}_contours.{format}" for name in ("first", "second")]
+    files = [save_figures(ratio_dataset(1, 2), tmp_path / name, format, dpi=50)[0] for name in ("first", "second")]
+    assert [path.name for path in files] == [f"{name}_curves.{format}" for name in ("first", "second")]
     first, second = (path.read_bytes() for path in files)
     assert first.startswith(start) and first == second
 
@@ -390,14 +390,13 @@ def test_other_formats_and_resolutions_are_refused_in_a_sentence(choice: dict, t
     assert not list(tmp_path.iterdir())
 
 
-def test_figures_show_all_that_is_read_for_them(tmp_path: Path) -> None:
-    data = read_dataset(PAPER)
-    some, noted = read_dataset(PAPER, only=DRAWN), []
+def test_what_is_read_for_the_figures_is_all_that_they_show() -> None:
+    data, some = read_dataset(PAPER), read_dataset(PAPER, only=DRAWN)
     assert len(some.variables) < len(data.variables) / 2
+    part = {"packing_fraction": [9, 10, 11], "restitution": [0, 8, 9]}
     for draw in (theory_errors, theory_losses, cluster_shares, dominating_errors, friction_figure):
-        figures = [draw(one) for one in (data, some)]
-        noted.append([[text.get_text() for text in figure.findobj(Text)] for figure in figures])
-    assert all(first == second for first, second in noted)
+        first, second = (draw(one.isel(part)) for one in (data, some))
+        assert [text.get_text() for text in first.findobj(Text)] == [text.get_text() for text in second.findobj(Text)]
 
 
 def test_line_of_points_writes_only_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -170,7 +170,8 @@ def _label_place(
 
 def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the distance from each place to the nearest of the others."""
-    return np.linalg.norm(places[:, None] - others, axis=-1).min(axis=1)
+    squared = sum(np.subtract.outer(places[:, axis], others[:, axis]) ** 2 for axis in (0, 1))
+    return np.sqrt(squared.min(axis=1))
 
 
 # ---------------------------------------------------------------------------------------------- excess

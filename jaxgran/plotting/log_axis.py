@@ -1,4 +1,4 @@
-"""Numbers at a logarithmic axis: two to seven at any range, a part of a decade or many, so that none overprints another."""
+"""Numbers at a logarithmic axis: two to seven, at a part of a decade or at many, so that none overprints another."""
 
 import math
 
