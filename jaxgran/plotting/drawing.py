@@ -211,7 +211,8 @@ def fix_layout(figure: Figure) -> None:
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
-        figure.set_layout_engine("none")
+        with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
+            figure.set_layout_engine(None)  # with "none" Matplotlib would still draw twice, the first time for nothing
 
 
 def scientific(value: float) -> str:
