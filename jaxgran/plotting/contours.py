@@ -136,11 +136,12 @@ def label_contours(
 
 def _move_inside(label: Text, axes: Axes) -> None:
     """Move a label that reaches over the frame into it."""
-    box, frame = label.get_window_extent(), axes.bbox
-    over = np.maximum(0.0, frame.min - box.min) - np.maximum(0.0, box.max - frame.max)
+    (left, low, right, high), frame = label.get_window_extent().extents, axes.bbox.extents
+    over = np.maximum(0.0, frame[:2] - (left, low)) - np.maximum(0.0, (right, high) - frame[2:])
     if over.any():
         place = axes.transData.transform(label.get_position()) + over
-        label.set_position(axes.transData.inverted().transform(place))
+        x, y = axes.transData.inverted().transform(place)
+        label.set_position((float(x), float(y)))
 
 
 def _thinned(path: MplPath) -> np.ndarray:
@@ -170,8 +171,8 @@ def _label_place(
 
 def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the distance from each place to the nearest of the others."""
-    squared = sum(np.subtract.outer(places[:, axis], others[:, axis]) ** 2 for axis in (0, 1))
-    return np.sqrt(squared.min(axis=1))
+    x, y = (np.subtract.outer(places[:, axis], others[:, axis]) for axis in (0, 1))
+    return np.sqrt((x * x + y * y).min(axis=1))
 
 
 # ---------------------------------------------------------------------------------------------- excess

@@ -31,12 +31,10 @@ def log_numbers(low: float, high: float, most: int) -> np.ndarray:
     A series has at most `most` numbers, and one of powers of ten at most seven.
     """
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    for parts in _IN_A_DECADE:
-        numbers = np.array([part * 10.0**decade for decade in decades for part in parts])
-        numbers = numbers[(numbers >= low * (1 - _ROUNDING)) & (numbers <= high * (1 + _ROUNDING))]
-        if len(numbers) <= most:
-            break
+    series = [np.array([part * 10.0**decade for decade in decades for part in parts]) for parts in _IN_A_DECADE]
+    series = [one[(one >= low * (1 - _ROUNDING)) & (one <= high * (1 + _ROUNDING))] for one in series]
+    numbers = next((one for one in series if len(one) <= most), series[-1])
     if len(numbers) < _LEAST:
-        steps = MaxNLocator(most - 1, steps=(1, 2, 4, 5, 10)).tick_values(low, high)
+        steps = np.asarray(MaxNLocator(most - 1, steps=(1, 2, 4, 5, 10)).tick_values(low, high))
         return steps[(steps >= low) & (steps <= high)]
     return numbers[:: math.ceil(len(numbers) / _MOST)]
