@@ -593,7 +593,7 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
-    write_few_variables(monkeypatch, *theory._SHARES)
+    write_few_variables(monkeypatch, *theory.SHARES)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
     for drawing in ("ratio_curves", "cluster_shares"):
         monkeypatch.setattr(map_figures, drawing, lambda _: Figure())

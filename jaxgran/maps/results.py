@@ -63,8 +63,8 @@ def read_dataset(
 def _read_some(path: Path, names: Collection[str]) -> xr.Dataset:
     """Some variables of a file; xarray would look at all of them before it leaves any out."""
     with h5netcdf.File(path, "r") as file:
-        kept = [file.variables[name] for name in names if name in file.variables]
-        variables = {one.name.lstrip("/"): (one.dimensions, one[...], dict(one.attrs)) for one in kept}
+        kept = {name: file.variables[name] for name in sorted(names) if name in file.variables}
+        variables = {name: (one.dimensions, one[...], dict(one.attrs)) for name, one in kept.items()}
         return xr.decode_cf(xr.Dataset(variables, attrs=dict(file.attrs)))
 
 

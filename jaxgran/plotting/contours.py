@@ -136,8 +136,8 @@ def label_contours(
 
 def _move_inside(label: Text, axes: Axes) -> None:
     """Move a label that reaches over the frame into it."""
-    (left, low, right, high), frame = label.get_window_extent().extents, axes.bbox.extents
-    over = np.maximum(0.0, frame[:2] - (left, low)) - np.maximum(0.0, (right, high) - frame[2:])
+    box, frame = (np.reshape(one.extents, (2, 2)) for one in (label.get_window_extent(), axes.bbox))
+    over = np.maximum(0.0, frame[0] - box[0]) - np.maximum(0.0, box[1] - frame[1])
     if over.any():
         place = axes.transData.transform(label.get_position()) + over
         x, y = axes.transData.inverted().transform(place)
