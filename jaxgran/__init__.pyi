@@ -3,6 +3,9 @@
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
 from .caches import enable_cache
+from .contact.problem import ContactNetwork, DelassusProblem
+from .contact.residuals import ContactResiduals, contact_residuals
+from .contact.solve_contacts import ContactSolution, solve_contacts
 from .dynamics.advance import advance
 from .dynamics.plain import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
@@ -37,7 +40,11 @@ from .sampling.steady_state import heated, prepare
 __version__: str
 __all__ = [
     "Closure",
+    "ContactNetwork",
+    "ContactResiduals",
+    "ContactSolution",
     "Cooling",
+    "DelassusProblem",
     "Fields",
     "Grains",
     "InputError",
@@ -53,6 +60,7 @@ __all__ = [
     "advance",
     "averages_against_grains",
     "cluster_shares",
+    "contact_residuals",
     "cooling",
     "count_events",
     "dominating_errors",
@@ -83,6 +91,7 @@ __all__ = [
     "sample",
     "save_figures",
     "snapshot_series",
+    "solve_contacts",
     "theory_errors",
     "theory_losses",
     "write_trajectory",

@@ -23,6 +23,7 @@ STEPS = jnp.int32(20)
 FLOW = flow_of(0.7)
 COOLED = replace(FLOW, shear_rate=0.0)
 KEY = jax.random.key(0)
+PAIR = jg.DelassusProblem(jnp.eye(2), -jnp.ones(2))
 X = 0.6  # a restitution, a packing fraction, a length
 
 
@@ -48,6 +49,8 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "heaviside": lambda x, _: jg.heaviside(x).second_moment,
     "grid": lambda x, _: jg.grid(x, 3),
     "fields_at": lambda x, _: jg.fields_at(seen(), jnp.asarray([[1.0, 1.2]]), jg.gaussian(x)),
+    "solve_contacts": lambda x, _: jg.solve_contacts(PAIR, x).velocities,
+    "contact_residuals": lambda x, _: jg.contact_residuals(PAIR, x * jnp.ones(2)).natural_map,
     "predict": lambda x, _: jg.predict(known_closure(), x, 0.7),
     "restitution_from_stresses": lambda x, _: jg.restitution_from_stresses(known_closure(), 0.7, x, 1.0).restitution,
 }
@@ -67,6 +70,7 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 
 # Classes, and what takes datasets and files.
 WITHOUT_ARRAYS = {
+    *("ContactNetwork", "ContactResiduals", "ContactSolution", "DelassusProblem"),
     *("Closure", "Cooling", "Fields", "Grains", "InputError", "RestitutionFit", "ShearFlow", "Snapshot", "State"),
     *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
     *(

@@ -1,7 +1,7 @@
 """The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an iteration by.
 
-W is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal velocities that
-follow. Three diagonals D stand for it in the ``projected_methods``:
+W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal
+velocities that follow. Three diagonals D stand for it in the ``projected_methods``:
 
 - ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks make it diverge.
 - ``count_bound``: z_i/m_i + z_j/m_j with z_b the number of contacts of grain b (mass splitting). Since
@@ -11,13 +11,26 @@ follow. Three diagonals D stand for it in the ``projected_methods``:
   and λ(A_b) ≤ z_b, so it is never worse than the count.
 
 An isolated pair has D = W in all three.
+
+A problem given by its matrix has the same four functions. Its bounds know no grains, only the entries of W. For any
+s > 0, 2 |x_c x_d| ≤ x_c² s_d/s_c + x_d² s_c/s_d, so the diagonal Σ_d |W_cd| s_d/s_c bounds W (Gershgorin). With
+s_c = W_cc^-½ it is ``spectral_bound``. As |W_cd| ≤ (W_cc W_dd)^½, it is at most z_c W_cc with z_c the number of entries
+of row c, which is ``count_bound``.
 """
 
+from collections.abc import Callable
+from functools import singledispatch
+from typing import Any
+
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.problem import DelassusProblem, entries, is_sparse
+
+Operator = Contacts | DelassusProblem  # what has the four functions product, diagonal and bounds
 
 
 def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, "grains 2"]:
@@ -38,6 +51,7 @@ def in_clusters(contacts: Contacts, impulses: Float[Array, " contacts"], grains:
     return (impulses > 0) & others
 
 
+@singledispatch
 def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, " contacts"]:
     """Change W p of the relative normal velocities that the impulses cause."""
     total = grain_impulses(contacts, impulses, grains)
@@ -45,11 +59,13 @@ def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], gr
     return jnp.sum(contacts.normals * change, axis=-1)
 
 
+@singledispatch
 def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     """Diagonal of W; one in unused slots, as in all three, so that it can be divided by."""
     return jnp.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, 1)
 
 
+@singledispatch
 def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     """Diagonal D with W ⪯ D from the numbers of contacts of the grains."""
     one = contacts.used.astype(contacts.normals.dtype)[:, None]
@@ -58,6 +74,7 @@ def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     return jnp.where(contacts.used, bound, 1)
 
 
+@singledispatch
 def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     """Diagonal D with W ⪯ D from the 2×2 matrices of the grains."""
     nx, ny = contacts.normals[:, 0], contacts.normals[:, 1]
@@ -67,6 +84,57 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     largest = largest_eigenvalue(xx, xy, yy)
     bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
+
+
+@delassus_product.register
+def _(problem: DelassusProblem, impulses: Array, grains: int) -> Array:
+    return _times(problem.matrix, impulses)
+
+
+@diagonal.register
+def _(problem: DelassusProblem, grains: int) -> Array:
+    matrix = problem.matrix
+    if is_sparse(matrix):
+        rows, columns, values = entries(matrix)
+        own = _row_sums(matrix, jnp.where(rows == columns, values, 0))
+    else:
+        own = jnp.diagonal(matrix)
+    return jnp.where(own > 0, own, 1)
+
+
+@count_bound.register
+def _(problem: DelassusProblem, grains: int) -> Array:
+    count = _times(_each(problem.matrix, lambda x: (x != 0).astype(x.dtype)), jnp.ones_like(problem.approach))
+    return jnp.maximum(count, 1) * diagonal(problem, grains)
+
+
+@spectral_bound.register
+def _(problem: DelassusProblem, grains: int) -> Array:
+    root = jnp.sqrt(diagonal(problem, grains))
+    bound = root * _times(_each(problem.matrix, jnp.abs), 1 / root)
+    return jnp.where(bound > 0, bound, 1)
+
+
+def _times(matrix: Any, vector: Array) -> Array:
+    """Product with a dense or sparse matrix, in full precision on every backend."""
+    if is_sparse(matrix):
+        _, columns, values = entries(matrix)
+        return _row_sums(matrix, values * vector[columns])
+    return jnp.matmul(matrix, vector, precision=lax.Precision.HIGHEST)
+
+
+def _row_sums(matrix: Any, values: Array) -> Array:
+    """Sums over the stored entries of each row, of one value for each entry."""
+    return jnp.zeros(matrix.shape[0], values.dtype).at[matrix.indices[:, 0]].add(values)
+
+
+def _each(matrix: Any, function: Callable[[Array], Array]) -> Any:
+    """The matrix with a function of its entries in their place."""
+    return (
+        type(matrix)((function(matrix.data), matrix.indices), shape=matrix.shape)
+        if is_sparse(matrix)
+        else function(matrix)
+    )
 
 
 def _gathered(

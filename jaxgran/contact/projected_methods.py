@@ -33,9 +33,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import count_bound, diagonal, spectral_bound
+from jaxgran.contact.delassus import Operator, count_bound, diagonal, spectral_bound
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.contact.network import Contacts
 from jaxgran.model.choices import Solver
 
 
@@ -62,7 +61,7 @@ class Method(NamedTuple):
     =======  ======================================  ============================================================
     """
 
-    bound: Callable[[Contacts, int], Array]
+    bound: Callable[[Operator, int], Array]
     memory: tuple[float, ...]
     propose: Callable[[Iterate, Array], tuple[Array, Array]]
     learn: Callable[[Iterate, Array, Array, Array, Array], tuple[Array, ...]]

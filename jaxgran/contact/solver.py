@@ -17,7 +17,7 @@ step have this derivative and the impulses are not unique, nor are their derivat
 set A is that of the solution found, so derivatives want a small tolerance (1e-8 or less).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import delassus_product, diagonal
+from jaxgran.contact.delassus import Operator, delassus_product, diagonal
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import METHODS, Iterate, dot
@@ -65,7 +65,7 @@ class Solution:
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 6))
 def solve(
-    contacts: Contacts,
+    contacts: Operator,
     grains: int,
     shear_rate: float | Array,
     tolerance: float | Array,
@@ -77,8 +77,8 @@ def solve(
     """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
 
     Args:
-      contacts: the network.
-      grains: number of grains.
+      contacts: the network, or a problem given by its matrix.
+      grains: number of grains; not used with a matrix.
       shear_rate: γ̇; sets the absolute floor of the residual.
       tolerance: relative residual to reach.
       max_iterations: cap; beyond it the best iterate is returned with a status.
@@ -89,7 +89,7 @@ def solve(
     Impulses and response have derivatives with respect to the network, see the module; all else has none.
     """
     b, own = contacts.approach, diagonal(contacts, grains)
-    if b.size == 1:
+    if b.size == 1 and isinstance(contacts, Contacts):
         return _single_contact(b, own, active)
     rule = METHODS[method]
     bound = rule.bound(contacts, grains)
@@ -147,10 +147,6 @@ def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> 
     impulses, pressing = solution.impulses, solution.impulses > 0
     own = diagonal(contacts, grains)
 
-    def response(normals: Array, inverse_mass_i: Array, inverse_mass_j: Array) -> Array:
-        network = replace(contacts, normals=normals, inverse_mass_i=inverse_mass_i, inverse_mass_j=inverse_mass_j)
-        return delassus_product(network, impulses, grains)
-
     def of_pressing(change: Array) -> Array:
         """W_AA on the contacts that press, and the identity on the others."""
         felt = delassus_product(contacts, jnp.where(pressing, change, 0), grains)
@@ -168,10 +164,8 @@ def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> 
         good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
         return jnp.where(good, change, jnp.nan)
 
-    places = ("normals", "inverse_mass_i", "inverse_mass_j")
     change = tangents[0]
-    at, along = (tuple(getattr(x, name) for name in places) for x in (contacts, change))
-    _, turned = jax.jvp(response, at, along)
+    _, turned = jax.jvp(lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,))
     wanted = jnp.where(pressing, -(turned + change.approach), 0)
     impulse_change = lax.custom_linear_solve(of_pressing, wanted, solved, symmetric=True)
     none: Any = np.zeros((), jax.dtypes.float0)

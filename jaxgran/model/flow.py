@@ -92,7 +92,7 @@ class ShearFlow:
                 raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")
         if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
             require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
-        for name, (accepts, words) in _RANGES.items():
+        for name, (accepts, words) in RANGES.items():
             require(name, getattr(self, name), accepts, words)
         shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
         if len(shapes) > 1:
@@ -134,7 +134,7 @@ jax.tree_util.register_pytree_with_keys(
     _unflatten,
 )
 
-_RANGES = {
+RANGES = {
     "restitution": (lambda x: (x >= 0) & (x <= 1), "between 0 and 1"),
     "packing_fraction": (
         lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION),

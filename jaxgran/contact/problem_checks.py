@@ -1,0 +1,169 @@
+"""What a contact problem must be, judged where it is used; values that JAX traces pass, their shapes do not.
+
+Shapes are known even inside of ``jit``. Values are judged outside of it, where a mistake can be said in a sentence.
+Inside, a solve ends with a status. "ok" then still means that the residual is small, whatever the matrix is.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxgran.contact.problem import ContactNetwork, ContactProblem, DelassusProblem, entries, is_sparse
+from jaxgran.model.checks import InputError, known, require, shown
+
+LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are judged; Cholesky's factor of it takes 0.1 s
+_UNIT_LENGTH = 1e-5  # by which the length of a normal may differ from one; float32 and typed digits pass
+_BATCH = "a batch of problems is solved by jax.vmap(jaxgran.solve_contacts)"
+_FINITE = "finite numbers"
+
+
+def judged(problem: Any) -> ContactProblem:
+    """The problem with all its numbers in one precision.
+
+    Raises:
+      InputError: (a ValueError) it is no contact problem, its shapes do not fit, or a value cannot be; see
+        ``solve_contacts``.
+    """
+    if isinstance(problem, ContactNetwork):
+        _require_network(problem)
+        kind = _precision(problem.normals, problem.masses, problem.approach)
+        normals, masses, approach = (jnp.asarray(x, kind) for x in (problem.normals, problem.masses, problem.approach))
+        return ContactNetwork(jnp.asarray(problem.ends, jnp.int32), normals, masses, approach)
+    if isinstance(problem, DelassusProblem):
+        _require_delassus(problem)
+        matrix = problem.matrix
+        kind = _precision(matrix, problem.approach)
+        matrix = matrix.astype(kind) if is_sparse(matrix) else jnp.asarray(matrix, kind)
+        return DelassusProblem(matrix, jnp.asarray(problem.approach, kind))
+    raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {shown(problem)}.")
+
+
+def require_impulses(problem: ContactProblem, impulses: Any) -> jax.Array:
+    """The impulses in the precision of the problem; an InputError unless there is one for each contact."""
+    _require_shape("impulses", impulses, problem.approach.shape, "a number for each contact")
+    return jnp.asarray(impulses, problem.approach.dtype)
+
+
+def _require_network(network: ContactNetwork) -> None:
+    count = _contacts(network)
+    _require_shape("ends", network.ends, (count, 2), "two grains for each contact")
+    _require_shape("normals", network.normals, (count, 2), "a unit vector for each contact")
+    if np.ndim(network.masses) != 1 or np.size(network.masses) == 0:
+        raise InputError(f"masses must be an array (grains,), not of the shape {np.shape(network.masses)}; {_BATCH}.")
+    grains = np.shape(network.masses)[0]
+    if not np.issubdtype(network.ends.dtype, np.integer):
+        raise InputError(f"ends must be whole numbers, not of the type {network.ends.dtype}.")
+    require("ends", network.ends, lambda x: (x >= 0) & (x < grains), f"numbers of grains, 0 to {grains - 1}")
+    require("masses", network.masses, lambda x: x > 0, "positive, or infinite for a wall")
+    require("approach", network.approach, np.isfinite, _FINITE)
+    require("normals", network.normals, np.isfinite, _FINITE)
+    ends, normals, masses = known(network.ends), known(network.normals), known(network.masses)
+    if normals is None:
+        return
+    lengths = np.linalg.norm(normals, axis=1)
+    wrong = (lengths != 0) & (np.abs(lengths - 1) > _UNIT_LENGTH)
+    if np.any(wrong):
+        raise InputError(
+            f"normals must be unit vectors, and that of contact {np.argmax(wrong)} has the length "
+            f"{lengths[np.argmax(wrong)]:.6g}: divide it by its length."
+        )
+    if ends is None:
+        return
+    selfish = (lengths > 0) & (ends[:, 0] == ends[:, 1])
+    if np.any(selfish):
+        raise InputError(f"ends must be two different grains, and contact {np.argmax(selfish)} has one grain twice.")
+    if masses is not None and np.any(held := (lengths > 0) & np.all(np.isinf(masses[ends]), axis=1)):
+        raise InputError(f"contact {np.argmax(held)} joins two walls, which no impulse moves: leave it out.")
+
+
+def _require_delassus(problem: DelassusProblem) -> None:
+    count, matrix = _contacts(problem), problem.matrix
+    _require_shape("matrix", matrix, (count, count), "a row and a column for each contact")
+    if is_sparse(matrix):
+        if matrix.n_batch or matrix.n_dense:
+            raise InputError(
+                "a sparse matrix must have neither batch nor dense dimensions: use BCOO.fromdense(matrix)."
+            )
+        if matrix.nse == 0:
+            raise InputError("matrix must have entries: a contact has a positive one on the diagonal.")
+        require("matrix", matrix.data, np.isfinite, _FINITE)
+    else:
+        require("matrix", matrix, np.isfinite, _FINITE)
+    require("approach", problem.approach, np.isfinite, _FINITE)
+    values = _known_matrix(matrix)
+    if values is not None:
+        _require_definite(values)
+
+
+def _require_definite(matrix: Any) -> None:
+    """Symmetric, with a positive diagonal and no negative eigenvalue, all to rounding."""
+    epsilon = float(np.finfo(matrix.dtype).eps) if matrix.dtype.kind == "f" else 0.0
+    own = matrix.diagonal()
+    if not np.all(own > 0):
+        at = int(np.argmin(own))
+        raise InputError(f"matrix must have a positive diagonal, and entry {at} of it is {own[at]:.6g}.")
+    root = np.sqrt(own.astype(float))
+    scaled = matrix / root[:, None] / root if isinstance(matrix, np.ndarray) else _scaled(matrix, 1 / root)
+    uneven, largest = abs(scaled - scaled.T).max(), abs(scaled).max()
+    if uneven > np.sqrt(epsilon):
+        raise InputError(
+            f"matrix must be symmetric, and entries differ from their mirror images by up to {uneven:.2g} of the "
+            "diagonal: give (W + W.T) / 2 if that is rounding."
+        )
+    slack = 16 * len(own) * epsilon
+    if largest > 1 + slack or (len(own) <= LARGEST_FACTORED and not _is_definite(scaled, slack)):
+        raise InputError("matrix must have no negative eigenvalue, as W = H M⁻¹ Hᵀ has none, and this one has.")
+
+
+def _is_definite(scaled: Any, slack: float) -> bool:
+    dense = scaled if isinstance(scaled, np.ndarray) else scaled.toarray()
+    try:
+        np.linalg.cholesky(np.asarray(dense, float) + slack * np.eye(len(dense)))
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _scaled(matrix: Any, factors: np.ndarray) -> Any:
+    from scipy.sparse import diags_array
+
+    return (diags_array(factors) @ matrix @ diags_array(factors)).tocsr()
+
+
+def _known_matrix(matrix: Any) -> Any:
+    """The matrix as an array of NumPy or a sparse one of SciPy; None while JAX traces it."""
+    if not is_sparse(matrix):
+        return known(matrix)
+    rows, columns, values = (known(x) for x in entries(matrix))
+    if rows is None or columns is None or values is None:
+        return None
+    from scipy.sparse import coo_array
+
+    inside = (rows < matrix.shape[0]) & (columns < matrix.shape[1])  # a BCOO is padded with indices outside of it
+    return coo_array((values[inside], (rows[inside], columns[inside])), shape=matrix.shape).tocsr()
+
+
+def _contacts(problem: ContactProblem) -> int:
+    shape = np.shape(problem.approach) if hasattr(problem.approach, "dtype") else None
+    if shape is None or len(shape) != 1:
+        raise InputError(f"approach must be an array (contacts,), not {_described(problem.approach)}; {_BATCH}.")
+    if shape == (0,):
+        raise InputError("approach must have a number for at least one contact: this problem has none to solve.")
+    return shape[0]
+
+
+def _require_shape(name: str, value: Any, shape: tuple[int, ...], words: str) -> None:
+    if not hasattr(value, "dtype") or np.shape(value) != shape:
+        raise InputError(f"{name} must be an array {shape}, {words}, not {_described(value)}; {_BATCH}.")
+
+
+def _described(value: Any) -> str:
+    return f"of the shape {tuple(np.shape(value))}" if hasattr(value, "dtype") else shown(value)
+
+
+def _precision(*values: Any) -> Any:
+    """The widest type of the values that is one of floating point."""
+    kind = np.result_type(*(value.dtype for value in values))
+    return jax.dtypes.canonicalize_dtype(kind if jnp.issubdtype(kind, jnp.floating) else np.float64)

@@ -1,0 +1,345 @@
+"""One call for any contact problem: against independent solvers, by the contact law, and as JAX transforms it."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.experimental.sparse import BCOO
+from oracles import MAX_DISCS, delassus, exact_velocities, random_network
+from scipy.optimize import nnls
+
+from jaxgran import (
+    ContactNetwork,
+    DelassusProblem,
+    InputError,
+    Status,
+    contact_residuals,
+    solve_contacts,
+)
+
+pytestmark = pytest.mark.kernels
+
+SIZE = 12  # contacts of the matrices
+seeds = st.integers(0, 2**32 - 1)
+restitutions = st.floats(0, 1)
+
+
+def network_of(seed: int, discs: int = MAX_DISCS) -> tuple[ContactNetwork, np.ndarray, np.ndarray]:
+    """A random network in 192 slots, with W dense, and the velocities of the grains before."""
+    contacts, masses, velocities = random_network(seed, discs)
+    ends = jnp.stack([contacts.i, contacts.j], axis=1)
+    network = ContactNetwork(ends, contacts.normals, jnp.asarray(masses), contacts.approach)
+    return network, delassus(contacts, masses), velocities
+
+
+def matrix_problem(seed: int, size: int = SIZE) -> DelassusProblem:
+    """A dense matrix without a network behind it, with scales over two decades."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(size, size)) * 10 ** rng.uniform(-1, 1, (size, 1))
+    return DelassusProblem(jnp.asarray(root @ root.T), jnp.asarray(root @ rng.normal(size=size)))
+
+
+def by_nnls(problem: DelassusProblem) -> np.ndarray:
+    """Impulses at restitution zero: with W = L Lᵀ they make |Lᵀp + L⁻¹u⁻| least."""
+    lower = np.linalg.cholesky(np.asarray(problem.matrix))
+    return nnls(lower.T, -np.linalg.solve(lower, np.asarray(problem.approach)))[0]
+
+
+@settings(max_examples=10)
+@given(seeds, st.integers(2, MAX_DISCS), restitutions)
+def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restitution):
+    network, matrix, velocities = network_of(seed, discs)
+    contacts, masses, _ = random_network(seed, discs)
+    normals, (i, j), used = np.asarray(network.normals), np.asarray(network.ends).T, np.asarray(contacts.used)
+    stopped = exact_velocities(contacts, masses, velocities)
+    before, after = (np.sum(normals * (v[i] - v[j]), axis=1) for v in (velocities, stopped))
+    expected = before + (1 + restitution) * (after - before)
+    as_matrix = DelassusProblem(jnp.asarray(np.where(np.eye(len(used)) > used, 1, matrix)), network.approach)
+    for problem in (network, as_matrix):
+        solution = solve_contacts(problem, restitution, tolerance=1e-11, max_iterations=100_000)
+        assert solution.status == Status.ok
+        np.testing.assert_allclose(np.asarray(solution.velocities)[used], expected[used], rtol=0, atol=1e-8)
+        assert np.all(np.asarray(solution.impulses)[~used] == 0)
+
+
+@given(seeds, restitutions)
+def test_any_matrix_has_the_impulses_of_non_negative_least_squares(seed, restitution):
+    problem = matrix_problem(seed)
+    expected = (1 + restitution) * by_nnls(problem)
+    solution = solve_contacts(problem, restitution, tolerance=1e-12, max_iterations=1_000_000)
+    error, matrix = np.asarray(solution.impulses) - expected, np.asarray(problem.matrix)
+    assert error @ matrix @ error <= 1e-14 * (expected @ matrix @ expected)
+
+
+@settings(max_examples=20)
+@given(seeds, restitutions)
+def test_solution_obeys_the_contact_law_and_never_gains_energy(seed, restitution):
+    network, matrix, _ = network_of(seed)
+    solution = solve_contacts(network, restitution, tolerance=1e-10, max_iterations=100_000)
+    impulses, after, before = (np.asarray(x) for x in (solution.impulses, solution.velocities, network.approach))
+    speed = np.linalg.norm(np.minimum(before, 0))
+    rebound = after + restitution * before
+    assert np.all(impulses >= 0) and np.min(rebound) >= -2e-10 * speed
+    assert np.all(np.minimum(np.diag(matrix) * impulses, np.abs(rebound)) <= 2e-10 * speed)
+    np.testing.assert_allclose(after, before + matrix @ impulses, rtol=0, atol=1e-11 * np.max(np.abs(before)))
+    gain = impulses @ (before + after) / 2
+    at_zero = impulses / (1 + restitution)
+    unit = at_zero @ matrix @ at_zero
+    assert abs(gain + (1 - restitution**2) / 2 * unit) <= 1e-8 * unit
+    assert gain <= 1e-8 * unit
+
+
+@given(seeds, restitutions)
+def test_residuals_are_those_of_their_definitions(seed, restitution):
+    rng = np.random.default_rng(seed)
+    problem, impulses = matrix_problem(seed), rng.normal(size=SIZE)
+    matrix, approach = np.asarray(problem.matrix), np.asarray(problem.approach)
+    after = matrix @ impulses + (1 + restitution) * approach
+    push, singly = np.diag(matrix) * impulses, (1 + restitution) * np.minimum(approach, 0)
+    speed, energy = np.linalg.norm(singly), np.sum(singly**2 / np.diag(matrix))
+    expected = {
+        "natural_map": np.linalg.norm(np.minimum(push, after)) / speed,
+        "fischer_burmeister": np.linalg.norm(push + after - np.sqrt(push**2 + after**2)) / speed,
+        "complementarity": np.max(np.abs(impulses * after)) / energy,
+        "energy": abs(impulses @ after) / energy,
+        "approach": max(0, -np.min(after)) / speed,
+        "tension": max(0, -np.min(push)) / speed,
+    }
+    found = vars(contact_residuals(problem, jnp.asarray(impulses), restitution))
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-9, atol=1e-12)
+
+
+def test_residuals_vanish_at_a_solution_and_where_nothing_approaches():
+    problem = matrix_problem(0)
+    exact = vars(contact_residuals(problem, jnp.asarray(by_nnls(problem))))
+    apart = replace(problem, approach=jnp.abs(problem.approach))
+    at_rest = vars(contact_residuals(apart, jnp.zeros(SIZE)))
+    assert max(exact.values()) < 1e-10 and max(at_rest.values()) == 0
+
+
+def test_dense_and_sparse_matrices_are_the_same_problem():
+    network, matrix, _ = network_of(3, 20)
+    matrix = matrix + np.diag(np.diag(matrix) == 0)
+    approach, count = network.approach, len(matrix)
+    rows, columns = np.nonzero(matrix)
+    split = np.concatenate([matrix[rows, columns] / 4, 3 * matrix[rows, columns] / 4, [np.pi]])
+    places = np.concatenate([np.stack([rows, columns], 1), np.stack([rows, columns], 1), [[count, count]]])
+    twice = BCOO((jnp.asarray(split), jnp.asarray(places)), shape=(count, count))  # in two parts, and padded
+    forms = (matrix, scipy.sparse.csr_array(matrix), scipy.sparse.coo_matrix(matrix), BCOO.fromdense(matrix), twice)
+    first, *others = [
+        solve_contacts(DelassusProblem(jnp.asarray(x) if x is matrix else x, approach), tolerance=1e-12) for x in forms
+    ]
+    for other in others:
+        assert other.status == Status.ok
+        np.testing.assert_allclose(other.velocities, first.velocities, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["nesterov", "jacobi", "jacobi-count"])
+def test_every_bounded_method_solves_a_matrix(method):
+    problem = replace(
+        matrix_problem(1), matrix=jnp.asarray(np.eye(SIZE) + 0.5 * (np.eye(SIZE, k=1) + np.eye(SIZE, k=-1)))
+    )
+    solution = solve_contacts(problem, method=method, tolerance=1e-9)
+    assert solution.status == Status.ok
+    np.testing.assert_allclose(solution.impulses, by_nnls(problem), atol=1e-7 * np.max(solution.impulses))
+
+
+def test_walls_do_not_move_and_one_contact_is_exact():
+    wall = ContactNetwork(jnp.array([[0, 1]]), jnp.array([[0.0, 1.0]]), jnp.array([2.0, jnp.inf]), jnp.array([-3.0]))
+    solution = solve_contacts(wall, restitution=0.5)
+    assert solution.impulses == 9.0 and solution.velocities == 1.5
+    assert solve_contacts(DelassusProblem(jnp.array([[0.5]]), jnp.array([-3.0])), 0.5).impulses == 9.0
+
+
+def test_single_precision_stays_single():
+    problem = jax.tree.map(lambda x: x.astype(jnp.float32), matrix_problem(0))
+    solution = solve_contacts(problem, 0.5, tolerance=1e-4)
+    assert solution.impulses.dtype == solution.residuals.energy.dtype == jnp.float32
+    mixed = solve_contacts(replace(problem, approach=problem.approach.astype(float)), 0.5, tolerance=1e-4)
+    assert mixed.impulses.dtype == float
+
+
+def test_compiled_call_equals_the_one_outside():
+    for problem in (network_of(0, 20)[0], matrix_problem(0)):
+        outside, inside = solve_contacts(problem, 0.5), jax.jit(solve_contacts)(problem, 0.5)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-14), outside, inside)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_batch_has_the_results_of_its_problems_one_by_one(sparse):
+    """The second is jammed and the third is no number: neither spoils the others."""
+    several = [matrix_problem(seed) for seed in (0, 1, 2, 3)]
+    squeezed = np.eye(SIZE)
+    squeezed[0, 1] = squeezed[1, 0] = -1
+    several[1] = DelassusProblem(jnp.asarray(squeezed), jnp.full(SIZE, -1.0))
+    several[2] = replace(several[2], approach=several[2].approach.at[0].set(jnp.nan))
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
+    if sparse:
+        batch = replace(batch, matrix=BCOO.fromdense(batch.matrix, n_batch=1))
+    together = jax.vmap(partial(solve_contacts, tolerance=1e-8, max_iterations=20_000))(batch, jnp.full(4, 0.5))
+    assert together.status.tolist() == [Status.ok, Status.infeasible, Status.nonfinite, Status.ok]
+    for k in (0, 3):
+        alone = solve_contacts(several[k], 0.5, tolerance=1e-8, max_iterations=20_000)
+        np.testing.assert_allclose(together.velocities[k], alone.velocities, atol=1e-6)
+
+
+def test_derivatives_of_a_network_are_those_of_finite_differences():
+    network, _, _ = network_of(1, 14)
+    weights = random_like(network.approach, 0)
+
+    def function(at):
+        fields = {name: value for name, value in at.items() if name != "restitution"}
+        return weighted(weights, replace(network, **fields), at["restitution"])
+
+    at = {name: getattr(network, name) for name in ("approach", "masses", "normals")} | {"restitution": jnp.array(0.3)}
+    along = {name: random_like(value, 1) for name, value in at.items()}
+    along["masses"] = along["masses"] * network.masses
+    along["normals"] = jnp.where(network.normals != 0, along["normals"], 0)  # unused slots stay unused
+    assert_derivatives(function, at, along)
+
+
+@pytest.mark.parametrize("form", [jnp.asarray, partial(BCOO.fromdense, nse=SIZE**2)])
+def test_derivatives_of_a_matrix_are_those_of_finite_differences(form):
+    problem = replace(matrix_problem(1), matrix=matrix_problem(1).matrix + jnp.eye(SIZE))
+    weights = random_like(problem.approach, 0)
+
+    def function(at):
+        changed = problem.matrix + at["change"] + at["change"].T
+        return weighted(weights, DelassusProblem(form(changed), at["approach"]), at["restitution"])
+
+    at = {"change": jnp.zeros((SIZE, SIZE)), "approach": problem.approach, "restitution": jnp.array(0.3)}
+    assert_derivatives(function, at, {name: random_like(value, 1) for name, value in at.items()})
+
+
+def random_like(value, seed):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=value.shape))
+
+
+def weighted(weights, problem, restitution):
+    """A number that depends on all impulses and velocities."""
+    solution = solve_contacts(problem, restitution, tolerance=1e-12, max_iterations=100_000)
+    return jnp.sum(weights * solution.velocities) + jnp.sum(weights * solution.impulses)
+
+
+def assert_derivatives(function, at, along, step=1e-6):
+    """The slope along a direction, in forward and in reverse mode, is that of a central difference."""
+    function = jax.jit(function)
+    up, down = (function(jax.tree.map(lambda x, d, s=s: x + s * d, at, along)) for s in (step, -step))
+    slope = jax.grad(function)(at)
+    reverse = sum(float(jnp.sum(slope[name] * along[name])) for name in at)
+    forward = jax.jvp(function, (at,), (along,))[1]
+    np.testing.assert_allclose([reverse, forward], (up - down) / (2 * step), rtol=1e-5)
+
+
+def test_cap_returns_the_best_iterate_and_a_status():
+    problem = network_of(0)[0]
+    solutions = [solve_contacts(problem, tolerance=1e-12, max_iterations=cap) for cap in (5, 10, 20)]
+    assert [int(one.iterations) for one in solutions] == [5, 10, 20]
+    assert {int(one.status) for one in solutions} == {Status.iteration_limit}
+    assert np.all(np.diff([one.residuals.natural_map for one in solutions]) <= 0)
+
+
+def test_unit_of_velocity_and_mass_changes_no_residual_and_no_iteration():
+    problem = matrix_problem(5)
+    scaled = DelassusProblem(problem.matrix * 2.0**-20, problem.approach * 2.0**30)
+    one, other = (solve_contacts(x, 0.5, tolerance=1e-9, max_iterations=10_000) for x in (problem, scaled))
+    assert one.iterations == other.iterations
+    np.testing.assert_allclose(other.impulses * 2.0**-50, one.impulses, rtol=1e-9)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), one.residuals, other.residuals)
+
+
+NETWORK, _, _ = network_of(0, 20)
+MATRIX = matrix_problem(0)
+LOPSIDED = np.asarray(MATRIX.matrix) + np.eye(SIZE, k=1)
+SADDLE = np.eye(SIZE) + 0.6 * (1 - np.eye(SIZE)) * np.outer(np.sign(np.sin(np.arange(SIZE))), np.ones(SIZE))
+SADDLE = (SADDLE + SADDLE.T) / 2
+
+
+@pytest.mark.parametrize(
+    ("problem", "words"),
+    [
+        (3, "a ContactNetwork or a DelassusProblem"),
+        (replace(MATRIX, approach=jnp.zeros(0)), "at least one contact"),
+        (replace(MATRIX, approach=MATRIX.approach[:-1]), r"matrix must be an array \(11, 11\)"),
+        (replace(MATRIX, approach=[1.0] * SIZE), "approach must be an array"),
+        (replace(MATRIX, approach=MATRIX.approach[None]), "jax.vmap"),
+        (replace(MATRIX, approach=MATRIX.approach.at[0].set(jnp.nan)), "approach must be finite"),
+        (replace(MATRIX, matrix=MATRIX.matrix.at[0, 0].set(jnp.inf)), "matrix must be finite"),
+        (replace(MATRIX, matrix=jnp.asarray(LOPSIDED)), "symmetric"),
+        (replace(MATRIX, matrix=scipy.sparse.csr_array(LOPSIDED)), "symmetric"),
+        (replace(MATRIX, matrix=jnp.asarray(SADDLE)), "no negative eigenvalue"),
+        (replace(MATRIX, matrix=scipy.sparse.csr_array(SADDLE)), "no negative eigenvalue"),
+        (replace(MATRIX, matrix=-MATRIX.matrix), "positive diagonal"),
+        (replace(MATRIX, matrix=jnp.zeros((SIZE, SIZE))), "positive diagonal"),
+        (replace(MATRIX, matrix=scipy.sparse.csr_array((SIZE, SIZE))), "must have entries"),
+        (replace(MATRIX, matrix=scipy.sparse.eye_array(SIZE + 1)), r"\(12, 12\)"),
+        (replace(NETWORK, masses=jnp.zeros_like(NETWORK.masses)), "masses must be positive"),
+        (replace(NETWORK, masses=jnp.full_like(NETWORK.masses, jnp.inf)), "two walls"),
+        (replace(NETWORK, masses=jnp.ones((2, 60))), "jax.vmap"),
+        (replace(NETWORK, masses=NETWORK.masses[:3]), "numbers of grains, 0 to 2"),
+        (replace(NETWORK, ends=NETWORK.ends.astype(float)), "whole numbers"),
+        (replace(NETWORK, ends=jnp.ones_like(NETWORK.ends)), "one grain twice"),
+        (replace(NETWORK, ends=NETWORK.ends[:5]), r"ends must be an array \(192, 2\)"),
+        (replace(NETWORK, normals=2 * NETWORK.normals), "unit vectors"),
+        (replace(NETWORK, normals=NETWORK.normals.at[0, 0].set(jnp.nan)), "normals must be finite"),
+        (replace(NETWORK, approach=NETWORK.approach.at[0].set(jnp.nan)), "approach must be finite"),
+    ],
+)
+def test_problem_that_cannot_be_is_refused_in_a_sentence(problem, words):
+    with pytest.raises(InputError, match=words) as refused:
+        solve_contacts(problem)
+    assert str(refused.value).endswith(".") and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"restitution": 1.5}, "restitution must be between 0 and 1"),
+        ({"restitution": jnp.zeros(SIZE)}, "restitution must be between 0 and 1"),
+        ({"method": "newton"}, "method must be one of nesterov"),
+        ({"tolerance": 0.0}, "tolerance must be between"),
+        ({"max_iterations": 0}, "max_iterations must be a whole number"),
+        ({"relaxation": 2.0}, "relaxation must be between"),
+    ],
+)
+def test_number_out_of_range_is_refused_in_a_sentence(options, words):
+    with pytest.raises(InputError, match=words):
+        solve_contacts(MATRIX, **options)
+
+
+def test_impulses_of_another_problem_are_refused():
+    with pytest.raises(InputError, match=r"impulses must be an array \(12,\)"):
+        contact_residuals(MATRIX, jnp.zeros(SIZE - 1))
+
+
+def test_traced_values_end_in_a_status_and_traced_shapes_are_refused():
+    compiled = jax.jit(solve_contacts)
+    assert compiled(replace(MATRIX, approach=MATRIX.approach.at[0].set(jnp.nan))).status == Status.nonfinite
+    with pytest.raises(InputError, match="at least one contact"):
+        compiled(replace(MATRIX, approach=jnp.zeros(0)))
+
+
+def test_large_sparse_matrix_is_judged_and_solved_without_a_dense_copy():
+    count = 5000
+    row = scipy.sparse.diags_array(
+        [np.full(count, 2.0), np.full(count - 1, -1.0), np.full(count - 1, -1.0)], offsets=(0, 1, -1)
+    )
+    approach = np.zeros(count)
+    approach[0] = -1
+    solution = solve_contacts(DelassusProblem(row, jnp.asarray(approach)), max_iterations=300)
+    assert solution.residuals.natural_map < 0.1  # a shock that has come 300 discs far
+    with pytest.raises(InputError, match="negative eigenvalue"):
+        solve_contacts(
+            DelassusProblem(
+                row - 3.0 * scipy.sparse.eye_array(count, k=1) - 3.0 * scipy.sparse.eye_array(count, k=-1),
+                jnp.asarray(approach),
+            )
+        )
