@@ -160,7 +160,7 @@ def certified_impulses(g: np.ndarray, approach: np.ndarray, methods: Sequence[Me
             left = 1 + q @ rates / unit
             if left > 0 and is_solution(g, approach, p := _polished(g, approach, unit * q / left / lengths)):
                 return p
-            if is_obstacle(g, approach, _balanced(rows, q) / lengths):
+            if is_obstacle(g, approach, balanced(rows, q) / lengths):
                 return None
         except (LinAlgError, RuntimeError):  # a factorisation fails, or SciPy's iterations end
             continue
@@ -240,7 +240,7 @@ def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.n
     return best
 
 
-def _balanced(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def balanced(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The nearest weights on the same contacts with Gᵀ q = 0, none negative."""
     held = weights > 1e-8 * np.max(weights)
     balanced = np.zeros_like(weights)

@@ -22,6 +22,7 @@ from benchmarks.exact_contacts import Exact, exact
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import INFEASIBLE, Network, collection
 from benchmarks.output import Output
+from benchmarks.profiles import draw_shares
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution, solve
 from jaxgran.model.status import Status
@@ -341,10 +342,7 @@ def _draw_panel(axes: Axes, solves: list[dict], accuracy: str, cost: str) -> Non
 
 
 def draw_profile(rows: list[Row]) -> Figure:
-    """Share of all solvable networks that a method solves within a factor of the cost of the best method.
-
-    Dolan and Moré, Math. Program. 91, 201 (2002). A curve that stays below one has failures.
-    """
+    """Share of all solvable networks that a method solves within a factor of the cost of the best, see ``profiles``."""
     figure = Figure(figsize=(9, 7), layout="constrained")
     solves = [row for row in rows if row.precision == "float64" and row.group != INFEASIBLE]
     present = sorted({row.tolerance for row in solves}, key=np.log)
@@ -362,21 +360,10 @@ def draw_profile(rows: list[Row]) -> Figure:
                 )
                 for method in METHODS
             }
-            best = np.min(list(costs.values()), axis=0)
-            solved = np.isfinite(best)
-            for method, (colour, marker, style) in METHODS.items():
-                factors = np.sort(costs[method][solved] / best[solved])
-                share = np.arange(1, len(best) + 1) / len(best)
-                finite = np.isfinite(factors)
-                x = np.append(factors[finite], 1e3)
-                y = np.append(share[: len(x) - 1], np.sum(finite) / len(best))
-                every = max(1, len(x) // 8)
-                options = {"markerfacecolor": "none", "markevery": every, "ms": 6}
-                axes.step(x, y, where="post", color=colour, marker=marker, linestyle=style, label=method, **options)
-            axes.set(xscale="log", xlim=(0.95, 1e3), ylim=(0, 1.02), title=f"to a residual of {tolerance:.0e}")
+            draw_shares(axes, costs, METHODS)
+            axes.set_title(f"to a residual of {tolerance:.0e}")
             axes.set_xlabel("products over those of the best" if name == "products" else "time over that of the best")
-            axes.grid(alpha=0.3)
-        line[0].set_ylabel(f"share of {len(best)} networks")
+        line[0].set_ylabel(f"share of {len(costs['nesterov'])} networks")
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return figure

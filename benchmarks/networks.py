@@ -17,7 +17,7 @@ import jaxgran as jg
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.collision import contacts_now
 
-SLOTS, GRAINS = (32, 128, 256, 768), 256  # sizes of the buffers of contacts and grains: few shapes to compile
+SLOTS, GRAINS = (32, 128, 256, 768, 3072), 256  # sizes of the buffers of contacts and grains: few shapes to compile
 FLOWS = ((0.80, 0.0), (0.82, 0.0), (0.835, 0.0), (0.82, 0.9), (0.6, 0.5))  # packing fraction, restitution
 CHAINS = (8, 16, 32, 64, 128, 256)
 INFEASIBLE = "jammed, infeasible"
@@ -33,7 +33,7 @@ class Network(NamedTuple):
     field     shape              unit  meaning
     ========  =================  ====  ================================================
     contacts  Contacts           –     padded to one of the sizes ``SLOTS``
-    grains    number             –     always ``GRAINS``: those without a contact do not matter
+    grains    number             –     at least ``GRAINS``: those without a contact do not matter
     masses    (grains,)          m     their masses
     feasible  flag               –     False where no impulses stop all contacts
     ========  =================  ====  ================================================
@@ -75,9 +75,13 @@ def flow_networks(packing_fraction: float, restitution: float, grains: int, coun
 
 def sheared(packing_fraction: float, restitution: float, grains: int, strain: float, seed: int = 0) -> jg.State:
     """A flow after a strain from a packing with random velocities; it need not be steady."""
-    state = _packed(grains, jnp.asarray(packing_fraction), jax.random.key(seed))
-    velocities = jnp.asarray(_random(seed, grains) / 2)
-    return further(packing_fraction, restitution, replace(state, velocities=velocities), strain)
+    state = moving(_packed(grains, jnp.asarray(packing_fraction), jax.random.key(seed)), seed)
+    return further(packing_fraction, restitution, state, strain)
+
+
+def moving(state: jg.State, seed: int) -> jg.State:
+    """The packing with random velocities."""
+    return replace(state, velocities=jnp.asarray(_random(seed, len(state.velocities)) / 2))
 
 
 def further(packing_fraction: float, restitution: float, state: jg.State, strain: float) -> jg.State:
@@ -230,5 +234,5 @@ def _network(masses: np.ndarray, **fields: np.ndarray) -> Network:
     def pad(values: np.ndarray) -> jax.Array:
         return jnp.asarray(np.pad(values, [(0, slots - len(values))] + [(0, 0)] * (values.ndim - 1)))
 
-    masses = np.concatenate([masses, np.ones(GRAINS - len(masses))])
-    return Network(Contacts(**{name: pad(values) for name, values in fields.items()}), GRAINS, masses)
+    masses = np.concatenate([masses, np.ones(max(0, GRAINS - len(masses)))])
+    return Network(Contacts(**{name: pad(values) for name, values in fields.items()}), len(masses), masses)

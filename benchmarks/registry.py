@@ -194,6 +194,15 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "collection",
+        "Which contact problems is a solver compared on, and what are their solutions?",
+        (4, 0.5),
+        ("collection.h5", "collection.json"),
+        (Option("--fclib", "folder for a file of each problem in the layout of FCLIB", Path),),
+        one_core=True,
+        module="collection.make",
+    ),
+    Benchmark(
         "engine_cost",
         "What does each engine cost, and the original design: JAX alone, in lockstep, by Jacobi iterations?",
         (4, 1),

@@ -1,0 +1,147 @@
+"""Solvers side by side on the collection: each is a function, and all are judged by the same residual.
+
+A solver is a function ``prepare(entry, tolerance)`` that returns a function ``solve()``. What a program does once for
+a problem, such as building its matrices or compiling, belongs into ``prepare`` and is not timed. ``solve`` returns the
+impulses at restitution zero, (contacts,), or ``Answer(impulses, products)`` if it counts products with W or their
+equals, or None where it finds that there is no solution. It has a limit of its own, so that it ends. Whether it
+succeeded is not its own word: the residual of the natural map must be at most the tolerance.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxgran as jg
+from benchmarks.collection.files import Entry
+from benchmarks.collection.make import padded
+from benchmarks.gauss_seidel import gauss_seidel
+from benchmarks.method_chart import METHODS, timed
+from benchmarks.profiles import draw_shares, with_styles
+from jaxgran.contact.problem import as_contacts
+from jaxgran.model.status import Status
+
+CAP = 20_000  # products with W of our own methods
+_JUDGED = 1 + 1e-9  # of the tolerance: the residual is computed a second time, with another rounding
+
+
+class Answer(NamedTuple):
+    """Impulses and the products with W that they took."""
+
+    impulses: np.ndarray
+    products: float
+
+
+Solve = Callable[[], np.ndarray | Answer | None]
+Prepare = Callable[[Entry, float], Solve]
+
+
+class Row(NamedTuple):
+    """One solver on one problem.
+
+    ``residual`` is that of the natural map in float64, not a number where the solver returned no impulses.
+    ``products`` is not a number where it does not count them. ``solved`` says whether the answer is right: impulses
+    within the tolerance, or none for a problem that has no solution.
+    """
+
+    solver: str
+    problem: str
+    family: str
+    feasible: bool
+    contacts: int
+    tolerance: float
+    seconds: float
+    products: float
+    residual: float
+    solved: bool
+
+
+def compare(
+    solvers: Mapping[str, Prepare], entries: Sequence[Entry], tolerance: float = 1e-6, timings: int = 3
+) -> list[Row]:
+    """Every solver on every problem, problem by problem, so that all meet the same load of the machine."""
+    return [_row(name, prepare, entry, tolerance, timings) for entry in entries for name, prepare in solvers.items()]
+
+
+def _row(name: str, prepare: Prepare, entry: Entry, tolerance: float, timings: int) -> Row:
+    solve = prepare(entry, tolerance)
+    seconds, answer = timed(lambda times: [solve() for _ in range(max(1, times))][-1], timings)
+    impulses, products = answer if isinstance(answer, Answer) else (answer, np.nan)
+    residual = np.nan if impulses is None else residual_of(entry, impulses)
+    right = residual <= tolerance * _JUDGED if entry.solution.feasible else impulses is None
+    head = (name, entry.name, entry.family, entry.solution.feasible, len(entry.problem.approach), tolerance)
+    return Row(*head, float(seconds), float(products), residual, bool(right))
+
+
+def residual_of(entry: Entry, impulses: np.ndarray) -> float:
+    """Residual of the natural map; see ``jaxgran.contact_residuals``."""
+    network = padded(entry.problem)
+    filled = np.zeros(len(network.approach))
+    filled[: len(entry.problem.approach)] = impulses
+    return float(jg.contact_residuals(network, jnp.asarray(filled)).natural_map)
+
+
+def projected(method: str, entry: Entry, tolerance: float) -> Solve:
+    """A projected method of this program, compiled for one of few shapes."""
+    network, count = padded(entry.problem), len(entry.problem.approach)
+    call = partial(_solved, network, method, jnp.asarray(tolerance))
+
+    def solve() -> Answer | None:
+        solution = jax.block_until_ready(call())
+        if solution.status == Status.infeasible:
+            return None
+        return Answer(np.asarray(solution.impulses)[:count], int(solution.iterations))
+
+    return solve
+
+
+@partial(jax.jit, static_argnums=1)
+def _solved(network: jg.ContactNetwork, method: str, tolerance: jax.Array) -> jg.ContactSolution:
+    return jg.solve_contacts(network, method=method, tolerance=tolerance, max_iterations=CAP)
+
+
+def swept(entry: Entry, tolerance: float) -> Solve:
+    """Gauss–Seidel sweeps, a loop in numba."""
+    contacts = as_contacts(jg.ContactNetwork(*map(jnp.asarray, entry.problem)))
+    contacts = jax.tree.map(np.asarray, contacts)
+
+    def solve() -> Answer:
+        solution = gauss_seidel(contacts, len(entry.problem.masses), tolerance, CAP)
+        return Answer(solution.impulses, int(solution.iterations))
+
+    return solve
+
+
+OURS: dict[str, Prepare] = {
+    "barzilai-borwein": partial(projected, "barzilai-borwein"),
+    "nesterov": partial(projected, "nesterov"),
+    "Gauss–Seidel": swept,
+}
+
+
+def draw_profile(rows: Sequence[Row]) -> Figure:
+    """Performance profiles in time, and in products with W of the solvers that count them, on what has a solution."""
+    rows = [row for row in rows if row.feasible]
+    names = list(dict.fromkeys(row.solver for row in rows))
+    counting = [name for name in names if all(row.products == row.products for row in rows if row.solver == name)]
+    styles = with_styles(names, METHODS)
+    shown = [("seconds", names, "time over that of the best")]
+    shown += [("products", counting, "products with W over those of the best")] if counting else []
+    figure = Figure(figsize=(5 * len(shown) + 0.5, 4.6), layout="constrained")
+    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, (cost, solvers, label) in zip(panels, shown, strict=True):
+        costs = {
+            name: np.array([getattr(row, cost) if row.solved else np.inf for row in rows if row.solver == name])
+            for name in solvers
+        }
+        draw_shares(axes, costs, {name: styles[name] for name in solvers})
+        axes.set_xlabel(label)
+    count = len({row.problem for row in rows})
+    panels[0].set_ylabel(f"share of {count} problems, to {rows[0].tolerance:.0e}")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(4, len(names)))
+    return figure

@@ -1,0 +1,230 @@
+"""The collection of contact problems: certificates against exact fractions, the file, and solvers side by side."""
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from scipy.sparse import csc_array
+
+from benchmarks import networks
+from benchmarks.collection import PATH, Entry, fclib, load
+from benchmarks.collection.certificates import Problem, certificate, delassus, obstacle, obstructed, solved
+from benchmarks.collection.compare import Answer, compare, draw_profile
+from benchmarks.collection.files import write
+from benchmarks.collection.problems import compact
+from benchmarks.exact_contacts import certified_impulses
+from benchmarks.exact_contacts import incidence as dense_incidence
+from benchmarks.networks import Network
+
+ROOT = Path(__file__).parents[1]
+FEASIBLE = {
+    "chain": networks.chain(16),
+    "size ratio": networks.size_ratio(1, 0),
+    "mass ratio": networks.mass_ratio(4, 0),
+    "hexagon, struck": networks.hexagonal(2, True),
+}
+JAMMED = {"row": networks.jammed_row(10), "lattice": networks.jammed_lattice(4)}
+feasible = pytest.mark.parametrize("network", FEASIBLE.values(), ids=FEASIBLE)
+jammed = pytest.mark.parametrize("network", JAMMED.values(), ids=JAMMED)
+
+
+def problem_of(network: Network) -> Problem:
+    return compact(network.contacts, network.masses)
+
+
+def rough(network: Network) -> np.ndarray:
+    """The solution in double precision by a method of the other reference, with an error of a millionth."""
+    used = np.asarray(network.contacts.used)
+    g = dense_incidence(network.contacts, network.grains)[used] / np.repeat(np.sqrt(network.masses), 2)
+    impulses = certified_impulses(g, np.asarray(network.contacts.approach)[used])
+    assert impulses is not None
+    return impulses * (1 + 1e-6 * np.sin(np.arange(len(impulses))))
+
+
+def entry_of(name: str, network: Network) -> Entry:
+    problem = problem_of(network)
+    solution = solved(problem, rough(network)) if network.feasible else obstructed(problem)
+    assert solution is not None
+    return Entry(name, "made", f"a network called {name}", problem, solution)
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[Entry]:
+    return [entry_of(name, network) for name, network in (FEASIBLE | JAMMED).items()]
+
+
+def after_in_fractions(problem: Problem, *parts: np.ndarray) -> list[Fraction]:
+    """w = u⁻ + W Σ parts, without any rounding."""
+    impulses = [sum((Fraction(x) for x in each), Fraction(0)) for each in zip(*parts, strict=True)]
+    gained = [[Fraction(0), Fraction(0)] for _ in problem.masses]
+    for (i, j), normal, impulse in zip(problem.ends, problem.normals, impulses, strict=True):
+        for a in (0, 1):
+            gained[i][a] += Fraction(normal[a]) * impulse / Fraction(problem.masses[i])
+            gained[j][a] -= Fraction(normal[a]) * impulse / Fraction(problem.masses[j])
+    return [
+        Fraction(u) + sum(Fraction(n[a]) * (gained[i][a] - gained[j][a]) for a in (0, 1))
+        for (i, j), n, u in zip(problem.ends, problem.normals, problem.approach, strict=True)
+    ]
+
+
+@feasible
+def test_solution_is_one_in_exact_fractions(network):
+    """To 30 digits: by numbers that have nothing to do with those of the certificate."""
+    problem = problem_of(network)
+    solution = solved(problem, rough(network))
+    high, low = solution.impulses, solution.impulses_low
+    after, own = after_in_fractions(problem, high, low), delassus(problem).diagonal()
+    speed = np.linalg.norm(np.minimum(problem.approach, 0))
+    push = [Fraction(o) * (Fraction(a) + Fraction(b)) for o, a, b in zip(own, high, low, strict=True)]
+    least = [float(min(x, y)) for x, y in zip(push, after, strict=True)]
+    assert min(push) >= 0
+    assert np.linalg.norm(least) <= 1e-28 * speed
+    np.testing.assert_allclose(solution.certificate["natural_map"], np.linalg.norm(least) / speed, rtol=1e-6)
+    np.testing.assert_allclose(solution.velocities, [float(x) for x in after], rtol=1e-15)
+
+
+@feasible
+def test_certificate_tells_an_error_of_the_sixteenth_digit(network):
+    problem = problem_of(network)
+    solution = solved(problem, rough(network))
+    largest = np.argmax(solution.impulses)
+    spoilt = solution.impulses_low.copy()
+    spoilt[largest] += 1e-16 * solution.impulses[largest]
+    found = certificate(problem, solution.impulses, spoilt)
+    assert found["natural_map"] > 1e-20 > 1e8 * solution.certificate["natural_map"]
+
+
+@jammed
+def test_weights_prove_in_exact_fractions_that_there_is_no_solution(network):
+    """Velocities v with H v ≥ −u⁻ have 0 = (Hᵀq)·v ≥ −q·u⁻ > 0."""
+    problem = problem_of(network)
+    proof = obstructed(problem)
+    assert proof is not None and not proof.feasible
+    weights = [Fraction(a) + Fraction(b) for a, b in zip(proof.impulses, proof.impulses_low, strict=True)]
+    total = np.full((len(problem.masses), 2), Fraction(0))
+    for (i, j), normal, weight in zip(problem.ends, problem.normals, weights, strict=True):
+        total[i] += [Fraction(n) * weight for n in normal]
+        total[j] -= [Fraction(n) * weight for n in normal]
+    assert min(weights) >= 0
+    assert sum(q * Fraction(u) for q, u in zip(weights, problem.approach, strict=True)) < 0
+    assert max(abs(float(x)) for x in total.ravel()) < 1e-30
+
+
+def test_a_problem_with_a_solution_has_no_such_proof():
+    problem = problem_of(FEASIBLE["chain"])
+    assert obstacle(problem, np.ones(15), np.zeros(15)) > 0.1
+    assert obstacle(problem, -np.ones(15), np.zeros(15)) == np.inf
+
+
+def test_file_returns_what_was_written_and_is_the_same_twice(entries, tmp_path):
+    for name in ("one.h5", "two.h5"):
+        write(tmp_path / name, entries)
+    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "two.h5").read_bytes()
+    again = sorted(load(tmp_path / "one.h5"), key=lambda one: [x.name for x in entries].index(one.name))
+    for one, other in zip(entries, again, strict=True):
+        assert (one.name, one.family, one.origin) == (other.name, other.family, other.origin)
+        assert one.solution.feasible == other.solution.feasible
+        assert one.solution.certificate == other.solution.certificate
+        for a, b in zip((*one.problem, *one.solution[1:4]), (*other.problem, *other.solution[1:4]), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert len(load(tmp_path / "one.h5", most_contacts=15)) == sum(len(x.problem.approach) <= 15 for x in entries)
+
+
+def test_another_file_is_refused(tmp_path):
+    with h5py.File(tmp_path / "other.h5", "w"):
+        pass
+    with pytest.raises(ValueError, match="python -m benchmarks collection"):
+        load(tmp_path / "other.h5")
+
+
+def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold():
+    told = json.loads((ROOT / "benchmarks" / "results" / "collection.json").read_text())
+    assert hashlib.sha256(PATH.read_bytes()).hexdigest() == told["sha256"]
+    entries = load()
+    sizes = [len(one.problem.approach) for one in entries]
+    assert len(entries) == told["problems"] >= 200 and min(sizes) == 2 and max(sizes) > 2900
+    assert sum(not one.solution.feasible for one in entries) >= 7
+    for one in entries:
+        matrix, impulses, approach = one.matrix, one.solution.impulses, one.problem.approach
+        if one.solution.feasible:  # in double precision: for all; by the certificate: for every tenth
+            after, own = matrix @ impulses + approach, matrix.diagonal()
+            speed = np.linalg.norm(np.minimum(approach, 0))
+            assert np.linalg.norm(np.minimum(own * impulses, after)) <= 1e-9 * speed
+            np.testing.assert_allclose(one.solution.velocities, after, rtol=0, atol=1e-9 * speed)
+            assert np.all(impulses >= 0)
+    for one in entries[::10]:
+        high, low = one.solution[1:3]
+        if one.solution.feasible:
+            assert certificate(one.problem, high, low) == pytest.approx(one.solution.certificate, rel=1e-6, abs=1e-40)
+        else:
+            assert obstacle(one.problem, high, low) < 1e-28
+
+
+def test_layout_of_fclib_holds_the_same_problem_in_space(entries, tmp_path):
+    entry = entries[2]
+    fclib.write(tmp_path / "one.hdf5", entry)
+    count = len(entry.problem.approach)
+    with h5py.File(tmp_path / "one.hdf5") as file:
+        local = file["fclib_local"]
+        sizes = {name: int(local[f"W/{name}"][0]) for name in ("m", "n", "nzmax", "nz")}
+        parts = [local[f"W/{name}"][()] for name in ("x", "i", "p")]
+        assert [part.dtype for part in parts] == [np.float64, np.int32, np.int32]
+        assert local["spacedim"][0] == 3 and sizes["m"] == sizes["n"] == 3 * count and sizes["nz"] == -1
+        matrix = csc_array(tuple(parts), shape=(3 * count, 3 * count))
+        assert sizes["nzmax"] == matrix.nnz
+        r, u, q = (file[name][()] for name in ("solution/r", "solution/u", "fclib_local/vectors/q"))
+        assert np.all(local["vectors/mu"][()] == 0) and local["info/title"][()].decode() == entry.name
+    np.testing.assert_allclose(matrix @ r + q, u, atol=1e-14)
+    np.testing.assert_allclose(matrix.toarray()[::3, ::3], entry.matrix.toarray(), atol=1e-14)
+    np.testing.assert_allclose(u[::3], entry.solution.velocities, atol=1e-12)
+    assert np.linalg.eigvalsh(matrix.toarray())[0] > -1e-12
+
+
+def test_solvers_are_judged_by_their_residual_and_not_by_their_word(entries):
+    solvers = {
+        "right": lambda entry, tolerance: lambda: entry.solution.impulses if entry.solution.feasible else None,
+        "counting": lambda entry, tolerance: lambda: Answer(entry.solution.impulses, 7),
+        "wrong": lambda entry, tolerance: lambda: np.zeros(len(entry.problem.approach)),
+        "gives up": lambda entry, tolerance: lambda: None,
+    }
+    rows = compare(solvers, entries, timings=1)
+    assert [row.solver for row in rows[:4]] == list(solvers)
+    for row in rows:
+        assert (
+            row.solved
+            == {"right": True, "counting": row.feasible, "wrong": False, "gives up": not row.feasible}[row.solver]
+        )
+        assert row.seconds > 0
+        assert row.residual < 1e-12 or row.solver in ("wrong", "gives up") or not row.feasible
+    in_time, in_products = draw_profile(rows).axes
+    assert [line.get_label() for line in in_time.lines] == list(solvers)
+    assert [line.get_label() for line in in_products.lines] == ["counting"]
+    ends = {line.get_label(): float(line.get_ydata()[-1]) for line in in_time.lines}
+    assert ends == {"right": 1, "counting": 1, "wrong": 0, "gives up": 0}
+
+
+def test_page_about_own_solvers_runs(tmp_path, monkeypatch):
+    page = (ROOT / "docs" / "how-to" / "own-solver.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec("\n".join(re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)), names)
+    assert (tmp_path / "profile.png").stat().st_size > 10_000
+    assert {row.solver for row in names["rows"]} > {"mine"}
+    assert sum(row.solved for row in names["rows"] if row.solver == "mine") > 5
+
+
+@pytest.mark.slow
+def test_two_runs_write_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        words = ["collection", "--quick", "--output", str(tmp_path / name)]
+        subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=ROOT, env=os.environ, check=True)
+    one, two = (tmp_path / name / "collection_quick.h5" for name in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes()
