@@ -218,7 +218,7 @@ def test_page_about_own_solvers_runs(tmp_path, monkeypatch):
     exec("\n".join(re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)), names)
     assert (tmp_path / "profile.png").stat().st_size > 10_000
     assert {row.solver for row in names["rows"]} > {"mine"}
-    assert sum(row.solved for row in names["rows"] if row.solver == "mine") > 5
+    assert sum(row.solved for row in names["rows"] if row.solver == "mine") > 3
 
 
 @pytest.mark.slow
