@@ -34,7 +34,7 @@ def draw_shares(axes: Axes, costs: Mapping[str, np.ndarray], styles: Mapping[str
     for name, (colour, marker, line) in styles.items():
         factors = np.sort(costs[name][solved] / best[solved])
         finite = factors[np.isfinite(factors)]
-        x = np.append(finite, max(LARGEST_FACTOR, *finite[-1:]))
+        x = np.append(finite, np.max(finite, initial=LARGEST_FACTOR))
         y = np.append(np.arange(1, len(finite) + 1), len(finite)) / len(best)
         options = {"markerfacecolor": "none", "markevery": max(1, len(x) // 8), "ms": 6}
         axes.step(x, y, where="post", color=colour, marker=marker, linestyle=line, label=name, **options)
