@@ -243,8 +243,8 @@ def _polished(g: np.ndarray, approach: np.ndarray, impulses: np.ndarray) -> np.n
 def balanced(rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The nearest weights on the same contacts with Gᵀ q = 0, none negative."""
     held = weights > 1e-8 * np.max(weights)
-    balanced = np.zeros_like(weights)
-    balanced[held] = weights[held]
+    result = np.zeros_like(weights)
+    result[held] = weights[held]
     for _ in range(2):
-        balanced[held] -= np.linalg.lstsq(rows[held].T, balanced[held] @ rows[held])[0]
-    return np.maximum(balanced, 0)
+        result[held] -= np.linalg.lstsq(rows[held].T, result[held] @ rows[held])[0]
+    return np.maximum(result, 0)

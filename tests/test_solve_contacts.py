@@ -23,8 +23,6 @@ from jaxgran import (
     solve_contacts,
 )
 
-pytestmark = pytest.mark.kernels
-
 SIZE = 12  # contacts of the matrices
 seeds = st.integers(0, 2**32 - 1)
 restitutions = st.floats(0, 1)
@@ -51,6 +49,7 @@ def by_nnls(problem: DelassusProblem) -> np.ndarray:
     return nnls(lower.T, -np.linalg.solve(lower, np.asarray(problem.approach)))[0]
 
 
+@pytest.mark.kernels
 @settings(max_examples=10)
 @given(seeds, st.integers(2, MAX_DISCS), restitutions)
 def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restitution):
@@ -68,6 +67,7 @@ def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restituti
         assert np.all(np.asarray(solution.impulses)[~used] == 0)
 
 
+@pytest.mark.kernels
 @given(seeds, restitutions)
 def test_any_matrix_has_the_impulses_of_non_negative_least_squares(seed, restitution):
     problem = matrix_problem(seed)
