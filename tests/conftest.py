@@ -4,6 +4,7 @@ The compiled functions of the engine are shared by all tests: one number of grai
 ``compiled_programs`` says where they are kept.
 """
 
+import gc
 import os
 from dataclasses import replace
 from functools import cache, partial
@@ -46,6 +47,13 @@ damaged = []  # reports of compiled programs that could not be read
 def pytest_configure():
     """``pytest.GRAINS`` is the number of grains that the shared compiled functions are for."""
     pytest.GRAINS = GRAINS
+
+
+def pytest_collection_finish():
+    """What is imported stays: to look through it again and again for garbage would take a fifth of a run."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_warning_recorded(warning_message):

@@ -119,14 +119,14 @@ IMPOSSIBLE = {
         "with events, not machine_code: only the engine jax does that",
     ),
     "an observable": (
-        lambda state: jg.sample(of("machine_code"), state, 0.1, observe=lambda seen: seen.state.side),
-        "with observe, not machine_code",
+        lambda state: jg.sample(of("machine_code", solver="jacobi"), state, 0.1, observe=lambda seen: seen.state.side),
+        "with the solver jacobi, not machine_code",
     ),
     "an observable, block by block": (
         lambda state: jg.sample(
-            of("machine_code"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
+            of("thread_block"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
         ),
-        "with observe, not machine_code",
+        "on a CPU, not thread_block",
     ),
     "a sample": (lambda state: jg.sample(of("thread_block"), state, 0.1), "on a CPU, not thread_block"),
     "a preparation": (lambda _: jg.prepare(of("thread_block"), jax.random.key(0)), "on a CPU, not thread_block"),

@@ -15,7 +15,7 @@ from jaxtyping import Array, Int
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import select_engine
 from jaxgran.dynamics.plain import NEEDS_EVENTS, ended, require_advance
-from jaxgran.dynamics.tally import NUMBERS, Tally, sums_from_row
+from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
@@ -93,22 +93,41 @@ def register_machine_code() -> None:
 
 def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the machine code."""
+    end, sums, _, _ = call_machine_code(flow, state, steps)
+    return ended(state, end.positions, end.tilt, end.velocities, sums)
+
+
+def call_machine_code(
+    flow: ShearFlow, state: State, steps: Array, solved: Array | int = 0, room: int = 0
+) -> tuple[State, RunningSums, Array, Array]:
+    """What one call of the machine code leaves.
+
+    Args:
+      flow, state, steps: as in ``advance``.
+      solved: whether the contacts of the first step have acted already.
+      room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
+
+    Returns:
+      The state at the end, the running sums, the results in the order of ``machine_code.layout``, and the records.
+    """
     from jaxgran.dynamics.machine_code import layout
     from jaxgran.dynamics.machine_code.ffi import TARGET
 
     register_machine_code()
-    dtype, grains = state.positions.dtype, state.grains
+    dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
-    numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps)
-    memory = layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains
-    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,)]
+    numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps, solved)
+    memory = layout.WORDS + layout.WORDS_PER_GRAIN * count
+    record = layout.RECORD_HEAD + (layout.RECORD_OF_GRAIN + 3 * layout.RECORD_OF_CONTACT) * count
+    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,), (room, record)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
     call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    positions, velocities, found, _ = call(state.positions, state.velocities, grains.radii, grains.masses, packed)
-    status, tilt = found[layout.STATUS], found[layout.TILT]
-    sums = sums_from_row(found[:NUMBERS], status.astype(jnp.int32))
-    return ended(state, wrap(positions, state.side, tilt), tilt, velocities, sums)
+    given = state.positions, state.velocities, grains.radii, grains.masses, packed
+    positions, velocities, found, _, records = call(*given)
+    tilt = found[layout.TILT]
+    end = State(grains, wrap(positions, state.side, tilt), velocities, state.side, tilt)
+    return end, sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32)), found, records
 
 
 def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:

@@ -21,7 +21,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
-Observe = Callable[[State, Contacts, Array], Any]  # of a time step: the state, its contacts and their impulses
+Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: the state, its contacts, their impulses
 
 
 class AdvanceOptions(NamedTuple):

@@ -9,8 +9,9 @@ jax               everything else, and as reference     nothing: every backend, 
 auto              every flow                            nothing: the engine of the backend if possible, or else jax
 ================  ====================================  ============================================================
 
-All engines solve the same steps to the same tolerance. Derivatives, ``observe`` and steps without free flight run in
-the engine "jax" only. "auto" selects it for them. A named engine that cannot do them raises an InputError.
+All engines solve the same steps to the same tolerance. Derivatives and steps without free flight run in the engine
+"jax" only, and ``observe`` in it and in the machine code. "auto" selects an engine that can. A named engine that cannot
+raises an InputError.
 """
 
 import warnings
@@ -34,16 +35,17 @@ _SINGLE_PRECISION = (
     "JAX computes in single precision, in which flows take the engine jax, several times slower than the machine code: "
     'begin with jax.config.update("jax_enable_x64", True).'
 )
+_OPTIONS_OF_ENGINE = {"machine_code": ("observe",)}
 _SOLVER_OF_ENGINE = {"machine_code": "gauss-seidel, barzilai-borwein where stiff", "thread_block": "barzilai-borwein"}
 
 
-def select_engine(flow: ShearFlow, state: State | None = None, jax_only: str = "") -> Engine:
+def select_engine(flow: ShearFlow, state: State | None = None, option: str = "") -> Engine:
     """Selects the engine for the backend, precision and solver: ``machine_code``, ``thread_block`` or ``jax``.
 
     Args:
       flow: gives the engine, the solver and the number of grains; it may be a batch.
       state: gives the precision; None for JAX's default precision.
-      jax_only: name of an option that only the engine "jax" has, for the error message; "" if there is none.
+      option: name of an option that not all engines have; "" if there is none.
 
     Raises:
       InputError: the flow names an engine that cannot do this.
@@ -54,13 +56,14 @@ def select_engine(flow: ShearFlow, state: State | None = None, jax_only: str = "
     engine = _ENGINE_OF_PLATFORM.get(device.platform) if flow.engine == "auto" else flow.engine
     if engine is None:
         return "jax"
-    obstacle = _obstacle(engine, flow, state, jax_only, device)
+    option = "" if option in _OPTIONS_OF_ENGINE.get(engine, ()) else option
+    obstacle = _obstacle(engine, flow, state, option, device)
     if obstacle is None and engine == "thread_block":
         obstacle = _kernel_obstacle(flow, state, device)
     if obstacle is None:
         return engine
     if flow.engine == "auto":
-        if state is not None and engine == "machine_code" and _only_precision_is_missing(flow, jax_only):
+        if state is not None and engine == "machine_code" and _only_precision_is_missing(flow, option):
             _warn_once(_SINGLE_PRECISION)
         return "jax"
     where, why = obstacle
@@ -79,15 +82,14 @@ def solver_in_use(engine: Engine, solver: str) -> str:
     return _SOLVER_OF_ENGINE.get(engine, solver)
 
 
-def _obstacle(
-    engine: Engine, flow: ShearFlow, state: State | None, jax_only: str, device: Any
-) -> tuple[str, str] | None:
+def _obstacle(engine: Engine, flow: ShearFlow, state: State | None, option: str, device: Any) -> tuple[str, str] | None:
     """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
     if _ENGINE_OF_PLATFORM.get(device.platform) != engine:
         made_for = "processors" if engine == "machine_code" else "NVIDIA GPUs"
         return f"on a {device.platform.upper()}", f"it is made for {made_for}"
-    if jax_only:
-        return f"with {jax_only}", "only the engine jax does that"
+    if option:
+        others = [name for name, options in _OPTIONS_OF_ENGINE.items() if option in options]
+        return f"with {option}", f"only the engine {' or '.join([*others, 'jax'])} does that"
     if flow.solver != _DEFAULT_SOLVER:
         return f"with the solver {flow.solver}", "it has a contact solve of its own"
     if engine == "machine_code" and _dtype(state) != jnp.float64:
@@ -99,9 +101,9 @@ def _obstacle(
     return None
 
 
-def _only_precision_is_missing(flow: ShearFlow, jax_only: str) -> bool:
+def _only_precision_is_missing(flow: ShearFlow, option: str) -> bool:
     """Whether the machine code would advance the flow if double precision were switched on."""
-    other = jax_only or flow.solver != _DEFAULT_SOLVER or in_batch()
+    other = option or flow.solver != _DEFAULT_SOLVER or in_batch()
     return not other and not jax.config.read("jax_enable_x64")
 
 

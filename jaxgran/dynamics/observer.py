@@ -57,18 +57,24 @@ def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> O
     """The sums with a flight of so many steps; where the contacts of its first step acted, that step is in already."""
     dtype = user_sums.acted.dtype
     weight = steps.astype(dtype) - user_sums.acted
-    found = observe_now(_no_contacts(1, dtype), jnp.zeros(1, dtype))
-    return Observed(_added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.acted))
+    found = without_contacts(observe_now, dtype)
+    return Observed(added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.acted))
 
 
 def with_contacts(user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array) -> Observed:
     """The sums with the present step, whose contacts act."""
     one = jnp.ones_like(user_sums.acted)
-    return Observed(_added(user_sums.sums, observe_now(network, impulses), one), one)
+    return Observed(added(user_sums.sums, observe_now(network, impulses), one), one)
 
 
-def _added(sums: Any, found: Any, weight: Array) -> Any:
+def added(sums: Any, found: Any, weight: Array) -> Any:
+    """The sums with what was found, by its number of steps."""
     return jax.tree.map(lambda old, x: old + weight * jnp.asarray(x).astype(old.dtype), sums, found)
+
+
+def without_contacts(observe_now: ObserveNow, dtype: jnp.dtype) -> Any:
+    """What is found in a step without contacts."""
+    return observe_now(_no_contacts(1, dtype), jnp.zeros(1, dtype))
 
 
 def _no_contacts(slots: int, dtype: jnp.dtype) -> Contacts:

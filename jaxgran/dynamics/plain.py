@@ -122,7 +122,9 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     def observer_at(lists: PairLists, velocities: Array) -> ObserveNow | None:
         """What the user observes of the flow as it is; None where nothing is observed."""
         return (
-            None if options.observe is None else partial(_observed_at, options.observe, lists, grains, velocities, side)
+            None
+            if options.observe is None
+            else partial(_observed_at, partial(options.observe, flow), lists, grains, velocities, side)
         )
 
     def unfinished(now: Carry):
@@ -178,7 +180,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
 
 
 def _observed_at(
-    observe: Observe,
+    observe: Callable[[State, Contacts, Array], Any],
     lists: PairLists,
     grains: Grains,
     velocities: Array,

@@ -155,6 +155,17 @@ class RunningSums(NamedTuple):
         """Time so far."""
         return self._named("duration")
 
+    def joined(self, later: "RunningSums") -> "RunningSums":
+        """These sums and those of what followed, but the user's, which are those of the latter."""
+        return RunningSums(
+            self.flight + later.flight,
+            self.contact + later.contact,
+            self.solve + later.solve,
+            jnp.maximum(self.largest, later.largest),
+            jnp.maximum(self.status, later.status),
+            later.user_sums,
+        )
+
     def tally(self, **ends: Array) -> Tally:
         """The tally; what is known only at the end of an advance is given by name, but the status."""
         ends = {**ends, "status": self.status}

@@ -41,8 +41,8 @@ def _data(buffers, k):
 
 
 @compiled
-def _length(buffers, k):
-    return _word(_word(_word(buffers, k), _DIMS), 0)
+def _length(buffers, k, axis):
+    return _word(_word(_word(buffers, k), _DIMS), axis)
 
 
 def _handler(frame, stop):
@@ -53,7 +53,7 @@ def _handler(frame, stop):
         metadata[3] = _word(_word(frame, _INTERFACE), _VERSION) >> 32 << 32
         return 0
     given, made = _word(frame, _ARGUMENTS), _word(frame, _RESULTS)
-    grains = _length(given, 2)
+    grains = _length(given, 2, 0)
     results, memory = doubles(_data(made, 2), (RESULTS,)), integers(_data(made, 3), (1,))
     memory[0] = _data(made, 3) + 8  # what is left begins behind this number
     arrays, fits = arrays_of(memory, grains)
@@ -71,6 +71,7 @@ def _handler(frame, stop):
         doubles(_data(made, 0), (grains, 2)),
         doubles(_data(made, 1), (grains, 2)),
         results,
+        doubles(_data(made, 4), (_length(made, 4, 0), _length(made, 4, 1))),
         arrays,
         integers(stop, (1,)),
     )

@@ -11,8 +11,9 @@ import numpy as np
 from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import Status
 
-INPUTS = 9  # numbers of a flow and of its advance
-STATUS, TILT, RESULTS = NUMBERS, NUMBERS + 1, NUMBERS + 2  # behind the sums, and the length of all of it
+INPUTS = 10  # numbers of a flow and of its advance
+STATUS, TILT, SOLVED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
+RESULTS = NUMBERS + 4
 WORDS, WORDS_PER_GRAIN = 512 + NUMBERS, 176  # of eight bytes: bounds of the memory that ``memory`` cuts up
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
@@ -22,6 +23,8 @@ ACROSS, ROW = range(2)  # rows of the images: r_i − r_j − (across, row·L) i
 STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the search
 NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
 PULL_X, PULL_Y, DRIVE, IX, IY, JX, JY, MOBILITY, P = range(9)  # columns of what a contact brings to the solver
+AT_STEP, ACTED, CONTACTS, TILTED, RECORD_HEAD = range(5)  # columns of a record; behind them its grains and contacts
+RECORD_OF_GRAIN, RECORD_OF_CONTACT = 4, 7  # numbers of a record for each grain, and for each contact
 RESPONSE, STEP, CHANGE, BEST, BOUND = range(5)  # columns of the same for a stiff cluster
 
 NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come

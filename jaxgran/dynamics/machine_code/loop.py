@@ -36,8 +36,10 @@ from jaxgran.dynamics.machine_code.layout import (
     NONFINITE,
     OK,
     RADIUS,
+    RECORDED,
     RESULTS,
     SECOND,
+    SOLVED,
     STATUS,
     STRIKES,
     TILT,
@@ -56,6 +58,7 @@ from jaxgran.dynamics.machine_code.near_pairs import (
     skin_loss,
 )
 from jaxgran.dynamics.machine_code.network import gather_kicks, make_network, solve_isolated, sort_by_cluster
+from jaxgran.dynamics.machine_code.records import record_contacts, record_flight
 from jaxgran.dynamics.machine_code.sums import add_contacts, add_flight, add_solve
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
@@ -65,7 +68,9 @@ _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
 @compiled
-def advance_loop(positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, arrays, stop):
+def advance_loop(
+    positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, records, arrays, stop
+):
     """Advance one replica.
 
     Args:
@@ -73,8 +78,11 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         the positions not wrapped.
       radii, masses: (grains,).
       numbers: side, tilt, restitution, timestep, shear rate, tolerance, activation fraction, most iterations of a
-        solve, and steps.
-      results: (RESULTS,) receives the running sums, the status and the tilt.
+        solve, steps, and whether the contacts of the first step have acted already.
+      results: (RESULTS,) receives the running sums, the status, the tilt, whether the contacts of the step at which the
+        loop ends have acted, and the number of records.
+      records: (room, numbers) receives ``records`` of steps; the loop ends where it is full. Without room it records
+        nothing.
       arrays: memory of the loop, see ``memory``.
       stop: (1,), a number that others set; the loop ends with the status ``failed`` where it is not zero.
     """
@@ -91,9 +99,13 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
     expected = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
     usual = min(max(expected, _NARROWEST_SKIN), widest)
 
-    done, solved = 0, 0  # steps until the last search; whether the contacts of the present step have been dealt with
+    room, recorded = records.shape[0], 0
+    done, solved = (
+        0,
+        int(numbers[9]),
+    )  # steps until the last search; whether the contacts of the present step have been dealt with
     status = OK if finite else NONFINITE
-    while done < steps and status < NONFINITE:
+    while done < steps and status < NONFINITE and (room == 0 or recorded + 2 <= room):  # of a list and of contacts
         fastest = bring_into_cell(grains, side, tilt, rate)
         kinetic = kinetic_sums(grains, rate)
         needed = 1.2 * (2 * fastest * (1 + LIFE) + rate * largest) * ahead  # what one step may need
@@ -111,6 +123,9 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             predict_contact_steps(p, 0.0, solved, horizon, flow, grains, pairs)
         blocks = clear_calendar(found, pairs)
 
+        if room > 0:
+            record_flight(records[recorded], done, solved, tilt, 0.0, rate, grains, order.given)
+            recorded += 1
         k, fresh = 0, True  # steps since the search
         while True:
             # The next step to visit is that of a contact, the end of the list's life, or that of the advance.
@@ -134,6 +149,10 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
             hits, outcome = _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, results)
             status = max(status, CAPACITY if overfull else OK, outcome)
             solved = 1
+            if room > 0:
+                record_flight(records[recorded], done + k, solved, tilt + rate * t, t, rate, grains, order.given)
+                record_contacts(records[recorded], contacts, flow.bounce, order.given, network)
+                recorded += 1
             kinetic, fastest, finite = _strike(hits, t, rate, grains, network, clusters, kinetic, fastest)
             if not finite:
                 status = NONFINITE
@@ -146,6 +165,8 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
                 p = np.uint32(c) if overfull else network.met[c]
                 if pairs.calendar[STRIKES, p] <= k:  # it approached by rounding only, or there was no room for it
                     predict_contact_steps(p, t, k + 1, horizon, flow, grains, pairs)
+            if 0 < room == recorded:
+                break
 
         done += k
         tilt += rate * k * dt
@@ -153,11 +174,11 @@ def advance_loop(positions, velocities, radii, masses, numbers, new_positions, n
         _move(k * dt, grains)
 
     _deliver(order.given, rate, grains, new_positions, new_velocities)
-    if done == 0:  # as it was, to the bit
+    if done == 0 and recorded < 2:  # as it was, to the bit
         for g in range(count):
             new_positions[g, 0], new_positions[g, 1] = positions[g, 0], positions[g, 1]
             new_velocities[g, 0], new_velocities[g, 1] = velocities[g, 0], velocities[g, 1]
-    results[STATUS], results[TILT] = status, tilt
+    results[STATUS], results[TILT], results[SOLVED], results[RECORDED] = status, tilt, solved, recorded
 
 
 @compiled

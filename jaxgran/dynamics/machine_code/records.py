@@ -1,0 +1,55 @@
+"""Records of steps, for functions of a user's: the grains, and the contacts with their impulses, of the steps visited.
+
+A record is a row of numbers: its step, whether contacts act in it, how many there are, and the tilt; then x, y, c_x and
+c_y of every grain before the contacts act; then i, j, n_x, n_y, u, distance and impulse of every contact. Positions are
+not wrapped. A list of near pairs begins with a record without contacts, so no flight outlasts a list unseen.
+"""
+
+import math
+
+from jaxgran.dynamics.machine_code.compiled import compiled
+from jaxgran.dynamics.machine_code.layout import (
+    ACTED,
+    APPROACH,
+    AT_STEP,
+    CONTACTS,
+    DISTANCE,
+    FIRST,
+    IMPULSE,
+    NX,
+    NY,
+    RECORD_HEAD,
+    RECORD_OF_CONTACT,
+    RECORD_OF_GRAIN,
+    SECOND,
+    TILTED,
+    VX,
+    VY,
+    X,
+    Y,
+)
+
+
+@compiled
+def record_flight(record, step, acted, tilt, t, rate, grains, places):
+    """Record the grains at the time t since the search, without contacts; ``acted``: whether those have been."""
+    motion = grains.motion
+    record[AT_STEP], record[ACTED], record[CONTACTS] = step, acted, 0.0
+    record[TILTED] = tilt - math.floor(tilt + 0.5)
+    for g in range(places.size):
+        at = RECORD_HEAD + RECORD_OF_GRAIN * places[g]
+        y = motion[g, Y] + motion[g, VY] * t
+        record[at], record[at + 1] = motion[g, X] + motion[g, VX] * t, y
+        record[at + 2], record[at + 3] = motion[g, VX] - rate * y, motion[g, VY]
+
+
+@compiled
+def record_contacts(record, contacts, bounce, places, network):
+    """Add the contacts of a step and their impulses to its record."""
+    ends, rows = network.ends, network.rows
+    record[ACTED], record[CONTACTS] = 1.0, contacts
+    for c in range(contacts):
+        at = RECORD_HEAD + RECORD_OF_GRAIN * places.size + RECORD_OF_CONTACT * c
+        record[at], record[at + 1] = places[ends[FIRST, c]], places[ends[SECOND, c]]
+        record[at + 2], record[at + 3], record[at + 4] = rows[NX, c], rows[NY, c], rows[APPROACH, c]
+        record[at + 5], record[at + 6] = rows[DISTANCE, c], bounce * rows[IMPULSE, c]

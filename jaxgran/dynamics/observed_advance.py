@@ -1,0 +1,156 @@
+"""Advances one replica and sums what a function of the user's finds, with the machine code or the engine "jax".
+
+The machine code knows nothing of the function. It records the steps that it visits until its room is full; then JAX
+applies the function to the records, and the machine code goes on. So only the function is compiled, and not an engine.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.core import Tracer
+from jaxtyping import Array, Int
+
+from jaxgran.contact.delassus import grain_impulses
+from jaxgran.contact.network import Contacts
+from jaxgran.dynamics.advance import call_machine_code
+from jaxgran.dynamics.collision import Observe
+from jaxgran.dynamics.engine import select_engine
+from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
+from jaxgran.dynamics.plain import NEEDS_EVENTS, ended, require_advance
+from jaxgran.dynamics.plain import advance_observed as plain_advance
+from jaxgran.dynamics.tally import Tally, empty_sums, place_of
+from jaxgran.model.cell import wrap
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.forward_mode import forward_only
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
+from jaxgran.model.status import Status
+
+_ROOM = 64  # records of one call, after which the machine code searches anew
+_FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
+
+
+def advance_observed(
+    flow: ShearFlow, state: State, steps: Int[Array, ""], observe: Observe
+) -> tuple[State, Tally, Any]:
+    """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``.
+
+    Raises:
+      InputError: the flow names an engine that cannot do this, or the function returns something else than sums.
+    """
+    require_advance(flow, state, steps)
+    flow, state = forward_only((flow, state), NEEDS_EVENTS)
+    if select_engine(flow, state, "observe") == "jax" or _depends_on_traced(observe, flow, state):
+        return plain_advance(flow, state, steps, observe)
+    return _recorded(observe, flow, state, steps)
+
+
+def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
+    """Whether the function uses values from outside that JAX traces, whose derivatives ``_recorded`` would not see."""
+
+    def found(flow: ShearFlow, state: State) -> Any:
+        return without_contacts(partial(observe, flow, state), state.positions.dtype)
+
+    # First what it returns is judged: other things than numbers cannot be traced.
+    nothing_observed(partial(observe, flow, state), 3 * flow.grains, state.positions.dtype)
+    return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally, Any]:
+    """``advance_observed`` with the machine code; its derivatives are those of the engine "jax"."""
+
+    def unfinished(now) -> Array:
+        _, done, _, sums = now
+        return (done < steps) & (sums.status < Status.nonfinite)
+
+    def called(now):
+        state, done, solved, sums = now
+        end, new, found, records = call_machine_code(flow, state, steps - done, solved, _ROOM)
+        flown = found[place_of("steps")]
+        user_sums = _with_records(flow, state, observe, sums.user_sums, records, found, flown)
+        return end, done + flown.astype(done.dtype), _solved(found), sums.joined(new._replace(user_sums=user_sums))
+
+    dtype = state.positions.dtype
+    at_start = partial(observe, flow, state)
+    sums = empty_sums(dtype)._replace(user_sums=nothing_observed(at_start, 3 * flow.grains, dtype).sums)
+    now = state, jnp.zeros_like(steps), jnp.zeros((), dtype), sums
+    end, _, _, sums = lax.while_loop(unfinished, called, now)
+    return *ended(state, end.positions, end.tilt, end.velocities, sums), sums.user_sums
+
+
+@_recorded.defjvp
+def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
+    return jax.jvp(lambda *arguments: plain_advance(*arguments, observe), primals, tangents)
+
+
+def _solved(found: Array) -> Array:
+    from jaxgran.dynamics.machine_code.layout import SOLVED
+
+    return found[SOLVED]
+
+
+def _with_records(
+    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, records: Array, found: Array, flown: Array
+) -> Any:
+    """The user sums with what is found in the records of a call that flew so many steps from a state."""
+    from jaxgran.dynamics.machine_code.layout import ACTED, AT_STEP, CONTACTS, RECORDED
+
+    dtype, count = records.dtype, found[RECORDED].astype(jnp.int32)
+    sizes = sorted({max(4, flow.grains // _FEW), 3 * flow.grains})  # slots for contacts: a disc has three at most
+
+    def with_record(k: Array, user_sums: Any) -> Any:
+        record = records[k]
+        before = _recorded_state(record, state)
+
+        def with_contacts(slots: int) -> tuple[Any, Array]:
+            contacts, impulses = _recorded_contacts(record, state.grains, slots)
+            kicks = grain_impulses(contacts, impulses, flow.grains) / state.grains.masses[:, None]
+            return added(user_sums, observe(flow, before, contacts, impulses), jnp.ones((), dtype)), kicks
+
+        size = jnp.sum(record[CONTACTS] > jnp.asarray([0, *sizes[:-1]], dtype), dtype=jnp.int32)
+        branches = [lambda: (user_sums, jnp.zeros_like(before.velocities)), *(partial(with_contacts, n) for n in sizes)]
+        sums, kicks = lax.switch(size, branches)
+        after = State(state.grains, before.positions, before.velocities + kicks, state.side, before.tilt)
+        until = jnp.where(k + 1 < count, records[jnp.minimum(k + 1, len(records) - 1), AT_STEP], flown)
+        # The step whose contacts have acted, in this record or an earlier one, is no step of the flight.
+        weight = jnp.maximum(until - record[AT_STEP] - record[ACTED], 0)
+        return added(sums, without_contacts(partial(observe, flow, after), dtype), weight)
+
+    return lax.fori_loop(0, count, with_record, user_sums)
+
+
+def _recorded_state(record: Array, state: State) -> State:
+    """The state of a record, before its contacts act."""
+    from jaxgran.dynamics.machine_code import layout
+
+    tilt, count = record[layout.TILTED], state.grains.radii.size
+    numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
+    motion = numbers.reshape(count, layout.RECORD_OF_GRAIN)
+    return State(state.grains, wrap(motion[:, :2], state.side, tilt), motion[:, 2:], state.side, tilt)
+
+
+def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
+    """The contacts of a record and their impulses, in so many slots."""
+    from jaxgran.dynamics.machine_code import layout
+
+    first = layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * grains.radii.size
+    rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(slots, layout.RECORD_OF_CONTACT)
+    used = jnp.arange(slots, dtype=record.dtype) < record[layout.CONTACTS]
+    rows = jnp.where(used[:, None], rows, 0)  # what was never written may be anything
+    i, j = rows[:, 0].astype(jnp.int32), rows[:, 1].astype(jnp.int32)
+    contacts = Contacts(
+        i=i,
+        j=j,
+        normals=rows[:, 2:4],
+        distances=jnp.where(used, rows[:, 5], 1),
+        approach=rows[:, 4],
+        inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
+        inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
+        used=used,
+    )
+    return contacts, rows[:, 6]
