@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from jaxgran.plotting import drawing, losses, ratio, theory
+from jaxgran.plotting import drawing, losses, map_figures, ratio, theory
 
 
 def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
@@ -24,4 +24,4 @@ def caption(figure: Figure) -> str:
 
 def write_without_drawing(patch: pytest.MonkeyPatch) -> None:
     """Pictures are files of a few bytes, for tests of which files are written."""
-    patch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
+    patch.setattr(map_figures, "_draw", lambda draw, data, path: Path(path).write_bytes(b"a picture"))

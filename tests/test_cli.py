@@ -29,6 +29,7 @@ from command_line import (
     made_up_replicas,
     write_few_variables,
 )
+from compiled_programs import kept_programs
 from drawn import leave_out_layout, write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
@@ -278,7 +279,8 @@ def test_a_mistake_is_one_sentence_with_and_without_cached_programs(
 @pytest.fixture(scope="module")
 def small_map(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("map")
-    return folder, jaxgran(folder, *SMALL_MAP.split())
+    with kept_programs():
+        return folder, jaxgran(folder, *SMALL_MAP.split())
 
 
 def test_map_writes_a_dataset_and_its_figures(small_map, small_data) -> None:
@@ -362,7 +364,8 @@ def test_resolution_and_format_of_plot_are_judged_before_a_folder_is_made(small_
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("run")
-    return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--movie", "flow.gif")
+    with kept_programs():
+        return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--movie", "flow.gif")
 
 
 def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
@@ -791,7 +794,6 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
 
 def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> None:
     """A map has made-up replicas, of which the last has a bad status, and its figures are not drawn."""
-    leave_out_layout(monkeypatch)
     write_without_drawing(monkeypatch)
     write_few_variables(monkeypatch, "pressure_large_system", "pressure_large_system_error")
     statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
@@ -873,7 +875,6 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
 
 def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Python functions that C calls back end in a SystemError, whose cause is Ctrl-C."""
-    leave_out_layout(monkeypatch)
     write_without_drawing(monkeypatch)
 
     class Inside(SystemError):

@@ -1,11 +1,12 @@
 """Nothing that took time is replaced by something else: it is refused in a sentence, until --overwrite is given."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas
-from drawn import leave_out_layout, write_without_drawing
+from drawn import write_without_drawing
 
 from jaxgran.maps import sweep
 from jaxgran.maps.checkpoint import Checkpoint
@@ -18,18 +19,31 @@ MAP = ("map", *POINTS, "--seeds", "1")
 BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
 
 
+def made_up_maps(patch: pytest.MonkeyPatch) -> None:
+    """Maps of made-up replicas, whose pictures are files of a few bytes."""
+    write_without_drawing(patch)
+    patch.setattr(sweep, "replicas", made_up_replicas(BOTH))
+
+
 @pytest.fixture(autouse=True)
 def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Maps of made-up replicas, whose pictures are files of a few bytes."""
-    leave_out_layout(monkeypatch)
-    write_without_drawing(monkeypatch)
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas(BOTH))
+    made_up_maps(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished map."""
+    folder = tmp_path_factory.mktemp("finished")
+    with pytest.MonkeyPatch.context() as patch:
+        made_up_maps(patch)
+        assert jaxgran(folder, *MAP).status == 0
+    return folder
 
 
 @pytest.fixture
-def finished(tmp_path: Path) -> bytes:
+def finished(original: Path, tmp_path: Path) -> bytes:
     """The content of a finished map, jaxgran_map.nc."""
-    assert jaxgran(tmp_path, *MAP).status == 0
+    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
     return (tmp_path / "jaxgran_map.nc").read_bytes()
 
 

@@ -1,5 +1,6 @@
 """Command line: ``jaxgran map``, ``plot``, ``explore``, ``run``, ``fit``, ``info``. Exit statuses: ``terminal``."""
 
+import gc
 import os
 import sys
 from typing import Annotated, NoReturn
@@ -96,6 +97,7 @@ def command_line(
 def main() -> None:
     """Entry point: a mistake in the input ends with one sentence and exit status 2."""
     use_plain_letters()
+    gc.set_threshold(50_000, 20, 100)  # what is loaded is no garbage, and a command is short
     with sigterm_interrupts():
         _run()
 

@@ -4,7 +4,6 @@ The machine code knows nothing of the function. It records the steps that it vis
 applies the function to the records, and the machine code goes on. So only the function is compiled, and not an engine.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
