@@ -14,8 +14,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -91,21 +90,7 @@ def configure_jax() -> None:
 
     jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    programs._folder = lambda: programs_folder  # none: tests replace functions, of which its key knows nothing
-
-
-programs_folder: Path | None = None  # of programs that are neither traced nor compiled again
-
-
-@contextmanager
-def kept_programs() -> Iterator[None]:
-    """Programs are kept from run to run in the block, as users have them: for what runs with nothing replaced."""
-    global programs_folder
-    programs_folder = compiled_programs() / "programs"
-    try:
-        yield
-    finally:
-        programs_folder = None
+    programs._folder = lambda: None  # tests replace functions, of which the key of a kept program knows nothing
 
 
 def compiled_programs() -> Path:

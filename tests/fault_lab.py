@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 import xarray as xr
 from command_line import Outcome, jaxgran
-from compiled_programs import kept_programs
 
 from jaxgran.maps.results import read_dataset
 
@@ -40,7 +39,7 @@ class Lab:
 
     def run_here(self, output: str, *words: str) -> Outcome:
         """Run a map in this process, where nothing happens to it."""
-        with kept_programs(), pytest.MonkeyPatch.context() as patch:
+        with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
             return jaxgran(self.folder, *MAP, "--workers", "1", "--output", output, *words)
 

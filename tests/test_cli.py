@@ -29,7 +29,6 @@ from command_line import (
     made_up_replicas,
     write_few_variables,
 )
-from compiled_programs import kept_programs
 from drawn import leave_out_layout, write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
@@ -279,8 +278,7 @@ def test_a_mistake_is_one_sentence_with_and_without_cached_programs(
 @pytest.fixture(scope="module")
 def small_map(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("map")
-    with kept_programs():
-        return folder, jaxgran(folder, *SMALL_MAP.split())
+    return folder, jaxgran(folder, *SMALL_MAP.split())
 
 
 def test_map_writes_a_dataset_and_its_figures(small_map, small_data) -> None:
@@ -364,8 +362,7 @@ def test_resolution_and_format_of_plot_are_judged_before_a_folder_is_made(small_
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("run")
-    with kept_programs():
-        return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--movie", "flow.gif")
+    return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--movie", "flow.gif")
 
 
 def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:

@@ -118,7 +118,7 @@ def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab:
 
 def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> None:
     first = lab.start("one.nc")
-    lab.wait_for("one.nc", "map.nc", first)
+    lab.wait_for("one.nc", process=first)
     os.killpg(first.pid, signal.SIGSTOP)  # it holds the file as long as it lives
     for words in ([], ["--resume"]):
         second = lab.run_here("one.nc", *words)

@@ -84,7 +84,7 @@ def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> 
 
 @_recorded.defjvp
 def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
-    return jax.jvp(lambda *arguments: plain_advance(*arguments, observe), primals, tangents)
+    return jax.jvp(lambda flow, state, steps: plain_advance(flow, state, steps, observe), primals, tangents)
 
 
 def _solved(found: Array) -> Array:
@@ -100,7 +100,8 @@ def _with_records(
     from jaxgran.dynamics.machine_code.layout import ACTED, AT_STEP, CONTACTS, RECORDED
 
     dtype, count = records.dtype, found[RECORDED].astype(jnp.int32)
-    sizes = sorted({max(4, flow.grains // _FEW), 3 * flow.grains})  # slots for contacts: a disc has three at most
+    most = 3 * flow.grains  # contacts of discs form a planar graph
+    sizes = max(4, flow.grains // _FEW), most
 
     def with_record(k: Array, user_sums: Any) -> Any:
         record = records[k]
