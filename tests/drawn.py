@@ -24,4 +24,4 @@ def caption(figure: Figure) -> str:
 
 def write_without_drawing(patch: pytest.MonkeyPatch) -> None:
     """Pictures are files of a few bytes, for tests of which files are written."""
-    patch.setattr(map_figures, "_draw", lambda draw, data, path: Path(path).write_bytes(b"a picture"))
+    patch.setattr(map_figures, "_draw", lambda draw, data, path, *_: Path(path).write_bytes(b"a picture"))
