@@ -34,8 +34,8 @@ MISTAKES = (
     Mistake(
         "tolerance not squared",
         "jaxgran/dynamics/machine_code/loop.py",
-        "share = target * target * (starts[m + 1] - starts[m]) / starts[found]",
-        "share = target * scale * (starts[m + 1] - starts[m]) / starts[found]",
+        "iterations, squared, spare, outcome = 1, 0.0, target * target, OK",
+        "iterations, squared, spare, outcome = 1, 0.0, target * scale, OK",
         "a solve ends when its residual is below the tolerance; here, below the root of it",
         _ENGINES,
     ),
@@ -58,8 +58,8 @@ MISTAKES = (
     Mistake(
         "mass of the other grain",
         "jaxgran/dynamics/machine_code/cluster_solver.py",
-        "rows[c, IX], rows[c, IY], rows[c, JX], rows[c, JY] = nx * mi, ny * mi, nx * mj, ny * mj",
-        "rows[c, IX], rows[c, IY], rows[c, JX], rows[c, JY] = nx * mi, ny * mi, nx * mi, ny * mj",
+        "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mj, 0.0",
+        "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mi, 0.0",
         "an impulse changes the velocity of a grain by its own mass",
         _ENGINES,
     ),

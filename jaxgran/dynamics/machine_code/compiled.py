@@ -18,7 +18,9 @@ OPTIONS: dict[str, Any] = {
     "no_cpython_wrapper": True,  # nothing here is called from Python
     "no_cfunc_wrapper": True,
 }
-compiled: Callable[[Callable], Any] = njit(**OPTIONS)
+# Arrays are handed on by value, some hundred words a call, so what runs in every step becomes part of its caller.
+compiled: Callable[[Callable], Any] = njit(forceinline=True, **OPTIONS)
+called: Callable[[Callable], Any] = njit(**OPTIONS)  # what runs seldom
 
 
 @compiled

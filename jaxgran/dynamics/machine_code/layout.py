@@ -19,10 +19,11 @@ WORDS, WORDS_PER_GRAIN = 512 + NUMBERS, 176  # of eight bytes: bounds of the mem
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains
 FIRST, SECOND = range(2)  # rows of the ends of a pair, and of a contact
+WAITING, DONE = 1, 2  # of a grain in the search of clusters; 0 before it is reached
 ACROSS, ROW = range(2)  # rows of the images: r_i − r_j − (across, row·L) is the separation
 STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the search
 NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
-PULL_X, PULL_Y, DRIVE, IX, IY, JX, JY, MOBILITY, P = range(9)  # columns of what a contact brings to the solver
+PULL_X, PULL_Y, DRIVE, MOBILITY, TURN_I, TURN_J, P = range(7)  # columns of what a contact brings to the solver
 AT_STEP, ACTED, CONTACTS, TILTED, RECORD_HEAD = range(5)  # columns of a record; behind them its grains and contacts
 RECORD_OF_GRAIN, RECORD_OF_CONTACT = 4, 7  # numbers of a record for each grain, and for each contact
 RESPONSE, STEP, CHANGE, BEST, BOUND = range(5)  # columns of the same for a stiff cluster
@@ -104,16 +105,20 @@ class Network(NamedTuple):
 class Clusters(NamedTuple):
     """Contacts that touch each other, sorted by cluster, and the memory of their solver.
 
-    source: (contacts,) places in the network; those of cluster m at ``starts[m] : starts[m + 1]``; parent, number:
-    (grains,) for the search of clusters; scratch: (2, contacts); rows: (contacts, 9); stiff: (contacts, 5);
-    turns: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
+    source: (contacts,) places in the network; those of cluster m at ``starts[m] : starts[m + 1]``; of_grain:
+    (2 contacts,) contacts of the grains, those of grain g from ``offsets[g]`` on; queue, reached: (grains,) for the
+    search of clusters. Of the cluster that is solved: places: (contacts,) in the network; ends: (contacts, 2) grains;
+    rows: (contacts, 8); stiff: (contacts, 5); turns: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
     """
 
     source: Any
     starts: Any
-    parent: Any
-    number: Any
-    scratch: Any
+    of_grain: Any
+    offsets: Any
+    queue: Any
+    reached: Any
+    places: Any
+    ends: Any
     rows: Any
     stiff: Any
     turns: Any

@@ -8,8 +8,8 @@ the same sums. It differs in what it visits:
 - *Fly.* Of every near pair the ``calendar`` knows in which steps it will be a contact. The next step to visit is its
   smallest entry. Flight moves nothing: positions in the laboratory are r + v t, with t counted from the search.
 - *Collide.* The contacts of a step fall into clusters. Isolated pairs have a closed form; the others are solved
-  cluster by cluster (``cluster_solver``). A cluster in which nothing approaches needs no impulses. Each may leave the
-  share of the permitted squared residual that its number of contacts has in those of all clusters.
+  cluster by cluster (``cluster_solver``). A cluster in which nothing approaches needs no impulses. Of the permitted
+  squared residual that the clusters before it have not used, each may leave the share of its number of contacts.
 - *Renew the calendar.* An impulse changes the entries of the struck grains' pairs, and no others.
 - *Deliver.* At the end of a list the grains are moved to where they are.
 """
@@ -25,7 +25,7 @@ from jaxgran.dynamics.machine_code.calendar import (
     predict_contact_steps,
 )
 from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
-from jaxgran.dynamics.machine_code.compiled import LAW, compiled
+from jaxgran.dynamics.machine_code.compiled import LAW, called, compiled
 from jaxgran.dynamics.machine_code.layout import (
     CAPACITY,
     EPSILON,
@@ -57,7 +57,7 @@ from jaxgran.dynamics.machine_code.near_pairs import (
     search,
     skin_loss,
 )
-from jaxgran.dynamics.machine_code.network import gather_kicks, make_network, solve_isolated, sort_by_cluster
+from jaxgran.dynamics.machine_code.network import find_clusters, gather_kicks, make_network, solve_isolated
 from jaxgran.dynamics.machine_code.records import record_contacts, record_flight
 from jaxgran.dynamics.machine_code.sums import add_contacts, add_flight, add_solve
 
@@ -67,7 +67,7 @@ _PAIRS_PER_GRAIN = 2.7  # expected within the skin: wide lists cost the events, 
 _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
-@compiled
+@called
 def advance_loop(
     positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, records, arrays, stop
 ):
@@ -181,7 +181,7 @@ def advance_loop(
     results[STATUS], results[TILT], results[SOLVED], results[RECORDED] = status, tilt, solved, recorded
 
 
-@compiled
+@called
 def _take_grains(positions, velocities, radii, masses, places, rate, grains):
     """Take the grains, with velocities of the laboratory; returns the largest diameter and whether all is finite."""
     motion, constants = grains.motion, grains.constants
@@ -203,15 +203,15 @@ def _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, res
     hits, squared_scale, deepest = make_network(contacts, t, flow, grains, pairs, network)
     scale = math.sqrt(squared_scale)
     target = residual_target(scale, flow.tolerance, flow.rate, EPSILON)
-    coupled = solve_isolated(contacts, grains, network, clusters)
-    iterations, squared, outcome = 1, 0.0, OK
-    if coupled > 0:
-        found = sort_by_cluster(coupled, network, clusters)
+    iterations, squared, spare, outcome = 1, 0.0, target * target, OK
+    if solve_isolated(contacts, grains, network) > 0:
+        found = find_clusters(contacts, hits, network, clusters)
         starts = clusters.starts
         for m in range(found):
-            share = target * target * (starts[m + 1] - starts[m]) / starts[found]
+            share = spare * (starts[m + 1] - starts[m]) / (starts[found] - starts[m])
             needed, left, missed = solve_cluster(m, share, flow.most_iterations, grains, network, clusters)
             iterations, squared, outcome = max(iterations, needed), squared + left, max(outcome, missed)
+            spare -= left if left < share else share
     residual = relative_residual(math.sqrt(squared), scale, target)
     gather_kicks(contacts, hits, flow.bounce, network)
     add_contacts(results, step_sums, contacts, flow.bounce, grains, network)
@@ -230,7 +230,7 @@ def _strike(hits, t, rate, grains, network, clusters, kinetic, fastest):
     finite = True
     for h in range(hits):
         g = touched[h]
-        network.degree[g], clusters.parent[g], clusters.number[g], network.loaded[g] = 0, g, -1, 0
+        network.degree[g], clusters.reached[g], network.loaded[g] = 0, 0, 0
         px, py = kicks[g, 0], kicks[g, 1]
         ax, ay = px * constants[g, INVERSE_MASS], py * constants[g, INVERSE_MASS]
         if ax != 0.0 or ay != 0.0:
@@ -275,7 +275,7 @@ def _move(t, grains):
         motion[g, Y] += motion[g, VY] * t
 
 
-@compiled
+@called
 def _deliver(places, rate, grains, new_positions, new_velocities):
     """Positions and peculiar velocities of the grains, in the order in which they were given."""
     motion = grains.motion

@@ -104,10 +104,13 @@ def _clusters_of(memory, count, turns):
     return Clusters(
         _unsigned(_part(memory, size, 4), (size,)),
         _unsigned(_part(memory, size + 1, 4), (size + 1,)),
+        _unsigned(_part(memory, 2 * size, 4), (2 * size,)),
+        _unsigned(_part(memory, count, 4), (count,)),
         _unsigned(_part(memory, count, 4), (count,)),
         _signed(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, 2 * size, 4), (2, size)),
-        doubles(_part(memory, 9 * size, 8), (size, 9)),
+        _unsigned(_part(memory, size, 4), (size,)),
+        _unsigned(_part(memory, 2 * size, 4), (size, 2)),
+        doubles(_part(memory, 8 * size, 8), (size, 8)),
         doubles(_part(memory, 5 * size, 8), (size, 5)),
         turns,
         doubles(_part(memory, 3 * count, 8), (count, 3)),
@@ -134,6 +137,5 @@ def arrays_of(memory, count):
     for g in range(count if fits else 0):
         network.degree[g] = network.loaded[g] = 0
         network.kicks[g, 0] = network.kicks[g, 1] = 0.0
-        clusters.parent[g] = g
-        clusters.number[g] = -1
+        clusters.reached[g] = 0
     return Arrays(grains, pairs, network, clusters, order, step_sums), fits

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.machine_code.compiled import compiled
+from jaxgran.dynamics.machine_code.compiled import called, compiled
 from jaxgran.dynamics.machine_code.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
 
 LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
@@ -18,7 +18,7 @@ def skin_loss(fastest, rate, distance):
     return 2 * fastest * (1 + LIFE) + rate * distance / 2
 
 
-@compiled
+@called
 def put_in_order(positions, side, tilt, order):
     """Write an order that keeps neighbours close in memory: row by row, where a flow outgrows the caches."""
     given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
@@ -56,7 +56,7 @@ def bring_into_cell(grains, side, tilt, rate):
     return math.sqrt(fastest)
 
 
-@compiled
+@called
 def search(grains, pairs, side, tilt, largest, skin):
     """Write the pairs with a gap within a skin, which is made narrower where there is no room for all of them.
 
@@ -74,7 +74,7 @@ def search(grains, pairs, side, tilt, largest, skin):
     return kept, skin, found <= room
 
 
-@compiled
+@called
 def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
     """Write the pairs with a gap within the skin, and their images; what there is no room for is only counted."""
     motion, constants = grains.motion, grains.constants

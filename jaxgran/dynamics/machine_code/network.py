@@ -7,6 +7,7 @@ from jaxgran.dynamics.machine_code.compiled import compiled
 from jaxgran.dynamics.machine_code.layout import (
     APPROACH,
     DISTANCE,
+    DONE,
     FIRST,
     IMPULSE,
     INVERSE_MASS,
@@ -14,6 +15,7 @@ from jaxgran.dynamics.machine_code.layout import (
     NY,
     RADIUS,
     SECOND,
+    WAITING,
 )
 
 
@@ -43,10 +45,9 @@ def make_network(contacts, t, flow, grains, pairs, network):
 
 
 @compiled
-def solve_isolated(contacts, grains, network, clusters):
-    """Write the impulses of isolated pairs; collect the other contacts, and join their grains. Returns their number."""
+def solve_isolated(contacts, grains, network):
+    """Write the impulses of isolated pairs; returns the number of the other contacts."""
     ends, rows, degree, constants = network.ends, network.rows, network.degree, grains.constants
-    source, parent = clusters.source, clusters.parent
     coupled = 0
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
@@ -54,53 +55,52 @@ def solve_isolated(contacts, grains, network, clusters):
             mobility = constants[i, INVERSE_MASS] + constants[j, INVERSE_MASS]
             rows[IMPULSE, c] = max(0.0, -rows[APPROACH, c]) / mobility
         else:
-            source[coupled] = c
             coupled += 1
-            parent[_root(parent, i)] = _root(parent, j)
     return coupled
 
 
 @compiled
-def _root(parent, grain):
-    """A grain that stands for the cluster of the given one."""
-    while parent[grain] != grain:
-        parent[grain] = parent[parent[grain]]
-        grain = parent[grain]
-    return grain
+def find_clusters(contacts, hits, network, clusters):
+    """Find the clusters in which a contact approaches, each from such a contact outwards, neighbours after neighbours.
 
-
-@compiled
-def sort_by_cluster(coupled, network, clusters):
-    """Number the clusters in which a contact approaches, and sort the contacts of these by cluster.
-
-    Returns the number of clusters; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
+    Returns their number; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
     """
-    source, starts, parent, number = clusters.source, clusters.starts, clusters.parent, clusters.number
-    scratch, ends, rows = clusters.scratch, network.ends, network.rows
-    found = 0
-    for n in range(coupled):
-        root = _root(parent, ends[FIRST, source[n]])
-        scratch[1, n] = root
-        if rows[APPROACH, source[n]] < 0.0 and number[root] < 0:
-            number[root] = found
-            starts[found] = 0
-            found += 1
-    for n in range(coupled):
-        m = number[scratch[1, n]]
-        if m >= 0:
-            starts[m] += 1
+    ends, rows, degree, touched = network.ends, network.rows, network.degree, network.touched
+    source, starts, queue, reached = clusters.source, clusters.starts, clusters.queue, clusters.reached
+    of_grain, offsets = clusters.of_grain, clusters.offsets
     total = 0
-    for m in range(found):
-        total += starts[m]
-        starts[m] = total
-    starts[found] = total
-    for n in range(coupled - 1, -1, -1):
-        m = number[scratch[1, n]]
-        if m >= 0:
-            starts[m] -= 1
-            scratch[0, starts[m]] = source[n]
-    for n in range(total):
-        source[n] = scratch[0, n]
+    for h in range(hits):
+        total += degree[touched[h]]
+        offsets[touched[h]] = total
+    for c in range(contacts):
+        for end in range(2):
+            g = ends[end, c]
+            offsets[g] -= 1
+            of_grain[offsets[g]] = c
+    found = size = 0
+    for c in range(contacts):
+        i, j = ends[FIRST, c], ends[SECOND, c]
+        if rows[APPROACH, c] < 0.0 and reached[i] == 0 and (degree[i] > 1 or degree[j] > 1):
+            starts[found] = size
+            found += 1
+            first, last = 0, 1  # of the grains that wait in the queue
+            queue[0] = i
+            reached[i] = WAITING
+            while first < last:
+                g = queue[first]
+                first += 1
+                reached[g] = DONE
+                for q in range(offsets[g], offsets[g] + degree[g]):
+                    n = of_grain[q]
+                    other = ends[SECOND, n] if ends[FIRST, n] == g else ends[FIRST, n]
+                    if reached[other] != DONE:
+                        source[size] = n
+                        size += 1
+                    if reached[other] == 0:
+                        reached[other] = WAITING
+                        queue[last] = other
+                        last += 1
+    starts[found] = size
     return found
 
 
