@@ -50,8 +50,8 @@ MISTAKES = (
     Mistake(
         "half of a closing gap",
         "jaxgran/dynamics/machine_code/calendar.py",
-        "if excess > 0.0 and excess + 2 * closing * horizon > 0.0:",
-        "if excess > 0.0 and excess + 1 * closing * horizon > 0.0:",
+        "late = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)",
+        "late = (excess > 0.0) & (excess + 1 * closing * horizon > 0.0)",
         "every contact that begins while a list is valid is in the calendar",
         _ENGINES,
     ),

@@ -379,7 +379,7 @@ def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin,
     motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
     room = count * (count - 1) // 2
     heads, links = np.empty(max(9, 2 * count), np.int32), np.empty(count, np.int32)
-    memory = layout.Pairs(np.empty((2, room), np.uint32), np.empty((2, room)), None, None, None, heads, links)
+    memory = layout.Pairs(np.empty((2, room), np.uint32), np.empty((2, room)), *3 * [None], heads, links, *3 * [None])
     grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images

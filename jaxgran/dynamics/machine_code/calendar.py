@@ -30,6 +30,9 @@ from jaxgran.dynamics.machine_code.layout import (
 gap_coefficients, gap_discriminant = LAW["gap_coefficients"], LAW["gap_discriminant"]
 touching_time, first_step = LAW["touching_time"], LAW["first_step"]
 
+_NEVER = float(NEVER)
+_TOGETHER = 8  # pairs whose steps are computed together
+
 
 @compiled
 def pair_motion(p, t, flow, grains, pairs):
@@ -44,42 +47,63 @@ def pair_motion(p, t, flow, grains, pairs):
 
 
 @compiled
-def predict_contact_steps(p, t, earliest, horizon, flow, grains, pairs):
-    """Write when, from the step ``earliest`` on, a pair is a contact if neither grain is struck.
+def predict_contact_steps(count, t, earliest, horizon, flow, grains, pairs):
+    """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are not struck.
 
-    ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer valid.
+    ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer valid. Pairs are
+    taken in blocks, and the arithmetic has no branches, so that a processor does it for several pairs at a time.
     """
-    calendar, dt, theta = pairs.calendar, flow.dt, flow.theta
-    i, j, dx, dy, ux, uy = pair_motion(p, t, flow, grains, pairs)
-    reach = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
+    listed, calendar, flights, entries = pairs.listed, pairs.calendar, pairs.flights, pairs.entries
+    for start in range(0, count, LANES):
+        size = min(LANES, count - start)
+        for n in range(size):
+            i, j, dx, dy, ux, uy = pair_motion(listed[start + n], t, flow, grains, pairs)
+            flights[0, n], flights[1, n], flights[2, n], flights[3, n] = dx, dy, ux, uy
+            flights[4, n] = grains.constants[i, RADIUS] + grains.constants[j, RADIUS]
+        for n in range((size + _TOGETHER - 1) // _TOGETHER * _TOGETHER):
+            strikes, begins, ends = _contact_steps(
+                flights[0, n], flights[1, n], flights[2, n], flights[3, n], flights[4, n], t, earliest, horizon, flow
+            )
+            entries[STRIKES, n], entries[BEGINS, n], entries[ENDS, n] = strikes, begins, ends
+        for n in range(size):
+            p = listed[start + n]
+            calendar[STRIKES, p], calendar[BEGINS, p] = entries[STRIKES, n], entries[BEGINS, n]
+            calendar[ENDS, p] = entries[ENDS, n]
+
+
+@compiled
+def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
+    """The entries of the calendar of a pair."""
+    dt, theta = flow.dt, flow.theta
     speed, closing, excess = gap_coefficients(dx, dy, ux, uy, reach)
-    calendar[STRIKES, p], calendar[BEGINS, p], calendar[ENDS, p] = NEVER, NEVER, -1
-    if excess > 0.0 and excess + 2 * closing * horizon > 0.0:
-        return  # apart, and the gap does not close while the list is valid
-    if speed == 0.0:
-        if excess <= 0.0:
-            calendar[BEGINS, p], calendar[ENDS, p] = earliest, NEVER - 1
-        return
     discriminant = gap_discriminant(speed, closing, excess)
-    if not discriminant >= 0.0:
-        return
-    root, per_speed = math.sqrt(discriminant), 1 / speed
+    root, per_speed = math.sqrt(discriminant if discriminant > 0.0 else 0.0), 1 / speed
     turn = _as_step(first_step(t - closing * per_speed, dt, 0.0))  # the first step in which the pair recedes
     enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) * per_speed
-    begin = max(earliest, _as_step(first_step(t + enter, dt, theta)))
-    last = max(turn - 1, _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta)))
-    if begin <= last and begin < MANY:
-        calendar[BEGINS, p], calendar[ENDS, p] = begin, last
-        if begin < turn:
-            calendar[STRIKES, p] = begin
+    begin, last = (
+        _as_step(first_step(t + enter, dt, theta)),
+        _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta)),
+    )
+    begin = begin if begin > earliest else earliest
+    last = last if last > turn - 1 else turn - 1
+    late = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)  # the gap does not close while the list is valid
+    meets = (discriminant >= 0.0) & (begin <= last) & (begin < MANY) & (speed != 0.0)
+    rests = (speed == 0.0) & (excess <= 0.0)
+    begin = begin if meets else (earliest if rests else _NEVER)
+    last = last if meets else (_NEVER - 1 if rests else -1.0)
+    strikes = meets & (begin < turn) & (not late)
+    return (
+        np.int32(begin if strikes else _NEVER),
+        np.int32(_NEVER if late else begin),
+        np.int32(-1.0 if late else last),
+    )
 
 
 @compiled
 def _as_step(number):
     """The number as a step of the calendar: -1 for what is past or no number, and never beyond its end."""
-    if number > MANY:
-        return int(MANY)
-    return int(number) if number > -1.0 else -1
+    number = number if number > -1.0 else -1.0
+    return number if number < MANY else MANY
 
 
 @compiled

@@ -14,7 +14,7 @@ from jaxgran.model.status import Status
 INPUTS = 10  # numbers of a flow and of its advance
 STATUS, TILT, SOLVED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
 RESULTS = NUMBERS + 4
-WORDS, WORDS_PER_GRAIN = 512 + NUMBERS, 176  # of eight bytes: bounds of the memory that ``memory`` cuts up
+WORDS, WORDS_PER_GRAIN = 1024 + NUMBERS, 184  # of eight bytes: bounds of the memory that ``memory`` cuts up
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains
@@ -75,6 +75,7 @@ class Pairs(NamedTuple):
 
     ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; of_grain: (2 room,) pairs of the grains,
     those of grain g at ``offsets[g] : offsets[g + 1]``; heads, links: chains of the grains in each cell of the search.
+    listed: (slots,) pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), memory of this for a block.
     """
 
     ends: Any
@@ -84,6 +85,9 @@ class Pairs(NamedTuple):
     offsets: Any
     heads: Any
     links: Any
+    listed: Any
+    flights: Any
+    entries: Any
 
 
 class Network(NamedTuple):

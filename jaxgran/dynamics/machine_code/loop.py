@@ -120,7 +120,8 @@ def advance_loop(
         life = LIFE / rate if rate > 0.0 else math.inf
         horizon = max(min(slack / loss if loss > 0.0 else math.inf, life), dt) + ahead
         for p in range(found):
-            predict_contact_steps(p, 0.0, solved, horizon, flow, grains, pairs)
+            pairs.listed[p] = p
+        predict_contact_steps(found, 0.0, solved, horizon, flow, grains, pairs)
         blocks = clear_calendar(found, pairs)
 
         if room > 0:
@@ -160,11 +161,8 @@ def advance_loop(
             loss_before, loss = loss, skin_loss(fastest, rate, largest + skin)
             slack -= (loss - loss_before) * ahead
             horizon = max(min(slack / loss, life - t), dt) + ahead
-            _renew_calendar(k, hits, horizon, flow, grains, pairs, network)
-            for c in range(found if overfull else contacts):
-                p = np.uint32(c) if overfull else network.met[c]
-                if pairs.calendar[STRIKES, p] <= k:  # it approached by rounding only, or there was no room for it
-                    predict_contact_steps(p, t, k + 1, horizon, flow, grains, pairs)
+            listed = _list_struck(k, hits, found if overfull else contacts, overfull, pairs, network)
+            predict_contact_steps(listed, t, k + 1, horizon, flow, grains, pairs)
             if 0 < room == recorded:
                 break
 
@@ -230,7 +228,7 @@ def _strike(hits, t, rate, grains, network, clusters, kinetic, fastest):
     finite = True
     for h in range(hits):
         g = touched[h]
-        network.degree[g], clusters.reached[g], network.loaded[g] = 0, 0, 0
+        network.degree[g], clusters.reached[g] = 0, 0
         px, py = kicks[g, 0], kicks[g, 1]
         ax, ay = px * constants[g, INVERSE_MASS], py * constants[g, INVERSE_MASS]
         if ax != 0.0 or ay != 0.0:
@@ -249,21 +247,30 @@ def _strike(hits, t, rate, grains, network, clusters, kinetic, fastest):
 
 
 @compiled
-def _renew_calendar(k, hits, horizon, flow, grains, pairs, network):
-    """Predict the contacts of the struck grains anew, each pair once; clears the impulses."""
-    kicks, touched, ends, offsets, of_grain = network.kicks, network.touched, pairs.ends, pairs.offsets, pairs.of_grain
-    t = k * flow.dt
+def _list_struck(k, hits, contacts, overfull, pairs, network):
+    """List the pairs of the struck grains, each once, for a new prediction; clears the impulses. Returns how many."""
+    kicks, touched, loaded, met = network.kicks, network.touched, network.loaded, network.met
+    ends, offsets, of_grain, listed = pairs.ends, pairs.offsets, pairs.of_grain, pairs.listed
+    count = np.uint64(0)
     for h in range(hits):
         g = touched[h]
-        if kicks[g, 0] != 0.0 or kicks[g, 1] != 0.0:
+        if loaded[g] > 0:
             for q in range(offsets[g], offsets[g + 1]):
                 p = of_grain[q]
-                other = ends[SECOND, p] if ends[FIRST, p] == g else ends[FIRST, p]
-                # each pair once: of two struck grains the one with the smaller number predicts it
-                if other > g or (kicks[other, 0] == 0.0 and kicks[other, 1] == 0.0):
-                    predict_contact_steps(p, t, k + 1, horizon, flow, grains, pairs)
+                other = ends[FIRST, p] ^ ends[SECOND, p] ^ g
+                listed[count] = p
+                # each pair once: of two struck grains the one with the smaller number lists it
+                count += np.uint64((other > g) | (loaded[other] == 0))
+    for c in range(contacts):
+        p = np.uint32(c) if overfull else met[c]
+        if pairs.calendar[STRIKES, p] <= k and loaded[ends[FIRST, p]] == 0 and loaded[ends[SECOND, p]] == 0:
+            listed[count] = p  # it approached by rounding only, or there was no room for it
+            count += np.uint64(1)
     for h in range(hits):
-        kicks[touched[h], 0] = kicks[touched[h], 1] = 0.0
+        g = touched[h]
+        kicks[g, 0] = kicks[g, 1] = 0.0
+        loaded[g] = 0
+    return np.int64(count)
 
 
 @compiled

@@ -79,6 +79,9 @@ def _pairs_of(memory, count):
         _unsigned(_part(memory, count + 1, 4), (count + 1,)),
         _signed(_part(memory, cells, 4), (cells,)),
         _signed(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, slots, 4), (slots,)),
+        doubles(_part(memory, 5 * LANES, 8), (5, LANES)),
+        _signed(_part(memory, 3 * LANES, 4), (3, LANES)),
     )
 
 
