@@ -378,8 +378,9 @@ def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin,
     motion[:, :2] = rng.uniform(0, side, (count, 2))
     motion[:, 0] -= np.floor((motion[:, 0] - tilt * motion[:, 1]) / side) * side
     room = count * (count - 1) // 2
-    heads, links = np.empty(max(9, 2 * count), np.int32), np.empty(count, np.int32)
-    memory = layout.Pairs(np.empty((2, room), np.uint32), np.empty((2, room)), *3 * [None], heads, links, *3 * [None])
+    cells = np.empty(max(9, 2 * count) + 1, np.uint32), *np.empty((2, count), np.uint32), np.empty((3, count))
+    listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
+    memory = layout.Pairs(*listed, *3 * [None], *cells, *3 * [None])
     grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images

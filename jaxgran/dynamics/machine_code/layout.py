@@ -14,7 +14,7 @@ from jaxgran.model.status import Status
 INPUTS = 10  # numbers of a flow and of its advance
 STATUS, TILT, SOLVED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
 RESULTS = NUMBERS + 4
-WORDS, WORDS_PER_GRAIN = 1024 + NUMBERS, 184  # of eight bytes: bounds of the memory that ``memory`` cuts up
+WORDS, WORDS_PER_GRAIN = 1024 + NUMBERS, 187  # of eight bytes: bounds of the memory that ``memory`` cuts up
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains
@@ -71,10 +71,11 @@ class Order(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Near pairs, filled up to whole ``LANES``.
+    """Near pairs, filled up to whole ``LANES``, with a slot for one that there is no room for.
 
     ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; of_grain: (2 room,) pairs of the grains,
-    those of grain g at ``offsets[g] : offsets[g + 1]``; heads, links: chains of the grains in each cell of the search.
+    those of grain g at ``offsets[g] : offsets[g + 1]``. For the search: starts: (cells + 1,); cells, sorted: (grains,)
+    the cell of each grain, and the grains in the order of the cells; places: (3, grains) x, y and radius of these.
     listed: (slots,) pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), memory of this for a block.
     """
 
@@ -83,8 +84,10 @@ class Pairs(NamedTuple):
     calendar: Any
     of_grain: Any
     offsets: Any
-    heads: Any
-    links: Any
+    starts: Any
+    cells: Any
+    sorted: Any
+    places: Any
     listed: Any
     flights: Any
     entries: Any

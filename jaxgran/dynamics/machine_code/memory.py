@@ -70,15 +70,17 @@ def _part(memory, items, size):
 @compiled
 def _pairs_of(memory, count):
     room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
-    slots, cells = (room + LANES - 1) // LANES * LANES, max(9, 2 * count)
+    slots, cells = (room + LANES) // LANES * LANES, max(9, 2 * count)
     return Pairs(
         _unsigned(_part(memory, 2 * slots, 4), (2, slots)),
         doubles(_part(memory, 2 * slots, 8), (2, slots)),
         _signed(_part(memory, 3 * slots, 4), (3, slots)),
         _unsigned(_part(memory, 2 * room, 4), (2 * room,)),
         _unsigned(_part(memory, count + 1, 4), (count + 1,)),
-        _signed(_part(memory, cells, 4), (cells,)),
-        _signed(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, cells + 1, 4), (cells + 1,)),
+        _unsigned(_part(memory, count, 4), (count,)),
+        _unsigned(_part(memory, count, 4), (count,)),
+        doubles(_part(memory, 3 * count, 8), (3, count)),
         _unsigned(_part(memory, slots, 4), (slots,)),
         doubles(_part(memory, 5 * LANES, 8), (5, LANES)),
         _signed(_part(memory, 3 * LANES, 4), (3, LANES)),

@@ -77,51 +77,91 @@ def search(grains, pairs, side, tilt, largest, skin):
 @called
 def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
     """Write the pairs with a gap within the skin, and their images; what there is no room for is only counted."""
-    motion, constants = grains.motion, grains.constants
-    ends, images, heads, links = pairs.ends, pairs.images, pairs.heads, pairs.links
-    count, found = motion.shape[0], 0
-    most = math.sqrt(heads.size)
+    most = math.sqrt(pairs.starts.size - 1)
     up, along = int(min(most, side / reach)), int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
-    small = not (up >= 3 and along >= 3)  # all pairs, by nearest images
-    cells = 1 if small else up * along
-    for cell in range(cells):
-        heads[cell] = -1
-    for g in range(count):
-        cell = 0
-        if not small:
-            row = min(max(int(motion[g, Y] / side * up), 0), up - 1)
-            fraction = (motion[g, X] - tilt * motion[g, Y]) / side
-            cell = row * along + min(max(int(fraction * along), 0), along - 1)
-        links[g] = heads[cell]
-        heads[cell] = g
-    for cell in range(cells):
-        for k in range(1 if small else 5):  # the cell itself, its right neighbour, and the three above
-            above, beside = cell // along + (k >= 2), cell % along + (k - 3 if k >= 2 else k)
-            row, column = 0, 0
-            if above == up and not small:
-                above, row = 0, 1
-            if beside == along and not small:
-                beside, column = 0, 1
-            elif beside < 0:
-                beside, column = along - 1, -1
-            shift = (column + row * tilt) * side
-            i = heads[cell]
-            while i >= 0:
-                j = links[i] if k == 0 else heads[above * along + beside]
-                while j >= 0:
-                    dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
-                    if small:
-                        row = int(np.rint(dy / side))
-                        shift = np.rint((dx - row * tilt * side) / side) * side + row * tilt * side
-                    dx, dy = dx - shift, dy - row * side
-                    limit = constants[i, RADIUS] + constants[j, RADIUS] + skin
-                    if dx * dx + dy * dy <= limit * limit:
-                        if found < room:
-                            ends[FIRST, found], ends[SECOND, found] = i, j
-                            images[ACROSS, found], images[ROW, found] = shift, row
-                        found += 1
-                    j = links[j]
-                i = links[i]
+    if up >= 3 and along >= 3:
+        _sort_into_cells(grains, pairs, side, tilt, up, along)
+        return _pairs_of_cells(pairs, side, tilt, up, along, skin, room)
+    return _pairs_of_all(grains, pairs, side, tilt, skin, room)
+
+
+@compiled
+def _sort_into_cells(grains, pairs, side, tilt, up, along):
+    """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell + 1]``."""
+    motion, constants = grains.motion, grains.constants
+    starts, cells, sorted_grains, places = pairs.starts, pairs.cells, pairs.sorted, pairs.places
+    for cell in range(up * along + 1):
+        starts[cell] = 0
+    for g in range(motion.shape[0]):
+        row = min(max(int(motion[g, Y] / side * up), 0), up - 1)
+        fraction = (motion[g, X] - tilt * motion[g, Y]) / side
+        cells[g] = row * along + min(max(int(fraction * along), 0), along - 1)
+        starts[cells[g] + 1] += 1
+    for cell in range(up * along):
+        starts[cell + 1] += starts[cell]
+    for g in range(motion.shape[0] - 1, -1, -1):  # a cell is filled from its end, which moves to its beginning
+        starts[cells[g] + 1] -= 1
+        n = starts[cells[g] + 1]
+        sorted_grains[n] = g
+        places[0, n], places[1, n], places[2, n] = motion[g, X], motion[g, Y], constants[g, RADIUS]
+    for cell in range(up * along):
+        starts[cell] = starts[cell + 1]
+    starts[up * along] = motion.shape[0]
+
+
+@compiled
+def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
+    """Pairs within each cell, with its right neighbour, and with the three above it."""
+    starts, sorted_grains, places = pairs.starts, pairs.sorted, pairs.places
+    ends, images = pairs.ends, pairs.images
+    found = 0
+    for cell in range(up * along):
+        row, column = cell // along, cell % along
+        above, over = (row + 1) * along, 0
+        if row + 1 == up:
+            above, over = 0, 1
+        for part in range(4):  # stretches of cells in a row, those across the boundary apart
+            begin = end = across = lift = 0
+            if part == 0:
+                end = starts[cell + 1 if column + 1 == along else cell + 2]
+            elif part == 1 and column + 1 == along:
+                begin, end, across = starts[row * along], starts[row * along + 1], 1
+            elif part == 2:
+                begin, end = starts[above + max(column - 1, 0)], starts[above + min(column + 2, along)]
+                lift = over
+            elif part == 3 and column == 0:
+                begin, end, across, lift = starts[above + along - 1], starts[above + along], -1, over
+            elif part == 3 and column + 1 == along:
+                begin, end, across, lift = starts[above], starts[above + 1], 1, over
+            shift, rise = (across + lift * tilt) * side, lift * side
+            for m in range(starts[cell], starts[cell + 1]):
+                i, x, y, width = sorted_grains[m], places[0, m] - shift, places[1, m] - rise, places[2, m] + skin
+                for n in range(m + 1 if part == 0 else begin, end):
+                    dx, dy, limit = x - places[0, n], y - places[1, n], width + places[2, n]
+                    at = np.uint64(min(found, room))  # without a branch, which would be mispredicted
+                    ends[FIRST, at], ends[SECOND, at] = i, sorted_grains[n]
+                    images[ACROSS, at], images[ROW, at] = shift, lift
+                    found += dx * dx + dy * dy <= limit * limit
+    return found
+
+
+@compiled
+def _pairs_of_all(grains, pairs, side, tilt, skin, room):
+    """Pairs of a cell that is too narrow for others within it, by nearest images."""
+    motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
+    found = 0
+    for i in range(motion.shape[0]):
+        for j in range(i):
+            dx, dy = motion[i, X] - motion[j, X], motion[i, Y] - motion[j, Y]
+            row = int(np.rint(dy / side))
+            shift = np.rint((dx - row * tilt * side) / side) * side + row * tilt * side
+            dx, dy = dx - shift, dy - row * side
+            limit = constants[i, RADIUS] + constants[j, RADIUS] + skin
+            if dx * dx + dy * dy <= limit * limit:
+                if found < room:
+                    ends[FIRST, found], ends[SECOND, found] = i, j
+                    images[ACROSS, found], images[ROW, found] = shift, row
+                found += 1
     return found
 
 
