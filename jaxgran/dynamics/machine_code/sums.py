@@ -19,6 +19,8 @@ contact_terms, kinetic_means = LAW["contact_terms"], LAW["kinetic_means"]
 
 _EDGES = RESIDUAL_EDGES[1:-1]
 _FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
+_PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
+_PADS = (0.0,) * (_PADDED - _TERMS)
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
 _SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
 _UNCONVERGED, _COUNTS = place_of("unconverged"), place_of("residual_counts")
@@ -45,7 +47,7 @@ def add_flight(sums, steps, flight, turned, kinetic):
 def add_contacts(sums, step_sums, contacts, bounce, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is memory for it."""
     ends, rows, kicks, loaded, constants = network.ends, network.rows, network.kicks, network.loaded, grains.constants
-    for n in range(_TERMS):
+    for n in range(_PADDED):
         step_sums[n] = 0.0
     for c in range(contacts):
         i, j = ends[FIRST, c], ends[SECOND, c]
@@ -53,22 +55,25 @@ def add_contacts(sums, step_sums, contacts, bounce, grains, network):
         mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
         impulse = bounce * rows[IMPULSE, c]
         change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (kicks[i, 1] * mi - kicks[j, 1] * mj)
-        terms = contact_terms(
-            nx,
-            ny,
-            distance,
-            max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
-            approach,
-            change / 2,
-            bounce,
-            impulse,
-            -bounce * min(approach, 0.0) / (mi + mj),
-            impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
-            1.0,
-            1.0 if impulse > 0.0 else 0.0,
-            1.0 if approach < 0.0 else 0.0,
+        terms = (
+            contact_terms(
+                nx,
+                ny,
+                distance,
+                max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
+                approach,
+                change / 2,
+                bounce,
+                impulse,
+                -bounce * min(approach, 0.0) / (mi + mj),
+                impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
+                1.0,
+                1.0 if impulse > 0.0 else 0.0,
+                1.0 if approach < 0.0 else 0.0,
+            )
+            + _PADS
         )
-        for n in range(_TERMS):
+        for n in range(_PADDED):
             step_sums[n] += terms[n]
     for n in range(_TERMS):
         sums[_FIRST_TERM + n] += step_sums[n]
