@@ -80,11 +80,9 @@ def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     root, per_speed = math.sqrt(discriminant if discriminant > 0.0 else 0.0), 1 / speed
     turn = _as_step(first_step(t - closing * per_speed, dt, 0.0))  # the first step in which the pair recedes
     enter = touching_time(closing, excess, root) if closing < 0.0 else -(root + closing) * per_speed
-    begin, last = (
-        _as_step(first_step(t + enter, dt, theta)),
-        _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta)),
-    )
+    begin = _as_step(first_step(t + enter, dt, theta))
     begin = begin if begin > earliest else earliest
+    last = _as_step(np.floor((t + (root - closing) * per_speed) / dt - theta))
     last = last if last > turn - 1 else turn - 1
     late = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)  # the gap does not close while the list is valid
     meets = (discriminant >= 0.0) & (begin <= last) & (begin < MANY) & (speed != 0.0)
