@@ -210,6 +210,13 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "observe_cost",
+        "What does an observable of one's own cost, to compile and in each sample?",
+        (2, 1),
+        ("observe_cost.json",),
+        one_core=True,
+    ),
+    Benchmark(
         "startup",
         "How long does a command take from the prompt to its end, and where does the time go?",
         (3, 1),
