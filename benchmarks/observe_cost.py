@@ -57,9 +57,7 @@ def run(output: Output) -> None:
             with_it = median(sampled(way, state, observe) for _ in range(REPEATS))
             row = {"engine": engine, "packing_fraction": nu, "timestep": dt, "compilation": first - with_it}
             rows.append(row | {"with": with_it, "without": without})
-            print(
-                f"{engine:13}{nu:5g}{dt:7g}{first - with_it:18.1f}{with_it:11.3f}{without:14.3f}{with_it / without:8.1f}",
-                flush=True,
-            )
+            numbers = f"{first - with_it:18.1f}{with_it:11.3f}{without:14.3f}{with_it / without:8.1f}"
+            print(f"{engine:13}{nu:5g}{dt:7g}{numbers}", flush=True)
     head = {"grains": FLOW.grains, "restitution": FLOW.restitution, "tolerance": FLOW.tolerance, "strain": STRAIN}
     output.write_rows("observe_cost", {"run": head | {"repeats": REPEATS, "unit": "CPU seconds"}}, "rows", rows)
