@@ -9,7 +9,7 @@ from jaxgran.model.checks import shown
 
 UsageError: Any = typer.BadParameter.__base__  # typer raises it for options that it cannot read
 _LONGEST_SENTENCE = 500  # characters; a quoted value may be longer
-_KINDS_OF_NUMBER = {"integer": "a whole number", "number": "a number"}
+_KINDS_OF_NUMBER = {"integer": "a whole number", "number": "a number", "float": "a number"}
 _COMMON_MISTAKES = {
     "--alpha": "--restitution",
     "-a": "--restitution",
@@ -68,7 +68,7 @@ def _words(mistake: Any, arguments: list[str]) -> str:
     found = re.match(r"Got unexpected extra argument\(?s?\)? \((.*)\)", words, re.DOTALL)
     if found:
         return f"{shown(found[1])} stands alone, and values follow their options; a list has commas and no spaces"
-    found = re.search("should be a valid (integer|number)", words)
+    found = re.search("(?:should be|is not) a valid (integer|number|float)", words)  # the latter before typer 0.29
     if found and parameter is not None:
         given = _given(arguments, parameter.opts[0])
         return f"{parameter.opts[0]} must be {_KINDS_OF_NUMBER[found[1]]}" + (

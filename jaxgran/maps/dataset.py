@@ -5,6 +5,7 @@ import os
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import xarray as xr
 
 from jaxgran import environment
 from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.error_variables import error_variables
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import BOUNDS, large_system_variables
@@ -20,7 +22,6 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.choices import Engine
 from jaxgran.model.status import Status
-from jaxgran.sampling.budget import BUDGET
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.memory import memory_strain
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
@@ -52,7 +53,6 @@ def map_dataset(
     NAME_error_PART               point                 its errors of PART timestep, size and tolerance, for the names
                                                         in ``BUDGET``
     NAME_error                    point                 its whole error, half the width of an interval of 95 %
-    point_grains                  point                 number of grains, if it was chosen by point
     NAME_correlation_strain       point                 strain of one independent sample, for averages of scalars
     NAME_by_seed                  (point, seed)         average of each seed
     theory_NAME                   point                 prediction of kinetic theory, for the names in ``THEORY``
@@ -75,8 +75,19 @@ def map_dataset(
 
     A point is (packing_fraction, restitution). If the settings have a list of numbers of grains or of time steps, the
     dimensions grains and timestep come before these. Only a map with the dimension grains has the last three kinds of
-    variables, see ``large_system_estimate``. Tensors have the dimensions (axis_a, axis_b) last. Attributes of the
-    variables give their units.
+    variables, see ``large_system_estimate``. Tensors have the dimensions (axis_a, axis_b) last. ``conventions`` lists
+    the attributes of the variables.
+
+    ============================  ====================  =============================================================
+    coordinate                    dimensions            meaning
+    ============================  ====================  =============================================================
+    packing_fraction,              of their own          values of the plane
+    restitution
+    grains, timestep              of their own or none  values of a list, or the one of all points
+    point_grains                  point                 number of grains, if it was chosen by point
+    seed                          seed                  0, 1, …: number of the replica, from ``first_seed`` on
+    direction_a, direction_b      axis_a, axis_b        "x" and "y": of the centre-to-centre vector, of the force
+    ============================  ====================  =============================================================
 
     Args:
       settings: the map.
@@ -139,9 +150,6 @@ def map_dataset(
         seed_dims = (*point_dims, "seed", *tensor_dims)
         variables[f"{name}_by_seed"] = (seed_dims, by_seed[name].reshape(*shape, seeds, *_tensor_shape(name)), attrs)
     variables |= error_variables(settings, point_dims, values, errors, OBSERVABLES)
-    for name in BUDGET:
-        linked = (f"{name}_stderr", f"{name}_error", "status")
-        variables[name][2]["ancillary_variables"] = " ".join(linked)
     if "grains" in settings.axes:
         averages = {name: (values[name].reshape(shape), errors[name].reshape(shape)) for name in BOUNDS}
         variables |= large_system_variables(point_dims[1:], settings.sizes, averages, OBSERVABLES)
@@ -195,11 +203,26 @@ def map_dataset(
     )
     coordinates = {
         **{name: (name, list(values), _AXES[name]) for name, values in settings.axes.items()},
-        "seed": ("seed", np.arange(seeds), {"long_name": "seed of the random numbers"}),
-        "axis_a": ("axis_a", ["x", "y"], {"long_name": "direction of the centre-to-centre vector"}),
-        "axis_b": ("axis_b", ["x", "y"], {"long_name": "direction of the force"}),
+        **{name: ((), value, _AXES[name]) for name, value in _single(settings).items()},
+        **{name: variables.pop(name) for name in ("point_grains",) if name in variables},
+        "seed": ("seed", np.arange(seeds), {"long_name": "seed of the random numbers, from the first", "units": "1"}),
+        "direction_a": ("axis_a", ["x", "y"], {"long_name": "direction of the centre-to-centre vector"}),
+        "direction_b": ("axis_b", ["x", "y"], {"long_name": "direction of the force"}),
     }
-    return xr.Dataset(variables, coordinates, {**run_attributes(settings), **run})
+    return follow_conventions(xr.Dataset(variables, coordinates, {**run_attributes(settings), **_history(run), **run}))
+
+
+def _single(settings: MapSettings) -> dict[str, float]:
+    """Number of grains and time step, where all points of a map have the same."""
+    values = {"timestep": settings.timestep}
+    if settings.grains_by_point is None:
+        values["grains"] = settings.grains
+    return {name: value for name, value in values.items() if name not in settings.axes}
+
+
+def _history(run: Mapping[str, Any]) -> dict[str, str]:
+    """When and by what a map was made, in the form of CF; a command that goes on with a map is the last one."""
+    return {"history": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} {run.get('command', 'jaxgran.ratio_map')}"}
 
 
 def _predictions(settings: MapSettings) -> dict[str, np.ndarray]:
@@ -225,8 +248,29 @@ def _worst(status: np.ndarray) -> np.ndarray:
 def run_attributes(settings: MapSettings) -> dict[str, Any]:
     """All parameters of the run, in types that NetCDF can store.
 
-    ``engine`` and ``solver`` are those that run; numbers of grains may have different ones on a GPU. ``engine_asked``
-    and ``solver_asked`` are those of the settings.
+    ==========================  =======================================================================================
+    attribute                   meaning
+    ==========================  =======================================================================================
+    title, Conventions          what the file is, and the version of the CF conventions
+    restitution, …, first_seed  the settings by their names in ``ratio_map``
+    engine, solver              what ran; numbers of grains may have different ones on a GPU
+    engine_asked, solver_asked  what was asked for
+    equilibrate                 strain before the sample, or "until steady"
+    timestep_unit               of the time step
+    strain_meaning              of the strain
+    shear_rate                  γ̇
+    polydispersity,             of the grains
+    size_distribution
+    max_iterations              of a contact solve
+    precision, device,          what it was computed with; the commit is empty outside a repository
+    platform, python, commit
+    version_PACKAGE             version of jaxgran and of packages that the numbers depend on
+    history, command            when and by what command the map was made
+    automatic_choice            what was chosen by ``auto``, in words
+    workers, resumed_replicas   number of processes, and of replicas that an earlier process left
+    wall_time_seconds,          of the last process
+    replica_steps_per_second
+    ==========================  =======================================================================================
     """
     parameters = asdict(settings)
     equilibrate = parameters.pop("equilibrate")
@@ -238,7 +282,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     solvers = [solver_in_use(engine, settings.solver) for engine in engines]
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
-        "Conventions": "CF-1.11",
+        "Conventions": CONVENTIONS,
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
         "snapshots": int(settings.snapshots),  # NetCDF has no True and False
         "engine": ", ".join(dict.fromkeys(engines)),

@@ -32,7 +32,8 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
     content = BytesIO()
-    data.to_netcdf(content, engine="h5netcdf")
+    known = {name: {"_FillValue": None} for name in data.coords}  # CF: a coordinate has no missing values
+    data.to_netcdf(content, engine="h5netcdf", encoding=known)
     with replaced(path) as temporary:
         temporary.write_bytes(content.getvalue() + _MARK + hashlib.sha256(content.getbuffer()).digest())
 

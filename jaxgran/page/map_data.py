@@ -130,7 +130,7 @@ def _observables(data: xr.Dataset, name: str, dims: list[str]) -> Iterator[dict[
         yield {
             "name": _text(name + component),
             "meaning": _text(about.get("long_name", name.replace("_", " "))) + component.replace("_", ", "),
-            "unit": _unit(about.get("units", "")),
+            "unit": _unit(about.get("reduced_unit", about.get("units", ""))),
             **{part: _numbers(values) for part, values in columns.items()},
         }
 

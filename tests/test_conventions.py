@@ -1,0 +1,110 @@
+"""A map follows the CF conventions, in the judgement of their checker."""
+
+import re
+import subprocess
+import sys
+from dataclasses import fields
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic import random_instant, random_replica
+
+from jaxgran.maps.conventions import CONVENTIONS
+from jaxgran.maps.dataset import map_dataset, run_attributes
+from jaxgran.maps.results import read_dataset, write_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.status import Status
+from jaxgran.sampling.observables import OBSERVABLES
+
+# One observable of each kind: the checker takes a time that grows with the square of the number of variables.
+KINDS = ("force_ratio", "max_overlap", "median_residual", "contact_stress", "local_granular", "theory_loss_contact_p")
+KINDS += ("enskog_contact_p", "theory_gran", "friction_error", "snapshot", "status", "memory", "strain", "timestep")
+# CF 7.3.4 accepts standard names, such as time, in cell_methods; the checker knows names of coordinates only.
+SKIPPED = ("--skip-checks", "check_cell_methods:M")
+
+
+def made(**choices) -> xr.Dataset:
+    """Return a map of random numbers with instants, by settings of one's own."""
+    settings = MapSettings((0.5, 0.9), (0.5, 0.6), seeds=2, strain=2.0, snapshots=True, **choices)
+    rng, points = np.random.default_rng(0), len(settings.flows())
+    found = {
+        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(instant=random_instant(point))
+        for point in range(points)
+        for seed in range(2)
+    }
+    return map_dataset(settings, found, {"command": "jaxgran map"})
+
+
+@pytest.fixture(scope="module")
+def several() -> xr.Dataset:
+    """A map with all dimensions."""
+    return made(grains=(64, 256), timestep=(5e-4, 1e-3))
+
+
+@pytest.fixture(scope="module")
+def single() -> xr.Dataset:
+    """A map of one time step, whose number of grains was chosen by point."""
+    return made(grains=256, timestep=5e-4, error=0.1, grains_by_point=(64, 256, 64, 256))
+
+
+@pytest.mark.skipif(find_spec("compliance_checker") is None, reason="compliance-checker is not installed")
+def test_the_checker_of_the_conventions_finds_nothing(several, single, tmp_path: Path) -> None:
+    files = []
+    for data, kinds in ((several, KINDS), (single, "force_ratio_error")):
+        files.append(str(tmp_path / f"{len(files)}.nc"))
+        write_dataset(data[[x for x in map(str, data.data_vars) if x.startswith(kinds)]], Path(files[-1]))
+    checker = [sys.executable, str(Path(sys.executable).with_name("compliance-checker"))]
+    test = f"--test={CONVENTIONS.lower().replace('-', ':')}"
+    done = subprocess.run([*checker, test, "--criteria=strict", *SKIPPED, *files], capture_output=True, text=True)
+    assert "exceptions" not in done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count("All tests passed") == 2
+
+
+@pytest.mark.parametrize("kind", ["several", "single"])
+def test_units_are_those_of_pure_numbers_and_links_lead_to_variables(kind: str, request) -> None:
+    data = request.getfixturevalue(kind)
+    for name, variable in data.variables.items():
+        flags = "flag_values" in variable.attrs or variable.dtype.kind == "U"
+        assert variable.attrs.get("units", "1" if flags else None) == "1", name
+        linked = variable.attrs.get("ancillary_variables", "").split()
+        assert all(set(data[x].dims) <= set(variable.dims) for x in linked), name
+    for name, (_, unit) in OBSERVABLES.items():
+        assert (
+            data[name].attrs.get("reduced_unit", "1") == data[f"{name}_by_seed"].attrs.get("reduced_unit", "1") == unit
+        )
+        assert {f"{name}_stderr", "status"} <= set(data[name].attrs["ancillary_variables"].split())
+        assert data[f"{name}_by_seed"].attrs["ancillary_variables"] == "status_by_seed"
+        assert data[name].attrs["cell_methods"] == "realization: " + data[f"{name}_by_seed"].attrs["cell_methods"]
+
+
+def test_estimates_for_a_large_system_are_linked_to_their_errors_and_limits(several) -> None:
+    linked = several.pressure_large_system.attrs["ancillary_variables"].split()
+    assert linked == ["pressure_large_system_error", "pressure_limit_seen"]
+
+
+def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(several, single, tmp_path: Path) -> None:
+    assert {"point_grains", "timestep"} <= set(single.coords) and "grains" not in single.coords
+    assert single.force_ratio.timestep.item() == 5e-4
+    one = made(grains=64, timestep=5e-4)
+    assert one.grains.item() == 64 and one.grains.dims == () and not {"grains", "timestep"} & set(one.data_vars)
+    write_dataset(one[["force_ratio", "force_ratio_stderr", "status", "contact_stress"]], tmp_path / "map.nc")
+    again = read_dataset(tmp_path / "map.nc")
+    assert set(again.coords) == set(one.coords) - {"seed"}
+    assert {"grains", "timestep"} <= set(again.force_ratio.encoding["coordinates"].split())
+    assert again.contact_stress.direction_b.values.tolist() == ["x", "y"]
+
+
+def test_the_history_of_a_map_tells_when_and_by_what_it_was_made(single) -> None:
+    when, _, command = single.attrs["history"].partition(" ")
+    assert np.datetime64(when.removesuffix("Z")) <= np.datetime64("now") and command == "jaxgran map"
+
+
+def test_every_attribute_of_a_file_is_in_the_documentation(single) -> None:
+    settings = {field.name for field in fields(MapSettings)}
+    documented = set(re.findall(r"\w+", run_attributes.__doc__))
+    missing = {name for name in set(single.attrs) - settings - documented if not name.startswith("version_")}
+    assert not missing
