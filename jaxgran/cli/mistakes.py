@@ -61,7 +61,7 @@ def _words(mistake: Any, arguments: list[str]) -> str:
         return f"there is no option {option}" + (f", perhaps {meant} is meant" if meant else "")
     if words.startswith("Missing") and parameter is not None:
         return f"{parameter.opts[0] if parameter.opts[0].startswith('-') else parameter.name.upper()} must be given"
-    found = re.match("No such command '(.*?)'(?:. Did you mean '(.*)')?", words, re.DOTALL)
+    found = re.match("No such command '(.*?)'(?:. Did you mean '([^']*)')?", words, re.DOTALL)
     if found:
         command, meant = found.groups()
         return f"there is no command {shown(command)}" + (f", perhaps {meant} is meant" if meant else "")
