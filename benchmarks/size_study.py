@@ -308,7 +308,7 @@ def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
     head = {"prepared_memories": PREPARED, "sampled_memories": SAMPLED, "blocks": BLOCKS, "timestep": 1e-3}
     output.write_rows("size_study", head, "flows", rows)
     output.write_picture(draw_sizes(rows), "size_study")
-    largest_of = {k: n for k, n in done}  # the last one of a flow is its largest
+    largest_of = dict(done)  # the last one of a flow is its largest
     states = {plan.flows[k][:2]: (n, read_flow(folder, *plan.flows[k][:2], n)) for k, n in largest_of.items()}
     output.write_picture(draw_waves(states, WAVE_BINS), "size_study", "_waves.png")
     output.write_picture(draw_profiles(states), "size_study", "_profiles.png")

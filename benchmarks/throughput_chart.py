@@ -56,9 +56,8 @@ WAYS = {"lax.map": _mapped, "vmap": _vectorised}
 
 def states(restitution: float, packing_fraction: float, grains: int, count: int) -> jg.State:
     """A batch of different states of one flow."""
-    flow, members = (packing_fraction, restitution), []
-    for seed in range(min(_SEEDS, count)):
-        members.append(sheared(*flow, grains, _EQUILIBRATION, seed))
+    flow = packing_fraction, restitution
+    members = [sheared(*flow, grains, _EQUILIBRATION, seed) for seed in range(min(_SEEDS, count))]
     while len(members) < count:
         members.append(further(*flow, members[-_SEEDS], _APART))
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *members)

@@ -113,7 +113,8 @@ def tuned(kind: str, networks: list[Network], iterations: int, steps: int) -> di
         free = jnp.asarray(optax.apply_updates(free, update))
     losses, (least, after) = [value for value, _ in history], min(history)
     print(f"{kind}, K = {iterations}: {np.round(after, 3)}, loss {stock:.3f} → {least:.3f}", flush=True)
-    return dict(kind=kind, K=iterations, before=STOCK[kind], after=after, loss_before=stock, losses=losses)
+    before = {"before": STOCK[kind], "loss_before": stock}
+    return {"kind": kind, "K": iterations, "after": after, "losses": losses, **before}
 
 
 def contestants(tunings: list[dict[str, Any]]) -> dict[str, tuple[str, Any]]:

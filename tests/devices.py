@@ -11,7 +11,7 @@ import numpy as np
 start, output, grains, *host = sys.argv[1:]
 jax.config.update("jax_enable_x64", True)
 if host == ["lockstep"]:
-    jax.default_backend = lambda: "accelerator"  # pyright: ignore
+    jax.default_backend = lambda: "accelerator"
 elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))
@@ -21,7 +21,7 @@ from jaxgran.model.grains import Grains  # noqa: E402
 from jaxgran.model.state import State  # noqa: E402
 from jaxgran.sampling.batch import advance_batch  # noqa: E402
 
-like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), State(Grains(0, 0), 0, 0, 0, 0), 0)  # pyright: ignore
+like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), State(Grains(0, 0), 0, 0, 0, 0), 0)
 with np.load(start) as arrays:
     leaves = [arrays[name] for name in arrays.files]
 state, tally = advance_batch(*jax.tree.unflatten(jax.tree.structure(like), leaves))

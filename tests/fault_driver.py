@@ -26,7 +26,7 @@ def advance_slowly(*arguments):
     return advance_batch(*arguments)
 
 
-sweep.advance_batch = advance_slowly  # pyright: ignore
+sweep.advance_batch = advance_slowly
 
 if FAULT == "clock":
     time.time = lambda: random.uniform(0, 4e9)

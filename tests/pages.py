@@ -60,7 +60,7 @@ def made_up_film(frames: int = 5) -> Film:
     drive = film.recording(recorder)(lambda flow, state, steps: (state, random_tally(rng, 1)))
     for step in steps:
         if step:
-            drive(flow, state, np.array([1]))  # pyright: ignore
+            drive(flow, state, np.array([1]))
         film.frames.keep(frame, 10 * step)
     return film
 

@@ -626,7 +626,7 @@ OUTPUTS = {
 
 
 @pytest.mark.parametrize("command", ["map", "run"])
-@pytest.mark.parametrize("output", OUTPUTS, ids=lambda x: x[:20])
+@pytest.mark.parametrize("output", OUTPUTS, ids=lambda x: f"{x[:20]}-{len(x)}-{x.count('/')}")
 def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
     command: str, output: str, tmp_path: Path
 ) -> None:

@@ -81,8 +81,10 @@ def test_standard_errors_of_predictions_are_those_of_an_ensemble() -> None:
     truth, pulls = predict(known_closure(), alpha, nu), []
     for seed in range(100, 140):
         seen = predict(fit_closure(made_up_map(seed)), alpha, nu)
-        for name in ("pressure", "shear_stress", "force_ratio"):
-            pulls.append((getattr(seen, name) - getattr(truth, name)) / getattr(seen, f"{name}_stderr"))
+        pulls += [
+            (getattr(seen, name) - getattr(truth, name)) / getattr(seen, f"{name}_stderr")
+            for name in ("pressure", "shear_stress", "force_ratio")
+        ]
     squares = np.mean(np.square(pulls), axis=1)
     # a map without scatter is at times given some, which makes errors larger and never smaller
     assert 0.5 < np.mean(squares) < 1 + 4 * np.std(squares) / np.sqrt(len(squares))

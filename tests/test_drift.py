@@ -17,7 +17,7 @@ def sample_of(seed: int, growth: float) -> Sample:
     factor = np.where(LATE, growth, 1.0)[:, None, None]
     even = np.broadcast_to(np.array([[40.0, -10.0], [-10.0, 40.0]]), (BLOCKS, 2, 2))
     noise = np.exp(0.05 * np.random.default_rng(seed).normal(size=(BLOCKS, 1, 1)))
-    moments = {name: factor * noise * even for name in ("contact_moment", "kinetic_moment")}
+    moments = dict.fromkeys(("contact_moment", "kinetic_moment"), factor * noise * even)
     tally = replace(tally, duration=np.full(BLOCKS, 1.0), **moments)
     return Sample(tally, np.float64(100.0), np.float64(1.0), 64)
 

@@ -133,6 +133,7 @@ def test_a_change_of_numbers_compiles_nothing_anew(gases, cooled) -> None:
         (lambda state: cooling(FLOW, state, [1.0, -2.0]), "times must be a list of positive times"),
         (lambda _: heated(FLOW, jax.random.key(0), temperature=0.0), "temperature must be a positive number"),
     ],
+    ids=["sample", "snapshots", "prepare", "sheared", "overlaps", "same time", "late", "before", "temperature"],
 )
 def test_what_makes_no_sense_without_shear_is_refused_in_one_sentence(gases, made, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:

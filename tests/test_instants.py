@@ -81,7 +81,7 @@ def test_instant_is_a_packing_of_the_flow_whose_forces_act_between_grains_that_t
 
 
 def test_bad_replicas_give_no_instant(with_instants) -> None:
-    found = {key: replica for key, replica in with_instants.items()}
+    found = dict(with_instants)
     found[0, 0] = found[0, 0]._replace(status=int(Status.nonfinite))
     found[0, 1] = found[0, 1]._replace(instant=random_instant(3))
     assert first_of_points(found)[0].side == 10.0

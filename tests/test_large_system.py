@@ -92,7 +92,7 @@ def test_order_of_the_sizes_and_sizes_without_a_value_do_not_matter() -> None:
 def test_variables_of_a_map_stand_at_their_points() -> None:
     factors = np.array([[1.0, 2.0], [3.0, 4.0]])
     values = growth(SIZES, 500)[:, None, None] * factors
-    averages = {name: (values, 0.01 * values) for name in BOUNDS}
+    averages = dict.fromkeys(BOUNDS, (values, 0.01 * values))
     about = {name: (name.replace("_", " "), "m / t^2") for name in BOUNDS}
     dims = ("packing_fraction", "restitution")
     variables = large_system_variables(dims, tuple(SIZES.tolist()), averages, about)

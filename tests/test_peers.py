@@ -127,7 +127,7 @@ def test_overlaps_are_seen_across_the_sheared_boundary() -> None:
 
 
 def row(seconds: float, error: float, noise: float = 0.0) -> dict:
-    return {front.COST: seconds, "errors": {name: (error, noise) for name in front.OBSERVABLES}}
+    return {front.COST: seconds, "errors": dict.fromkeys(front.OBSERVABLES, (error, noise))}
 
 
 def test_time_to_the_target_is_interpolated_along_the_front() -> None:

@@ -98,11 +98,11 @@ def begin(
         ]
     )
     _create(program, discs, flow)
+    more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
     program.commands_list(
         [
             "pair_style granular",
-            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} tangential linear_nohistory 0.0 0.0 "
-            "damping coeff_restitution",
+            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} {more}",
             f"neighbor {skin!r} bin",
             f"timestep {timestep!r}",
             "fix motion all nve",
