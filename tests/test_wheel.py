@@ -1,0 +1,107 @@
+"""The wheel is installed elsewhere, and runs for a user who may write results and nothing else.
+
+If the tests run as root, the user is nobody. Otherwise it is the user of the tests, whose home is a file.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxgran.maps.results import read_dataset
+
+pytestmark = [
+    pytest.mark.slow,  # all is compiled anew: 25 seconds of one core, in .ci/run
+    pytest.mark.skipif(os.name != "posix", reason="users are those of POSIX"),
+    pytest.mark.skipif(not (find_spec("hatchling") and find_spec("pip")), reason="hatchling or pip is not installed"),
+]
+ROOT = Path(__file__).parents[1]
+PACKAGES = Path(np.__file__).parents[1]
+FIRST_MAP = ("map", "--grains", "64", "--strain", "2")
+SMALL = ("--restitution", "0.5,0.9", "--packing-fraction", "0.7", "--seeds", "1", "--workers", "1")
+
+
+@pytest.fixture(scope="module")
+def place() -> Iterator[Path]:
+    """A folder that every user can read, with the wheel installed in ``site``, which nobody can write."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
+    wheels = map(str, folder.glob("*.whl"))
+    subprocess.run([*install, "--target", str(folder / "site"), *wheels], cwd=folder, check=True, capture_output=True)
+    folders = [folder / "site", *(x for x in (folder / "site").rglob("*") if x.is_dir())]
+    for one in folders:
+        one.chmod(0o555)
+    yield folder
+    for one in folders:
+        one.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(scope="module")
+def anyone(place: Path) -> tuple[str, dict[str, Any], int]:
+    """Interpreter, arguments of a process and number of the user: nobody, if some interpreter lets root be so."""
+    if os.getuid() == 0:
+        import pwd
+
+        nobody = pwd.getpwnam("nobody")
+        user = {"user": nobody.pw_uid, "group": nobody.pw_gid, "extra_groups": []}
+        version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        for python in filter(None, (sys.executable, shutil.which(version, path="/usr/local/bin:/usr/bin"))):
+            try:
+                subprocess.run([python, "-c", "import numpy"], check=True, cwd=place, env=environment(place), **user)
+                return python, user, nobody.pw_uid
+            except (PermissionError, subprocess.CalledProcessError):
+                continue  # it is in a folder of root
+    return sys.executable, {}, os.getuid()
+
+
+def environment(place: Path) -> dict[str, str]:
+    """A terminal of 80 columns that knows ASCII alone; neither a home nor a cache."""
+    return {
+        "COLUMNS": "80",
+        "HOME": str(place / "site" / "jaxgran" / "__init__.py"),
+        "LC_ALL": "C",
+        "PATH": os.defpath,
+        "PYTHONCOERCECLOCALE": "0",
+        "PYTHONIOENCODING": "ascii",
+        "PYTHONPATH": f"{place / 'site'}{os.pathsep}{PACKAGES}",
+        "PYTHONUTF8": "0",
+    }
+
+
+@pytest.mark.parametrize("further", [SMALL, ()], ids=["small", "whole"])
+def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, further, tmp_path: Path) -> None:
+    python, user, number = anyone
+    folder = Path(tempfile.mkdtemp(dir=place))
+    folder.chmod(0o777)
+    shared = folder / f"jaxgran-{number}"  # programs that anyone could have put there are not run
+    shared.mkdir()
+    shared.chmod(0o777)
+    variables = (
+        environment(place) | {"TMPDIR": str(folder)} | ({"XLA_FLAGS": os.environ["XLA_FLAGS"]} if further else {})
+    )
+    command = [python, "-m", "jaxgran", *FIRST_MAP, *further]
+    done = subprocess.run(command, cwd=folder, env=variables, capture_output=True, **user)
+    out, err = done.stdout.decode("ascii"), done.stderr.decode("ascii")
+    assert done.returncode == 0, err
+    assert "Traceback" not in err
+    assert err.count("the cache folder") == err.count("so every run compiles anew") == 1
+    assert max(map(len, out.splitlines())) <= 80
+    data = read_dataset(folder / "jaxgran_map.nc")
+    rows = [line for line in out.splitlines() if line.startswith("| 0.7 ")]
+    assert rows and all("+-" in row for row in rows)
+    for value in data.force_ratio.sel(packing_fraction=0.7).values:
+        assert any(f"{value:.2f}" in row for row in rows)
+    assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(shared.iterdir())
+    assert (folder / "jaxgran_map.nc").stat().st_uid == number
