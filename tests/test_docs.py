@@ -35,7 +35,14 @@ RUN = ("../README.md", *(page for page in PAGES if python_of(page)))
 def test_navigation_names_every_page_once() -> None:
     named = re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
     notebooks = [f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")]
-    assert sorted(named) == sorted([*PAGES, *notebooks, "contributing.md", "changelog.md"])
+    assert sorted(named) == sorted([*PAGES, *notebooks, "contributing.md", "changelog.md", "security.md"])
+
+
+def test_tests_that_pages_name_are_there() -> None:
+    text = "".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES)
+    named = set(re.findall(r"`(test_\w+)`", text))
+    there = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py"))
+    assert named and named <= set(re.findall(r"^def (test_\w+)", there, re.MULTILINE))
 
 
 def test_every_public_name_is_in_the_reference() -> None:

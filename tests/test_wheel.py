@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from jaxgran.maps.results import read_dataset
+from jaxgran.model.display import with_error
 
 pytestmark = [
     pytest.mark.slow,  # all is compiled anew: 25 seconds of one core, in .ci/run
@@ -81,7 +82,7 @@ def environment(place: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("further", [SMALL, ()], ids=["small", "whole"])
-def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, further, tmp_path: Path) -> None:
+def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, further) -> None:
     python, user, number = anyone
     folder = Path(tempfile.mkdtemp(dir=place))
     folder.chmod(0o777)
@@ -101,7 +102,8 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     data = read_dataset(folder / "jaxgran_map.nc")
     rows = [line for line in out.splitlines() if line.startswith("| 0.7 ")]
     assert rows and all("+-" in row for row in rows)
-    for value in data.force_ratio.sel(packing_fraction=0.7).values:
-        assert any(f"{value:.2f}" in row for row in rows)
+    there = data.sel(packing_fraction=0.7)
+    for numbers in zip(there.force_ratio.values, there.force_ratio_stderr.values, strict=True):
+        assert any(with_error(*numbers).replace("±", "+-") in row for row in rows)
     assert {path.suffix for path in folder.iterdir()} >= {".nc", ".png"} and not list(shared.iterdir())
     assert (folder / "jaxgran_map.nc").stat().st_uid == number

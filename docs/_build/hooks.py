@@ -1,4 +1,4 @@
-"""What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, contributing, the changes.
+"""What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages of its root.
 
 Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
 ``charts/architecture.svg``, is made from the imports of the code at every build. ``charts/paper.html``, the paper's map
@@ -25,7 +25,7 @@ from jaxgran.page.explore import explore
 ROOT = Path(__file__).parents[2]
 CHARTS = ROOT / "benchmarks" / "results"
 CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.png)"[^>]*>)')
-PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
+PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "security.md": "SECURITY.md"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
