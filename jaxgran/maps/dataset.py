@@ -212,9 +212,9 @@ def map_dataset(
     return follow_conventions(xr.Dataset(variables, coordinates, {**run_attributes(settings), **_history(run), **run}))
 
 
-def _single(settings: MapSettings) -> dict[str, float]:
+def _single(settings: MapSettings) -> dict[str, Any]:
     """Number of grains and time step, where all points of a map have the same."""
-    values = {"timestep": settings.timestep}
+    values: dict[str, Any] = {"timestep": settings.timestep}
     if settings.grains_by_point is None:
         values["grains"] = settings.grains
     return {name: value for name, value in values.items() if name not in settings.axes}
