@@ -60,7 +60,8 @@ def quick_flags() -> str:
     known = set()
     for library in libraries:
         with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-            known |= {flag for flag in QUICK_FLAGS if text.find(flag.encode()) >= 0}
+            # a flag is a text of C between zeros; one that was removed is still among the reserved names
+            known |= {flag for flag in QUICK_FLAGS if text.find(b"\0%s\0" % flag.encode()) >= 0}
     return " ".join(f"--{flag}={value}" for flag, value in QUICK_FLAGS.items() if flag in known)
 
 
