@@ -81,7 +81,7 @@ def map_dataset(
     ============================  ====================  =============================================================
     coordinate                    dimensions            meaning
     ============================  ====================  =============================================================
-    packing_fraction,              of their own          values of the plane
+    packing_fraction,             of their own          values of the plane
     restitution
     grains, timestep              of their own or none  values of a list, or the one of all points
     point_grains                  point                 number of grains, if it was chosen by point
