@@ -15,6 +15,8 @@ from .inference.closure_fit import fit_closure
 from .inference.friction_law import friction_law
 from .inference.restitution import RestitutionFit, fit_restitution
 from .inference.stress_inversion import restitution_from_stresses
+from .io.track_files import read_tracks
+from .io.tracks import Tracks, tracks_of_states
 from .io.trajectory import Trajectory, read_trajectory, write_trajectory
 from .maps.sweep import ratio_map
 from .model.checks import InputError
@@ -56,6 +58,7 @@ __all__ = [
     "State",
     "Status",
     "Tally",
+    "Tracks",
     "Trajectory",
     "advance",
     "averages_against_grains",
@@ -86,6 +89,7 @@ __all__ = [
     "ratio_contours",
     "ratio_curves",
     "ratio_map",
+    "read_tracks",
     "read_trajectory",
     "restitution_from_stresses",
     "sample",
@@ -94,5 +98,6 @@ __all__ = [
     "solve_contacts",
     "theory_errors",
     "theory_losses",
+    "tracks_of_states",
     "write_trajectory",
 ]

@@ -48,17 +48,17 @@ seen = replace(seen, velocities=seen.velocities + noise * random.normal(size=see
 strains = strain * np.arange(1, frames + 1) / frames
 
 # %% [markdown]
-# Every window between two frames is run at a trial restitution; the derivative of its end with respect to α says how to
-# change it.
+# Two discs that collide, and no third, tell α by themselves. The fit finds such collisions. It estimates each of them
+# from the frames before and after, with the noise in all of these, and takes the derivative of the misfit by α.
 
 # %%
-fit = jg.fit_restitution(strains, seen)
-print(f"restitution {fit.restitution:.4f} ± {fit.stderr:.4f}, noise {fit.noise:.3f} (made with {noise:.3f})")
-print(f"{fit.windows} windows, {fit.collisions:.0f} collisions, {100 * fit.outliers:.1f} % outliers")
+fit = jg.fit_restitution(jg.tracks_of_states(strains, seen))
+print(f"restitution {fit.restitution:.4f} ± {fit.stderr:.4f}, 95 % interval {fit.low:.4f} to {fit.high:.4f}")
+print(f"{fit.collisions} collisions; noise of the velocities {fit.velocity_noise:.4f} (made with {noise:.4f})")
 
 # %% [markdown]
-# Why windows, and not the whole run at once? Because derivatives of chaotic motion grow exponentially: beyond the
-# dotted line a change of α by 0.01 moves every grain by a diameter.
+# Why single collisions, and not the whole run at once? Because derivatives of chaotic motion grow exponentially: beyond
+# the dotted line a change of α by 0.01 moves every grain by a diameter.
 
 # %%
 figure, axis = plt.subplots(figsize=(5, 3.4), layout="constrained")
@@ -68,7 +68,7 @@ for restitution, style in ((0.5, "--"), (0.9, "-")):
     axis.semilogy(grown.strain, grown.derivative, style, color="0.2", label=rf"$\alpha={restitution}$")
 axis.axhline(100, color="0.6", ls=":", lw=1)
 axis.axvline(strain / frames, color="0.6", lw=1)
-axis.set_xlabel("strain since the beginning (grey line: one window)")
+axis.set_xlabel("strain since the beginning (grey line: one frame)")
 axis.set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ per grain")
 axis.legend(frameon=False)
 plt.show()

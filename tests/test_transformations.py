@@ -62,7 +62,10 @@ LONG_WITH_TANGENTS = LONG | {"advance", "sample", "snapshot_series", "cooling"}
 REFUSED: dict[str, Callable[[Any, State], Any]] = {
     "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
     "heated": lambda x, _: jg.heated(FLOW, KEY, grains=jg.own_grains(x * jnp.ones(COUNT))),
-    "fit_restitution": lambda x, state: jg.fit_restitution(np.arange(2.0), jax.tree.map(lambda y: y[None] * x, state)),
+    "tracks_of_states": lambda x, state: jg.tracks_of_states(
+        np.arange(2.0), jax.tree.map(lambda y: y[None] * x, state)
+    ),
+    "fit_restitution": lambda x, _: jg.fit_restitution(jg.Tracks(*[x] * 7)),
     "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
     "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].errors(),
     "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
@@ -84,7 +87,7 @@ WITHOUT_ARRAYS = {
         "ratio_contours",
         "ratio_curves",
     ),
-    *("read_trajectory", "save_figures", "theory_errors", "theory_losses", "write_trajectory"),
+    *("Tracks", "read_tracks", "read_trajectory", "save_figures", "theory_errors", "theory_losses", "write_trajectory"),
 }
 
 

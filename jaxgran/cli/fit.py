@@ -1,9 +1,10 @@
-"""The command ``fit``: the restitution of a trajectory, or a closure fitted to a map."""
+"""The command ``fit``: the restitution of discs from their tracks, or a closure fitted to a map."""
 
 import math
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from jaxgran.cli.tables import Table, print_table
@@ -15,6 +16,7 @@ _LARGEST_CHI_SQUARED = 9.0  # above it, no restitution of the map has these stre
 
 FIT_EXAMPLES = {
     "The restitution of observed grains": "jaxgran fit flow.gsd",
+    "The restitution of discs that a camera tracked": "jaxgran fit discs.csv --diameter 4.1",
     "How well a smooth law describes a map": "jaxgran fit jaxgran_map.nc",
     "The restitution of a flow from its stresses, with the law of a map": "jaxgran fit jaxgran_map.nc "
     "--packing-fraction 0.7 --pressure 3.2 --shear-stress 1.6 --relative-error 0.02",
@@ -22,9 +24,31 @@ FIT_EXAMPLES = {
 
 
 def fit_command(
-    file: Annotated[Path, typer.Argument(help="Trajectory (.gsd), or dataset of a map (.nc).")],
-    timestep: Annotated[
-        float | None, typer.Option(help="Time step of the runs beside a trajectory. [default: by its velocities]")
+    file: Annotated[
+        Path,
+        typer.Argument(help="Tracks of discs (.gsd, .csv, .tsv, .txt, .h5, .hdf5, .lammpstrj, .dump), or a map (.nc)."),
+    ],
+    shear_rate: Annotated[
+        float | None, typer.Option(help="Of the tracks. [default: by the file, or by how its cell tilts]")
+    ] = None,
+    frame_strain: Annotated[
+        float | None, typer.Option(help="Strain from frame to frame of the tracks, in place of --frame-time.")
+    ] = None,
+    frame_time: Annotated[
+        float | None,
+        typer.Option(help="Time from frame to frame of the tracks. [default: by the file, or its velocities]"),
+    ] = None,
+    peculiar: Annotated[bool, typer.Option("--peculiar", help="The velocities of the tracks lack the shear.")] = False,
+    diameter: Annotated[float | None, typer.Option(help="Of all discs, where the tracks have none.")] = None,
+    position_noise: Annotated[
+        float | None,
+        typer.Option(help="Standard error of a coordinate. [default: by the straight parts of the tracks]"),
+    ] = None,
+    velocity_noise: Annotated[
+        float | None, typer.Option(help="Standard error of a velocity. [default: as above]")
+    ] = None,
+    diameter_noise: Annotated[
+        float | None, typer.Option(help="Standard error of a diameter. [default: a hundredth of it]")
     ] = None,
     packing_fraction: Annotated[
         float | None, typer.Option(help="Of a flow whose restitution is sought from its stresses, with a map.")
@@ -36,43 +60,71 @@ def fit_command(
     require_number("relative_error", relative_error, lambda x: (x >= 0) & (x <= 1), "between 0 and 1")
     configured_jax()
     stresses = {"packing_fraction": packing_fraction, "pressure": pressure, "shear_stress": shear_stress}
-    given = [name for name, value in stresses.items() if value is not None]
-    if file.suffix == ".gsd":
-        if given:
-            raise InputError(f"{given[0]} goes with a map, and {shown(file.name)} is a trajectory.")
-        _fit_trajectory(file, timestep)
+    of_map = [name for name, value in stresses.items() if value is not None]
+    of_file = {"shear_rate": shear_rate, "frame_strain": frame_strain, "frame_time": frame_time, "diameter": diameter}
+    noise = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}
+    of_tracks = [
+        name for name, value in (of_file | noise | {"peculiar": peculiar or None}).items() if value is not None
+    ]
+    if file.suffix != ".nc":
+        if of_map:
+            raise InputError(f"{of_map[0]} goes with a map, and {shown(file.name)} is not one.")
+        _fit_tracks(file, _observed(peculiar=peculiar, **of_file), noise)
     else:
-        if timestep is not None:
-            raise InputError(f"timestep goes with a trajectory, and {shown(file.name)} is a map.")
-        if 0 < len(given) < len(stresses):
-            missing = next(name for name in stresses if name not in given)
+        if of_tracks:
+            raise InputError(f"{of_tracks[0]} goes with tracks of discs, and {shown(file.name)} is a map.")
+        if 0 < len(of_map) < len(stresses):
+            missing = next(name for name in stresses if name not in of_map)
             raise InputError(f"{missing} must be given too, or a restitution cannot be sought.")
-        _fit_map(file, list(stresses.values()) if given else None, relative_error)
+        _fit_map(file, list(stresses.values()) if of_map else None, relative_error)
 
 
-def _fit_trajectory(file: Path, timestep: float | None) -> None:
+def _observed(
+    shear_rate: float | None,
+    frame_strain: float | None,
+    frame_time: float | None,
+    diameter: float | None,
+    peculiar: bool,
+) -> dict:
+    """The arguments of ``read_tracks``: a strain between frames is a time, in units of 1/γ̇ where γ̇ is not given."""
+    for name, value in (("frame_strain", frame_strain), ("frame_time", frame_time)):
+        if value is not None:
+            require_number(name, value, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if frame_strain is not None:
+        if frame_time is not None:
+            raise InputError("frame_strain goes without --frame-time, as each says the other.")
+        shear_rate = 1.0 if shear_rate is None else shear_rate
+        require_number("shear_rate", shear_rate, lambda x: x > 0, "positive beside a strain")
+        frame_time = frame_strain / shear_rate
+    return {"interval": frame_time, "shear_rate": shear_rate, "peculiar": peculiar, "diameter": diameter}
+
+
+def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
     require_device()
     from jaxgran.inference.restitution import fit_restitution
-    from jaxgran.io.trajectory import read_trajectory
+    from jaxgran.io.track_files import read_tracks, recorded_restitution
 
-    trajectory = read_trajectory(file)
-    if not math.isfinite(float(trajectory.shear_rate)):
-        raise InputError(
-            f"{shown(file.name)} has no strain and shear rate of its frames: use fit_restitution in Python."
-        )
+    tracks = read_tracks(file, **observed)
     try:
-        found = fit_restitution(trajectory.strain, trajectory.state, float(trajectory.shear_rate), timestep)
+        found = fit_restitution(tracks, **noise)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)
-    recorded = f"{float(trajectory.restitution):g}" if math.isfinite(trajectory.restitution) else "none"
+    recorded = recorded_restitution(file)
+    frames, grains = tracks.positions.shape[:2]
     rows = [
         ["restitution ± standard error", with_error(found.restitution, found.stderr)],
-        ["recorded restitution", recorded],
-        ["noise of the velocities, σγ̇", f"{found.noise:.2g}"],
-        ["windows, collisions", f"{found.windows}, {found.collisions:g}"],
-        ["outliers", f"{100 * found.outliers:.2g} %"],
+        ["95 % interval", f"{found.low:.5g} to {found.high:.5g}"],
+        *([["recorded restitution", f"{recorded:g}"]] if recorded is not None else []),
+        ["frames, discs", f"{frames}, {grains}"],
+        ["collisions, rejected", f"{found.collisions}, {found.rejected}"],
+        ["noise of the positions", f"{found.position_noise:.2g}"],
+        [
+            "noise of the velocities",
+            "none given" if math.isnan(found.velocity_noise) else f"{found.velocity_noise:.2g}",
+        ],
+        ["misfit over the noise", f"{found.misfit:.2g}"],
     ]
-    print_table(Table("", ("of the trajectory", "value"), rows, numbers=False))
+    print_table(Table("", ("of the tracks", "value"), rows, numbers=False))
 
 
 def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:

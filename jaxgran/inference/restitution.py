@@ -1,206 +1,250 @@
-"""The restitution of grains from their observed motion.
+"""The restitution of discs from their tracks, by a likelihood that knows the noise of what was seen.
 
-A trajectory is cut into windows, each from one frame to the next. Every window is run from its first frame at a trial
-restitution α, and its end is compared with the next frame. The residuals are the differences of the velocities. A
-window has few collisions, so the residuals are nearly linear in α. Their derivatives are computed with the run (forward
-mode, with contacts that move in time).
+A collision of two discs, without friction, turns their relative velocity u into u − (1 + α)(u·n) n. What was seen of it
+are separations and relative velocities in some frames before and after, each with noise. The model of a collision has
+five unknowns: the separation at contact (its direction is n), the time of contact, and u. The misfit of a collision at
+a trial α is the least χ² over these five (errors in variables); the diameters belong to it with an error of their own.
 
-α follows from Gauss-Newton steps with Cauchy weights. The initial velocities are noisy, so a grain may collide in the
-run but not in the observation. Such a grain has a small weight. The noise is estimated from the grains that do not
-collide, which are the majority in a short window.
+The loss of α is the sum of −2 ln(exp(−χ²/2) + exp(−c/2)) over the collisions: what fits worse than c is no collision of
+these two discs alone, and counts as a constant. The least loss gives α, by Gauss-Newton steps with the derivative of
+the misfit by α at the five unknowns. The interval is that of the profile likelihood: all α with a loss of at most 3.84
+above the least.
 
-The standard error is that of the sum over windows, from the scatter of their contributions (the "sandwich" estimate).
-It is therefore valid for any distribution of the residuals.
+Masses cancel, and so does everything that happens elsewhere. So discs may be missing, and the cell need not be seen.
 
-Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), chapters 6 and 7.
+Sources: W. A. Fuller, Measurement Error Models (1987), chapter 3; S. A. Murphy and A. W. van der Vaart, J. Am. Stat.
+Assoc. 95, 449 (2000), on profile likelihood.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Int
+from scipy.optimize import brentq
+from scipy.stats import chi2
 
-from jaxgran.dynamics.plain import advance
+from jaxgran.inference.collision_model import Collisions, Fitted
+from jaxgran.inference.collisions import (
+    Noise,
+    candidates,
+    flights_of,
+    measured_noise,
+    relative_step,
+    straight_drift,
+)
+from jaxgran.io.tracks import Tracks
 from jaxgran.model.checks import InputError, require_number, require_untraced, shown
-from jaxgran.model.choices import MAX_STEPS
-from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State
-from jaxgran.model.status import Status
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the iteration
-_STRIDE = 0.003  # σ that a grain moves in a time step of the runs, at the root mean square velocity
-_FEWEST_STEPS = 10  # time steps of a window
+DIAMETER_NOISE = 0.01  # of a diameter: larger than most errors, and it costs little
+_LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
+_CLEAR = 4.0  # normal velocity of a collision that is used, over its error
+_UNLIKELY = 1e-3  # probability with which a true collision fits worse than the cut
+_FEWEST = 4  # collisions
+_LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
-_LEAST_STEP = 1e-9  # of α, at which the iteration ends in any case
-_MOST_STEPS = 50  # Gauss-Newton steps
-_SETTLED = 1e-2  # step in standard errors, at which the iteration ends
-_CAUCHY = 2.385  # width of Cauchy's law over the noise: 95 % as efficient as least squares for Gaussian noise
-_LEAST_NOISE = 1e-4  # over the root mean square velocity: an exact trajectory has no noise
-_TOLERANCE = 1e-9  # of the contact solve
+_MOST_STEPS = 50
+_CHOOSING = 10  # steps, after which the collisions that are used stay the same
+_APART = 2  # windows within which a pair does not collide twice
+_SETTLED = 1e-3  # step in standard errors, at which the iteration ends
+_LEVEL = chi2.ppf(0.95, 1)
 
 
 @dataclass(frozen=True)
 class RestitutionFit:
-    """The restitution inferred from a trajectory.
+    """The restitution inferred from tracks.
 
-    ===========  ====  ==================================================================================
-    field        unit  meaning
-    ===========  ====  ==================================================================================
-    restitution  –     α
-    stderr       –     standard error of α
-    noise        σγ̇    standard deviation of the noise of a component of an observed velocity
-    windows      –     number of pairs of successive frames that were compared
-    collisions   –     number of collisions in the runs of these windows
-    outliers     –     share of the components of velocity with a residual above 7 times its noise, as after
-                       a collision that is only in the run or only in the observation
-    ===========  ====  ==================================================================================
+    ==============  ====  =======================================================================================
+    field           unit  meaning
+    ==============  ====  =======================================================================================
+    restitution     –     α
+    stderr          –     standard error of α
+    low, high       –     ends of the 95 % interval of the profile likelihood
+    collisions      –     number of collisions of two discs that were used
+    rejected        –     number of changes of velocity between near discs that are no such collision, within the
+                          noise: a third disc took part, or an id changed
+    position_noise  ℓ     standard deviation of a component of a position
+    velocity_noise  ℓ/t   standard deviation of a component of a velocity; NaN without velocities
+    misfit          –     median χ² of the collisions over that expected; above 1, the errors were enlarged by its root
+    ==============  ====  =======================================================================================
     """
 
     restitution: float
     stderr: float
-    noise: float
-    windows: int
-    collisions: float
-    outliers: float
+    low: float
+    high: float
+    collisions: int
+    rejected: int
+    position_noise: float
+    velocity_noise: float
+    misfit: float
 
 
 def fit_restitution(
-    strain: Float[np.ndarray, " frames"], states: State, shear_rate: float = 1.0, timestep: float | None = None
+    tracks: Tracks,
+    *,
+    position_noise: float | None = None,
+    velocity_noise: float | None = None,
+    diameter_noise: float | None = None,
 ) -> RestitutionFit:
-    """The restitution with which the observed grains collide, for a simulation with any time step or an experiment.
+    """The restitution with which the discs of tracks collide, by their binary collisions.
 
     Args:
-      strain: (frames,), strain of each frame, increasing. Between two frames a grain should collide at most once, on
-        average.
-      states: the frames, with a leading (frames,) axis. Positions should be accurate to a few 1e-3 σ. The noise of the
-        velocities may be several per cent.
-      shear_rate: γ̇ of the observation, in the time unit of its velocities.
-      timestep: dt of the runs, in the same time unit, or None for one in which grains move 0.003 diameters.
+      tracks: as ``read_tracks`` and ``tracks_of_states`` return. Between two frames a disc should collide at most once,
+        on average, and move by a fraction of its diameter. Without velocities, a disc should be seen in three frames
+        or more between two collisions.
+      position_noise: standard deviation of a component of a position, in the unit of the tracks; None to estimate it.
+      velocity_noise: the same of a velocity.
+      diameter_noise: standard error of a diameter; a hundredth of the mean diameter by default.
 
     Returns:
-      The restitution with its standard error.
+      The restitution with its standard error and its 95 % interval.
 
     Raises:
-      ValueError: the frames are fewer than two, out of order or not finite, or no grains collide between them.
-      RuntimeError: the runs fail, or the restitution does not settle.
+      InputError: (a ValueError) too few collisions can be told from the noise; the message says what would help.
+      RuntimeError: the restitution does not settle.
     """
-    strain, count = _checked(strain, states, shear_rate)
-    speed = float(np.sqrt(np.mean(np.square(states.velocities))))
-    intervals = np.diff(strain) / shear_rate
-    if timestep is None:
-        timestep = min(_STRIDE / max(speed, float(np.max(shear_rate))), float(intervals.min()) / _FEWEST_STEPS)
-    require_number("timestep", timestep, lambda x: (x > 0) & (x * shear_rate <= 0.1), "positive, and 0.1/γ̇ at most")
-    steps = np.maximum(1, np.round(intervals / timestep))
-    if steps.max() > MAX_STEPS:
-        raise InputError(f"timestep must be at least {intervals.max() / MAX_STEPS:g}, not {shown(timestep)}.")
-    starts, ends = (jax.tree.map(lambda x, part=part: x[part], states) for part in (slice(None, -1), slice(1, None)))
-    flow = ShearFlow(count, 0.5, 0.5, 0.1 / shear_rate, shear_rate, tolerance=_TOLERANCE, max_iterations=20_000)
-    windows = (starts, ends, jnp.asarray(intervals / steps), jnp.asarray(steps, jnp.int32))
-    least_noise = _LEAST_NOISE * speed
-
-    def compare(alpha: float) -> _Comparison:
-        residuals, slopes, collisions, status = _residuals(flow, *windows, jnp.asarray(alpha, float))
-        worst = Status(int(np.max(status)))
-        if worst > Status.deep_overlap:
-            raise RuntimeError(
-                f"the runs from the frames ended as {worst.name}; positions and radii must be in one unit."
-            )
-        return _Comparison(alpha, np.asarray(residuals), np.asarray(slopes), float(np.sum(collisions)))
-
-    current = min((compare(alpha) for alpha in TRIALS), key=lambda trial: trial.loss(least_noise))
-    for _ in range(_MOST_STEPS):
-        step, error = current.step(least_noise)
-        current = compare(float(np.clip(current.restitution + step, 0, 1)))
-        if abs(step) <= max(_SETTLED * error, _LEAST_STEP):
-            break
-    else:
-        raise RuntimeError(f"the restitution did not settle: it was last {current.restitution:.3g}.")
-    noise = current.noise(least_noise)  # of a residual: the difference of two noisy velocities
-    return RestitutionFit(
-        restitution=current.restitution,
-        stderr=current.step(least_noise)[1],
-        noise=noise / np.sqrt(2),
-        windows=len(steps),
-        collisions=current.collisions,
-        outliers=float(np.mean(np.abs(current.residuals) > 3 * _CAUCHY * noise)),
+    if not isinstance(tracks, Tracks):
+        raise InputError(f"tracks must be Tracks, as read_tracks and tracks_of_states return, not {shown(tracks)}.")
+    words = "it iterates in Python, so call it for each trajectory"
+    require_untraced("fit_restitution", words, *vars(tracks).values())
+    given = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}
+    for name, value in given.items():
+        if value is not None:
+            require_number(name, value, lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0")
+    flights, length, duration = flights_of(tracks)
+    in_units = {"position_noise": length, "velocity_noise": length / duration, "diameter_noise": length}
+    known = {name: None if value is None else float(value) / in_units[name] for name, value in given.items()}
+    position, velocity = measured_noise(flights)
+    noise = Noise(
+        max(position if known["position_noise"] is None else known["position_noise"], _LEAST_NOISE),
+        max(velocity if known["velocity_noise"] is None else known["velocity_noise"], _LEAST_NOISE),
+        max(DIAMETER_NOISE if known["diameter_noise"] is None else known["diameter_noise"], _LEAST_NOISE),
     )
-
-
-def _checked(strain: Any, states: Any, shear_rate: float) -> tuple[np.ndarray, int]:
-    """The strains as an array and the number of grains; an InputError where the trajectory cannot be fitted."""
-    require_untraced(
-        "fit_restitution", "it iterates in Python, so call it for each trajectory", strain, states, shear_rate
-    )
-    require_number("shear_rate", shear_rate, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    strain, shape = np.asarray(strain, float), states.velocities.shape if isinstance(states, State) else ()
-    if strain.ndim != 1 or len(strain) < 2 or len(shape) != 3 or shape[0] != len(strain):
+    step = relative_step(flights)
+    if not step <= _LONGEST_STEP:
         raise InputError(
-            "states must be two or more frames of one flow, with the strain of each, "
-            f"not {len(np.atleast_1d(strain))} strains and velocities of shape {shape}."
+            f"tracks must show discs that move by {_LONGEST_STEP} diameters at most between frames, and neighbours "
+            f"move apart by {step:.2g}: take more frames in the same time."
         )
-    if not np.all(np.isfinite(strain)) or np.any(np.diff(strain) <= 0):
-        raise InputError("strain must be finite and increase from frame to frame.")
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(states)):
-        raise InputError("states must have finite positions, velocities, radii and masses.")
-    return strain, shape[1]
+    seen = candidates(flights, noise)
+    if seen is None:
+        raise InputError(_nothing(0, 0))
+    with jax.enable_x64(True):
+        best = _settled(Collisions(seen, noise))
+        if best.used.sum() < _FEWEST:
+            raise InputError(_nothing(int(best.used.sum()), len(seen.window)))
+        low, high = _interval(best)
+    return RestitutionFit(
+        restitution=best.restitution,
+        stderr=best.stderr,
+        low=low,
+        high=high,
+        collisions=int(best.used.sum()),
+        rejected=best.rejected,
+        position_noise=noise.position * length,
+        velocity_noise=noise.velocity * length / duration if np.isfinite(noise.velocity) else np.nan,
+        misfit=best.misfit,
+    )
 
 
-@jax.jit
-def _residuals(flow: ShearFlow, starts: State, ends: State, timesteps: Array, steps: Int[Array, " windows"], alpha):
-    """Residuals of the velocities at the end of each window and their derivatives by α, collisions and status.
-
-    Residuals and derivatives are (windows, grains, 2); collisions and status are (windows,).
-    """
-
-    def window(given):
-        start, end, timestep, count = given
-
-        def run(alpha):
-            trial = replace(flow, restitution=alpha, timestep=timestep)
-            final, tally = advance(trial, start, count, moving_contacts=True)
-            return final.velocities - end.velocities, (tally.collisions, tally.status)
-
-        residual, slope, (collisions, status) = jax.jvp(run, (alpha,), (jnp.ones_like(alpha),), has_aux=True)
-        return residual, slope, collisions, status
-
-    return lax.map(window, (starts, ends, timesteps, steps))
+def _nothing(collisions: int, changes: int) -> str:
+    """What would help where too few collisions are found."""
+    found = f"tracks must show {_FEWEST} or more collisions of two discs, and {collisions} can be told from noise"
+    if changes > 10 * _FEWEST:
+        return f"{found} among {changes} changes of velocity: take more frames in the same time, or a looser flow."
+    return f"{found}: take more frames or follow more discs, with less noise if there is much."
 
 
-class _Comparison(NamedTuple):
-    """Runs at one restitution compared with the observation.
-
-    ===========  =====================  ====  ====================================
-    restitution  ()                     –     α of the runs
-    residuals    (windows, grains, 2)   σγ̇    velocities of the runs less observed
-    slopes       (windows, grains, 2)   σγ̇    derivatives of the residuals by α
-    collisions   ()                     –     in all windows
-    ===========  =====================  ====  ====================================
-    """
-
+class _Best(NamedTuple):
+    collisions: Collisions
+    fitted: Fitted
+    used: np.ndarray
     restitution: float
-    residuals: np.ndarray
-    slopes: np.ndarray
-    collisions: float
+    stderr: float
+    misfit: float
+    rejected: int
 
-    def noise(self, least: float) -> float:
-        """Standard deviation of the residuals without collisions, from their median absolute value."""
-        return max(1.4826 * float(np.median(np.abs(self.residuals))), least)
 
-    def loss(self, least_noise: float) -> float:
-        """Negative log-likelihood of Cauchy's law with its fitted width; the smallest is the best restitution."""
-        noise = self.noise(least_noise)
-        return float(np.sum(np.log(noise) + np.log1p((self.residuals / (_CAUCHY * noise)) ** 2)))
+def _settled(collisions: Collisions) -> _Best:
+    """The restitution of the least loss, by Gauss-Newton steps.
 
-    def step(self, least_noise: float) -> tuple[float, float]:
-        """Gauss-Newton step of the restitution, and its standard error."""
-        weights = 1 / (1 + (self.residuals / (_CAUCHY * self.noise(least_noise))) ** 2)
-        curvature = np.sum(weights * self.slopes**2)
-        if not curvature > 0:
-            raise InputError("states must have collisions between the frames, and no grains collide.")
-        gradients = np.sum(weights * self.slopes * self.residuals, axis=(1, 2))  # of the windows
-        step = np.clip(-np.sum(gradients) / curvature, -_LARGEST_STEP, _LARGEST_STEP)
-        return float(step), float(np.sqrt(np.sum(gradients**2)) / curvature)
+    Errors begin as large as the misfit of the best trial says, and shrink with it, at most to the noise.
+    """
+    cut, middle = chi2.isf(_UNLIKELY, collisions.freedom), chi2.ppf(0.5, collisions.freedom)
+    trials = [(alpha, collisions.fitted(alpha)) for alpha in TRIALS]
+
+    def loss(fitted: Fitted) -> float:
+        return float(np.sum(np.log1p(fitted.misfit / cut)[_alone(collisions, fitted)]))
+
+    alpha, fitted = min(trials, key=lambda trial: loss(trial[1]))
+    alone, scale = _alone(collisions, fitted), 1.0
+    used = _once(collisions, fitted.misfit, alone)
+    for k in range(_MOST_STEPS):
+        fitted = collisions.fitted(alpha, fitted.unknowns)
+        if k < _CHOOSING:
+            scale = max(1.0, float(np.median((fitted.misfit / middle)[used]))) if used.any() else 1.0
+            alone = _alone(collisions, fitted)
+            used = _once(collisions, fitted.misfit, alone & (fitted.misfit < scale * cut))
+        weights = np.where(used, 1 / (1 + np.exp(np.clip((fitted.misfit / scale - cut) / 2, -50, 50))), 0)
+        information = np.sum(weights * fitted.curvature)
+        if used.sum() < _FEWEST or not information > 0:
+            return _Best(collisions, fitted, used, alpha, np.inf, scale, 0)
+        step = float(np.clip(-np.sum(weights * fitted.gradient) / information, -_LARGEST_STEP, _LARGEST_STEP))
+        now, error = float(np.clip(alpha + step, 0, 1)), float(np.sqrt(scale / information))
+        alpha, moved = now, abs(now - alpha)
+        if moved <= _SETTLED * error and k > 1:
+            rejected = _once(collisions, fitted.misfit, alone, used) & ~used
+            return _Best(collisions, fitted, used, alpha, error, scale, int(rejected.sum()))
+    raise RuntimeError(f"the restitution did not settle: it was last {alpha:.3g}.")
+
+
+def _alone(collisions: Collisions, fitted: Fitted) -> np.ndarray:
+    """Which candidates are clear of the noise and took place in their window, with no third disc."""
+    seen = collisions.seen
+    clear = fitted.normal_velocity > _CLEAR * fitted.normal_error
+    return clear & straight_drift(seen)
+
+
+def _once(
+    collisions: Collisions, misfit: np.ndarray, chosen: np.ndarray, first: np.ndarray | None = None
+) -> np.ndarray:
+    """Which of the chosen candidates are no repeats: a collision near a frame is seen in neighbouring windows.
+
+    Of these the one with the least misfit is kept, or one that is already in ``first``.
+    """
+    seen, taken, kept = collisions.seen, set(), np.zeros(len(chosen), bool)
+    order = misfit / collisions.freedom
+    for k in np.argsort(order if first is None else np.where(first, -1, order), kind="stable"):
+        pair, window = tuple(seen.grains[k]), int(seen.window[k])
+        if chosen[k] and not any((pair, window + step) in taken for step in range(-_APART, _APART + 1)):
+            kept[k] = True
+            taken.add((pair, window))
+    return kept
+
+
+def _interval(best: _Best) -> tuple[float, float]:
+    """Where the loss is 3.84 above its least, within [0, 1]."""
+    part = best.collisions.part(best.used)
+    cut = chi2.isf(_UNLIKELY, part.freedom)
+    unknowns = best.fitted.unknowns[best.used]
+
+    def loss(alpha: float) -> float:
+        misfit = part.fitted(alpha, unknowns).misfit / best.misfit
+        return -2 * float(np.sum(np.logaddexp(-misfit / 2, -cut / 2)))
+
+    least = loss(best.restitution)
+
+    def end(sign: int) -> float:
+        far = best.restitution
+        for _ in range(12):
+            near, far = far, float(np.clip(far + sign * 2.5 * best.stderr, 0, 1))
+            if loss(far) - least > _LEVEL:
+                crossing: Any = brentq(lambda alpha: loss(alpha) - least - _LEVEL, near, far, xtol=1e-3 * best.stderr)
+                return float(crossing)
+            if far in (0.0, 1.0):
+                return far
+        return far
+
+    return end(-1), end(1)

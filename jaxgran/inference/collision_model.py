@@ -1,0 +1,142 @@
+"""The model of one collision and its noise, fitted to many of them at a trial restitution.
+
+A collision of two discs without friction turns their relative velocity u into u − (1 + α)(u·n) n. Its five unknowns are
+the separation at contact, whose direction is n, the time of contact, and u. What was seen are separations and relative
+velocities in some frames before and after, each with noise; the distance at contact is that of the diameters, with an
+error. The least χ² over the unknowns is found for all collisions at once, with its derivatives by α.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from jaxgran.inference.collisions import Candidates, Noise
+
+UNKNOWNS = 5  # of a collision
+_CHUNK = 256  # collisions that are fitted at once
+
+
+class Fitted(NamedTuple):
+    """Collisions at one restitution; each is (collisions,).
+
+    misfit, gradient and curvature are χ², half its derivative by α, and half the second one, at the best unknowns.
+    """
+
+    unknowns: np.ndarray
+    misfit: np.ndarray
+    gradient: np.ndarray
+    curvature: np.ndarray
+    normal_velocity: np.ndarray
+    normal_error: np.ndarray
+
+
+class Collisions:
+    """Candidates with their noise, and the best unknowns found so far, with which the next search begins."""
+
+    def __init__(self, seen: Candidates, noise: Noise):
+        self.seen = seen
+        known = seen.known & (seen.before | seen.after)
+        self.freedom = 2.0 * (known.sum(axis=1) + (seen.before | seen.after).sum(axis=1)) - UNKNOWNS
+        count, rows = len(seen.window), -(-len(seen.window) // _CHUNK) * _CHUNK
+        self.count, self.guess = count, _padded(seen.guess, rows)
+        root = np.sqrt(2)
+        self.data = tuple(
+            _padded(x, rows)
+            for x in (
+                seen.time,
+                seen.separation,
+                seen.velocity,
+                (seen.before | seen.after) / (root * noise.position),
+                known / (root * noise.velocity),
+                seen.after.astype(float),
+                seen.reach,
+                np.full(count, noise.diameter),
+            )
+        )
+
+    def fitted(self, restitution: float, unknowns: np.ndarray | None = None, steps: int = 15) -> Fitted:
+        start = self.guess if unknowns is None else _padded(unknowns, len(self.guess))
+        alpha, most = jnp.asarray(restitution), jnp.asarray(steps)
+        chunks = [
+            _best_unknowns(alpha, most, *(jnp.asarray(x[k : k + _CHUNK]) for x in (start, *self.data)))
+            for k in range(0, len(start), _CHUNK)
+        ]
+        found = (np.concatenate(x)[: self.count] for x in zip(*chunks, strict=True))
+        best, misfit, products, gradient = found
+        inner, mixed = products[:, :UNKNOWNS, :UNKNOWNS], products[:, :UNKNOWNS, UNKNOWNS]
+        covariance = np.linalg.pinv(inner, hermitian=True)
+        curvature = products[:, UNKNOWNS, UNKNOWNS] - np.einsum("ci,cij,cj->c", mixed, covariance, mixed)
+        contact, velocity = best[:, :2], best[:, 3:]
+        distance = np.linalg.norm(contact, axis=1)
+        approach = -np.sum(contact * velocity, axis=1) / distance
+        across = -(velocity + (approach / distance)[:, None] * contact) / distance[:, None]  # its derivative by contact
+        slope = np.concatenate([across, np.zeros((len(best), 1)), -contact / distance[:, None]], axis=1)
+        error = np.sqrt(np.maximum(np.einsum("ci,cij,cj->c", slope, covariance, slope), 0))
+        return Fitted(best, misfit, gradient[:, UNKNOWNS], curvature, approach, error)
+
+    def part(self, chosen: np.ndarray) -> "Collisions":
+        """The chosen ones alone."""
+        part = object.__new__(Collisions)
+        count = int(chosen.sum())
+        rows = -(-count // _CHUNK) * _CHUNK
+        part.seen, part.freedom, part.count = None, self.freedom[chosen], count
+        part.guess, *data = (_padded(x[: self.count][chosen], rows) for x in (self.guess, *self.data))
+        part.data = tuple(data)
+        return part
+
+
+def _padded(x: np.ndarray, rows: int) -> np.ndarray:
+    """An array with its last row repeated up to a number of rows."""
+    return np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])
+
+
+def _residuals(
+    unknowns: Array, restitution: Array, time, separation, velocity, wx, wv, after, reach, diameter
+) -> Array:
+    """What was seen of a collision less the model of it, over the noise."""
+    contact, when, u = unknowns[:2], unknowns[2], unknowns[3:]
+    distance = jnp.sqrt(contact @ contact)
+    normal = contact / distance
+    velocities = u[None] - jnp.outer(after, (1 + restitution) * (u @ normal) * normal)
+    positions = contact[None] + (time - when)[:, None] * velocities
+    return jnp.concatenate(
+        [
+            (wx[:, None] * (separation - positions)).ravel(),
+            (wv[:, None] * (velocity - velocities)).ravel(),
+            ((distance - reach) / diameter)[None],
+        ]
+    )
+
+
+@jax.jit
+def _best_unknowns(restitution: Array, steps: Array, start: Array, *data: Array):
+    """Least squares over the five unknowns of every collision, by Levenberg-Marquardt steps.
+
+    Returns the unknowns, χ², and the products JᵀJ and Jᵀr; r are the residuals, J their derivatives by unknowns and α.
+    """
+
+    def one(start, *data):
+        def residuals(parameters):
+            r = _residuals(parameters[:UNKNOWNS], parameters[UNKNOWNS], *data)
+            return r, r
+
+        def step(_, carry):
+            unknowns, misfit, curvature, gradient, damping = carry
+            inner = curvature[:UNKNOWNS, :UNKNOWNS]
+            move = jnp.linalg.solve(inner + damping * jnp.diag(jnp.diag(inner)), gradient[:UNKNOWNS])
+            moved = unknowns - move
+            slopes, r = jax.jacfwd(residuals, has_aux=True)(jnp.append(moved, restitution))
+            now = moved, r @ r, slopes.T @ slopes, slopes.T @ r
+            better = now[1] <= misfit
+            kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), now, carry[:4])
+            return *kept, jnp.clip(jnp.where(better, damping / 10, damping * 10), 1e-12, 1e12)
+
+        size = UNKNOWNS + 1
+        begin = start, jnp.inf, jnp.eye(size), jnp.zeros(size), jnp.asarray(1e-2)
+        return lax.fori_loop(0, steps, step, begin)[:4]
+
+    return jax.vmap(one)(start, *data)

@@ -1,0 +1,349 @@
+"""Binary collisions in tracks: pairs of discs that fly straight, strike each other once, and fly straight again.
+
+Between collisions a disc moves on a straight line in the laboratory. For each pair of near discs and each window from
+a frame to the next in which both are seen, the flights before and after the window are as long as straight lines
+describe them, within the noise. The pair is a candidate where the relative velocity changes in the window by more than
+its noise. The flight of the centre of mass has to be straight through all of it: where a third disc, or one that is not
+seen, has struck either one, it is not.
+
+Only this flight needs masses. Where they are not known, they grow with that power of the diameter for which the most
+flights are straight.
+
+Lengths are in mean diameters, and times in the time in which a disc moves by one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from scipy.stats import chi2
+
+from jaxgran.io.tracks import Tracks, displacements, nearest_image
+
+LONGEST = 8  # frames of a flight beside those of its window
+_RARE = 1e-3  # probability with which noise alone ends a flight
+_LEAST_CHANGE = 3.0  # of the relative velocity of a candidate, over its error
+_POWERS = (2, 3, 0)  # of the diameter: discs, spheres, equal masses
+_FRAMES_TO_WEIGH = 100
+_REACH = 3.0  # steps of quick pairs between frames, within which a pair is near
+_QUICK = 0.9  # quantile of these steps
+
+
+class Noise(NamedTuple):
+    """Standard deviations of a component of an observed position and velocity, and of an observed diameter."""
+
+    position: float
+    velocity: float
+    diameter: float
+
+
+class Flights(NamedTuple):
+    """Tracks without jumps through the sides of the cell, in units of the fit.
+
+    ==========  ===================  =====================================================================
+    time        (frames,)            of each frame
+    positions   (frames, grains, 2)  on one straight line between collisions; NaN where not seen
+    velocities  (frames, grains, 2)  along that line; NaN where not known
+    places      (frames, grains, 2)  positions as they were seen, in the cell
+    cell        (frames, 3)          as in ``Tracks``
+    shear_rate  ()                   γ̇
+    diameters   (grains,)
+    masses      (grains,)            NaN where they are not known
+    ==========  ===================  =====================================================================
+    """
+
+    time: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+    places: np.ndarray
+    cell: np.ndarray
+    shear_rate: float
+    diameters: np.ndarray
+    masses: np.ndarray
+
+
+class Candidates(NamedTuple):
+    """Pairs that may have collided in a window, with what was seen of them before and after.
+
+    =================  ==================  ====================================================================
+    field              shape               meaning
+    =================  ==================  ====================================================================
+    window             (pairs,)            frame before the collision
+    grains             (pairs, 2)          the discs i and j
+    reach              (pairs,)            distance at contact, by the diameters
+    time               (pairs, frames)     of the frames around the window, from its beginning
+    separation         (pairs, frames, 2)  of disc i from the image of disc j
+    velocity           (pairs, frames, 2)  its rate of change, 0 where it is not known
+    known              (pairs, frames)     whether it is
+    before, after      (pairs, frames)     which frames belong to the flights
+    guess              (pairs, 5)          separation at contact (2), time of contact, velocity before (2)
+    drift              (pairs,)            χ² of the straight flight of the centre of mass
+    drift_freedom      (pairs,)            its degrees of freedom
+    =================  ==================  ====================================================================
+    """
+
+    window: Int[np.ndarray, " pairs"]
+    grains: Int[np.ndarray, "pairs 2"]
+    reach: Float[np.ndarray, " pairs"]
+    time: Float[np.ndarray, "pairs frames"]
+    separation: Float[np.ndarray, "pairs frames 2"]
+    velocity: Float[np.ndarray, "pairs frames 2"]
+    known: Bool[np.ndarray, "pairs frames"]
+    before: Bool[np.ndarray, "pairs frames"]
+    after: Bool[np.ndarray, "pairs frames"]
+    guess: Float[np.ndarray, "pairs 5"]
+    drift: Float[np.ndarray, " pairs"]
+    drift_freedom: Float[np.ndarray, " pairs"]
+
+
+def flights_of(tracks: Tracks) -> tuple[Flights, float, float]:
+    """The flights of tracks, and the units of length and of time in which they are."""
+    length = float(np.mean(tracks.diameters))
+    moved = displacements(tracks)
+    speeds = np.linalg.norm(moved, axis=-1) / np.diff(tracks.time)[:, None]
+    speed = float(np.nanmedian(speeds)) if np.isfinite(speeds).any() else 0.0
+    duration = length / speed if speed > 0 else float(np.median(np.diff(tracks.time)))
+    positions = _unwrapped(tracks)
+    lifted = positions[..., 1] - tracks.positions[..., 1]
+    velocities = tracks.velocities.copy()
+    velocities[..., 0] += tracks.shear_rate * lifted
+    flights = Flights(
+        tracks.time / duration,
+        positions / length,
+        velocities * duration / length,
+        tracks.positions / length,
+        tracks.cell / length,
+        tracks.shear_rate * duration,
+        tracks.diameters / length,
+        tracks.masses,
+    )
+    return flights, length, duration
+
+
+def _unwrapped(tracks: Tracks) -> np.ndarray:
+    """Positions that follow each disc through the sides of the cell, also past frames in which it is not seen."""
+    positions = tracks.positions.copy()
+    place, follows = positions[0].copy(), positions[0].copy()
+    for k in range(1, len(positions)):
+        now = tracks.positions[k]
+        step = nearest_image(now - place, tracks.cell[k])
+        follows_now = np.where(np.isfinite(place), follows + step, now)
+        seen = np.isfinite(now)
+        positions[k] = np.where(seen, follows_now, np.nan)
+        place, follows = np.where(seen, now, place), np.where(seen, follows_now, follows)
+    return positions
+
+
+def measured_noise(flights: Flights) -> tuple[float, float]:
+    """Noise of positions and velocities, from the quarter of the discs that changes least from frame to frame."""
+    x, v, during = flights.positions, flights.velocities, np.diff(flights.time)[:, None, None]
+    if not np.isfinite(v).any():
+        bend = np.diff(x[1:], axis=0) - np.diff(x[:-1], axis=0) * during[1:] / during[:-1]
+        ratio = during[1:] / during[:-1]
+        return _least_spread(bend / np.sqrt(1 + ratio**2 + (1 + ratio) ** 2)), np.inf
+    velocity = _least_spread(np.diff(v, axis=0)) / np.sqrt(2)
+    excess = (
+        _least_spread(np.diff(x, axis=0) - during * (v[1:] + v[:-1]) / 2) ** 2 - np.mean(during**2) * velocity**2 / 2
+    )
+    return float(np.sqrt(max(excess, 0) / 2)), velocity
+
+
+def _least_spread(vectors: np.ndarray) -> float:
+    """Standard deviation of a component, from the smallest quarter of the lengths."""
+    squares = np.sum(vectors**2, axis=-1)
+    squares = squares[np.isfinite(squares)]
+    return float(np.sqrt(np.quantile(squares, 0.25) / (-2 * np.log(0.75)))) if squares.size else 0.0
+
+
+def relative_step(flights: Flights, share: float = 0.5) -> float:
+    """How far near discs move apart or together between frames, in diameters: a quantile over discs and frames."""
+    steps = []
+    for k in range(len(flights.time) - 1):
+        seen = np.flatnonzero(np.isfinite(flights.places[k : k + 2, :, 0]).all(axis=0))
+        if len(seen) > 1:
+            _, neighbours = KDTree(flights.places[k, seen]).query(flights.places[k, seen], k=2)
+            nearest = np.asarray(neighbours)[:, 1]
+            moved = (flights.positions[k + 1] - flights.positions[k])[seen]
+            steps.append(np.linalg.norm(moved - moved[nearest], axis=-1))
+    return float(np.quantile(np.concatenate(steps), share)) if steps else np.nan
+
+
+def candidates(flights: Flights, noise: Noise) -> Candidates | None:
+    """All pairs that may have collided, of all windows; None where there are none."""
+    if not np.isfinite(flights.masses).all():
+        flights = _weighed(flights, noise)
+    margin = _REACH * relative_step(flights, _QUICK) + 0.1
+    found = [part for k in range(len(flights.time) - 1) if (part := _of_window(flights, noise, k, margin)) is not None]
+    return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
+
+
+def _weighed(flights: Flights, noise: Noise) -> Flights:
+    """The flights with masses, by how many collisions in some of the frames leave the centre of mass on its way."""
+    part = slice(0, _FRAMES_TO_WEIGH)
+    few = flights._replace(
+        **{name: getattr(flights, name)[part] for name in ("time", "positions", "velocities", "places", "cell")}
+    )
+    powers = _POWERS if np.ptp(flights.diameters) > 0 else _POWERS[:1]
+    best, most = flights, -1
+    for power in powers:
+        masses = flights.diameters**power
+        seen = candidates(few._replace(masses=masses), noise) if len(powers) > 1 else None
+        straight = 0 if seen is None else int(np.sum(straight_drift(seen)))
+        if straight > most:
+            best, most = flights._replace(masses=masses), straight
+    return best
+
+
+def straight_drift(seen: Candidates) -> Bool[np.ndarray, " pairs"]:
+    """Whether the centre of mass of each candidate flies straight, within the noise."""
+    return seen.drift < chi2.isf(_RARE, np.maximum(seen.drift_freedom, 1))
+
+
+def _near(flights: Flights, k: int, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs that are near in frame k, i < j, with the separation of i from the image of j."""
+    seen = np.flatnonzero(np.isfinite(flights.places[k, :, 0]))
+    if len(seen) < 2:
+        return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
+    reach, places, cell = np.max(flights.diameters[seen]) + margin, flights.places[k, seen], flights.cell[k]
+    images, owner = places, np.arange(len(seen))
+    if np.isfinite(cell[0]):
+        width, height, offset = cell
+        places = _wrapped(places, cell)
+        shifts = np.array([[m * width + n * offset, n * height] for n in (-1, 0, 1) for m in (-2, -1, 0, 1, 2)])
+        images, owner = (places + shifts[:, None]).reshape(-1, 2), np.tile(owner, len(shifts))
+        inside = np.all((images > -reach) & (images < np.array([width, height]) + reach), axis=1)
+        images, owner = images[inside], owner[inside]
+    tree = KDTree(images)
+    near = tree.query_ball_point(places, reach, return_sorted=False)
+    i = np.repeat(np.arange(len(seen)), [len(x) for x in near])
+    j_image = np.concatenate([np.asarray(x, int) for x in near])
+    apart, j = places[i] - images[j_image], owner[j_image]
+    first = i < j
+    i, j, apart = seen[i[first]], seen[j[first]], apart[first]
+    close = np.linalg.norm(apart, axis=1) < (flights.diameters[i] + flights.diameters[j]) / 2 + margin
+    return i[close], j[close], apart[close]
+
+
+def _wrapped(places: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    width, height, offset = cell
+    rows = np.floor(places[:, 1] / height)
+    x = places[:, 0] - rows * offset
+    return np.stack([x - width * np.floor(x / width), places[:, 1] - rows * height], axis=-1)
+
+
+def _of_window(flights: Flights, noise: Noise, k: int, margin: float) -> Candidates | None:
+    i, j, apart = _near(flights, k, margin)
+    if len(i) == 0:
+        return None
+    around = np.arange(k - LONGEST, k + 2 + LONGEST)
+    exists = (around >= 0) & (around < len(flights.time))
+    frames = np.clip(around, 0, len(flights.time) - 1)
+    time = np.where(exists, flights.time[frames] - flights.time[k], 0.0)
+    # The image of j lies a lattice vector from its track; the image slides by the shear of its height
+    shift = apart - (flights.positions[k, i] - flights.positions[k, j])
+    slide = flights.shear_rate * np.stack([shift[:, 1], np.zeros(len(i))], axis=-1)
+    of_i, of_j = (flights.positions[frames][:, grain].transpose(1, 0, 2) for grain in (i, j))
+    image = of_j - shift[:, None] - time[:, None] * slide[:, None]
+    v_i, v_j = (flights.velocities[frames][:, grain].transpose(1, 0, 2) for grain in (i, j))
+    v_image = v_j - slide[:, None]
+    share = (flights.masses[i] / (flights.masses[i] + flights.masses[j]))[:, None, None]
+    spread = np.sqrt(share**2 + (1 - share) ** 2)
+    pair = _Seen(time, of_i - image, v_i - v_image, exists)
+    centre = _Seen(
+        time, (share * of_i + (1 - share) * image) / spread, (share * v_i + (1 - share) * v_image) / spread, exists
+    )
+    of_pair = Noise(np.sqrt(2) * noise.position, np.sqrt(2) * noise.velocity, 0.0)
+
+    sides, lines = [], []
+    for outwards in (np.arange(LONGEST, -1, -1), np.arange(LONGEST + 1, 2 * LONGEST + 2)):
+        relative, common = (_lines(seen, outwards, of) for seen, of in ((pair, of_pair), (centre, noise)))
+        together = relative.misfit + common.misfit
+        added = np.diff(together, axis=1, prepend=0)
+        freedom = 4.0 * (1 + pair.known[:, outwards])
+        straight = np.cumprod(~relative.settled | (added < chi2.isf(_RARE, freedom)), axis=1).astype(bool)
+        belongs = np.zeros(pair.seen.shape, bool)
+        belongs[:, outwards] = straight & pair.seen[:, outwards]
+        last = straight.sum(axis=1) - 1
+        sides.append(belongs)
+        lines.append(
+            [x[np.arange(len(i)), last] for x in (relative.settled, relative.start, relative.slope, relative.variance)]
+        )
+    (before, after), ((first, a, u, var_u), (second, b, w, var_w)) = sides, lines
+    change = w - u
+    size = np.sum(change**2, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        clear = first & second & (size > _LEAST_CHANGE**2 * (var_u + var_w))
+        contact, until = -np.sum((b - a) * change, axis=-1) / size, time[np.argmax(after, axis=1)]
+        late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # by which noise may move it out of the window
+        clear &= (contact > -late) & (contact < until + late)
+        contact = np.clip(contact, 0, until)
+    if not clear.any():
+        return None
+    place = ((a + u * contact[:, None]) + (b + w * contact[:, None])) / 2
+    drift = _lines(
+        _Seen(time, centre.positions, centre.velocities, exists, before | after), np.arange(len(time)), noise
+    )
+    both = before | after
+    freedom = 2.0 * (both * (1 + pair.known)).sum(axis=1) - 4
+    guess = np.concatenate([place, contact[:, None], u], axis=1)
+    rows = len(i)
+    return Candidates(
+        *(x[clear] for x in (
+            np.full(rows, k),
+            np.stack([i, j], axis=-1),
+            (flights.diameters[i] + flights.diameters[j]) / 2,
+            np.tile(time, (rows, 1)),
+            np.where(both[..., None], pair.positions, 0),
+            np.where((both & pair.known)[..., None], pair.velocities, 0),
+            pair.known,
+            before,
+            after,
+            guess,
+            drift.misfit[:, -1],
+            freedom,
+        ))
+    )  # fmt: skip
+
+
+class _Seen:
+    """Positions (pairs, frames, 2) and velocities of points at times (frames,), and in which frames they are seen."""
+
+    def __init__(self, time, positions, velocities, exists, chosen=None):
+        self.time, self.positions, self.velocities = time, positions, velocities
+        self.seen = exists & np.isfinite(positions[..., 0])
+        self.seen = self.seen if chosen is None else self.seen & chosen
+        self.known = self.seen & np.isfinite(velocities[..., 0])
+
+
+class _Lines(NamedTuple):
+    """Straight lines through the first one, two, … of some frames: (pairs, frames) and (pairs, frames, 2)."""
+
+    settled: np.ndarray  # whether these frames determine a line
+    start: np.ndarray  # position at time zero
+    slope: np.ndarray
+    variance: np.ndarray  # of a component of the slope
+    misfit: np.ndarray  # χ²
+
+
+def _lines(seen: _Seen, order: np.ndarray, noise: Noise) -> _Lines:
+    """Weighted least squares, by sums over frames that are added in this order."""
+    t = seen.time[order]
+    wx = seen.seen[:, order] / noise.position**2
+    wv = seen.known[:, order] / noise.velocity**2
+    x = np.where(seen.seen[:, order, None], seen.positions[:, order], 0)
+    v = np.where(seen.known[:, order, None], seen.velocities[:, order], 0)
+    # From a rough line, so that the sums of squares keep their digits
+    first = x[np.arange(len(x)), np.argmax(seen.seen[:, order], axis=1)][:, None]
+    x = np.where(seen.seen[:, order, None], x - first, 0)
+    s0, s1, s2 = (np.cumsum(y, axis=1) for y in (wx, wx * t, wx * t**2 + wv))
+    p = np.cumsum(wx[..., None] * x, axis=1)
+    q = np.cumsum((wx * t)[..., None] * x + wv[..., None] * v, axis=1)
+    r = np.cumsum(np.sum(wx[..., None] * x**2 + wv[..., None] * v**2, axis=-1), axis=1)
+    determinant = s0 * s2 - s1**2
+    settled = determinant > 1e-9 * s0 * s2
+    safe = np.where(settled, determinant, 1)[..., None]
+    start = (s2[..., None] * p - s1[..., None] * q) / safe
+    slope = (s0[..., None] * q - s1[..., None] * p) / safe
+    misfit = np.where(settled, np.maximum(r - np.sum(start * p + slope * q, axis=-1), 0), 0)
+    return _Lines(settled, start + first, slope, s0 / safe[..., 0], misfit)

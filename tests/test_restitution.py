@@ -1,0 +1,123 @@
+"""The restitution of discs is found again from what was seen of them, with an interval that is true to its name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from observed import FRAMES, RESTITUTION, noisy, tracks, without_velocities
+from synthetic import one_sentence
+
+from jaxgran.inference.restitution import fit_restitution
+from jaxgran.io.tracks import Tracks
+from jaxgran.model.checks import InputError
+
+SEEN = {
+    "exactly": lambda seen: seen,
+    "velocities with 5 % of noise": lambda seen: noisy(seen, 1e-3, 0.05),
+    "a tenth missing": lambda seen: noisy(seen, 1e-4, 0.01, 0.1),
+    "positions alone": lambda seen: without_velocities(noisy(seen, 1e-4, 0.0)),
+    "positions alone, noisier": lambda seen: without_velocities(noisy(seen, 1e-3, 0.0)),
+}
+
+
+ALL = [(restitution, how) for restitution in (0.3, RESTITUTION, 0.95) for how in SEEN]
+QUICK = {(0.3, "velocities with 5 % of noise"), (RESTITUTION, "positions alone"), (0.95, "exactly")}
+
+
+@pytest.mark.parametrize(
+    ("restitution", "how"), [case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow) for case in ALL]
+)
+def test_restitution_is_found_again(restitution: float, how: str) -> None:
+    fit = fit_restitution(SEEN[how](tracks(restitution)))
+    assert abs(fit.restitution - restitution) < 4 * fit.stderr < 0.06
+    assert fit.low <= fit.restitution <= fit.high
+    assert fit.high - fit.low == pytest.approx(3.92 * fit.stderr, rel=0.2) or fit.high == 1
+    assert fit.collisions > 20
+
+
+def test_noise_is_measured() -> None:
+    fit = fit_restitution(noisy(tracks(), 1e-3, 0.05))
+    velocities = noisy(tracks(), 0.0, 0.05).velocities - tracks().velocities
+    assert fit.position_noise == pytest.approx(1e-3, rel=0.1)
+    assert fit.velocity_noise == pytest.approx(np.std(velocities), rel=0.1)
+    assert fit.misfit < 1.2
+
+
+@pytest.mark.parametrize("shear_rate", [0.0, 1.0])
+def test_units_do_not_matter(shear_rate: float) -> None:
+    """Lengths in pixels and times in frames, of a free gas and of a sheared one."""
+    seen = noisy(tracks(shear_rate=shear_rate), 1e-4, 0.01)
+    during = np.diff(seen.time).mean()
+    lengths = {name: 37 * getattr(seen, name) for name in ("diameters", "positions", "cell")}
+    times = {"time": seen.time / during, "shear_rate": shear_rate * during}
+    pixels = replace(seen, masses=5 * seen.masses, velocities=37 * during * seen.velocities, **lengths, **times)
+    one, other = fit_restitution(seen), fit_restitution(pixels)
+    assert other.restitution == pytest.approx(one.restitution, abs=1e-9)
+    assert other.position_noise == pytest.approx(37 * one.position_noise, rel=1e-6)
+    assert abs(one.restitution - RESTITUTION) < 4 * one.stderr
+
+
+def test_a_region_of_the_cell_suffices() -> None:
+    """Discs that enter and leave it, and no cell: pairs that meet through its sides are not seen."""
+    seen = noisy(tracks(), 1e-4, 0.01)
+    inside = np.all((seen.positions > 1) & (seen.positions < seen.cell[0, 0] - 2), axis=-1)[..., None]
+    region = replace(
+        seen,
+        positions=np.where(inside, seen.positions, np.nan),
+        velocities=np.where(inside, seen.velocities, np.nan),
+        cell=np.tile([np.inf, np.inf, 0.0], (FRAMES, 1)),
+        shear_rate=0.0,
+    )
+    fit, whole = fit_restitution(region), fit_restitution(seen)
+    assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
+    assert 10 < fit.collisions < whole.collisions
+
+
+def test_frames_may_be_left_out() -> None:
+    seen = noisy(tracks(), 1e-4, 0.01)
+    kept = np.random.default_rng(0).random(FRAMES) < 0.7
+    parts = {name: getattr(seen, name)[kept] for name in ("time", "positions", "velocities", "cell")}
+    fit = fit_restitution(replace(seen, **parts))
+    assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
+
+
+def test_mismatched_ids_change_little() -> None:
+    """In a tenth of the frames two near discs have each other's id."""
+    seen = noisy(tracks(), 1e-4, 0.01)
+    positions, velocities = seen.positions.copy(), seen.velocities.copy()
+    for k in range(5, FRAMES, 10):
+        apart = np.linalg.norm(positions[k, 0] - positions[k, 1:], axis=-1)
+        swapped = [0, 1 + int(np.argmin(apart))]
+        positions[k, swapped], velocities[k, swapped] = positions[k, swapped[::-1]], velocities[k, swapped[::-1]]
+    fit = fit_restitution(replace(seen, positions=positions, velocities=velocities))
+    assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
+
+
+def at_rest(seen: Tracks) -> Tracks:
+    return replace(seen, positions=seen.positions[:1] + np.zeros((FRAMES, 1, 1)), velocities=0 * seen.velocities)
+
+
+def elsewhere(seen: Tracks) -> Tracks:
+    return replace(seen, positions=np.random.default_rng(0).uniform(0, 11, seen.positions.shape))
+
+
+def twice(seen: Tracks) -> Tracks:
+    parts = {name: getattr(seen, name)[:2] for name in ("time", "positions", "velocities", "cell")}
+    return without_velocities(replace(seen, **parts))
+
+
+NOTHING = {"no collisions": at_rest, "frames too far apart": elsewhere, "positions in two frames": twice}
+
+
+@pytest.mark.parametrize("why", NOTHING)
+def test_where_nothing_is_to_be_learnt_a_sentence_says_so(why: str) -> None:
+    with pytest.raises(InputError, match=r"^tracks must show .* take") as refused:
+        fit_restitution(NOTHING[why](tracks()))
+    assert one_sentence(str(refused.value))
+
+
+@pytest.mark.parametrize("name", ["position_noise", "velocity_noise", "diameter_noise"])
+def test_noise_that_cannot_be_is_one_sentence(name: str) -> None:
+    with pytest.raises(InputError, match=f"^{name} must be a number of at least 0, not -1") as refused:
+        fit_restitution(tracks(), **{name: -1})
+    assert one_sentence(str(refused.value))

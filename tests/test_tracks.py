@@ -1,0 +1,334 @@
+"""Tracks are the same from every file that can hold them; what is no such file is one sentence, and exit status 2."""
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gsd.hoomd
+import h5py
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from command_line import jaxgran
+from observed import FRAMES, GRAINS, RESTITUTION, noisy, tracks
+from synthetic import one_sentence
+
+from jaxgran.inference.restitution import fit_restitution
+from jaxgran.io.track_files import read_tracks
+from jaxgran.io.tracks import Tracks, nearest_image, tracks_of_states
+from jaxgran.io.trajectory import write_trajectory
+from jaxgran.model.cell import cell_side
+from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
+
+INTERVAL = float(np.diff(tracks().time).mean())
+
+
+def rows_of(seen: Tracks) -> pd.DataFrame:
+    """One row for each disc in each frame in which it is seen; ids are no numbers of places."""
+    frame, grain = np.indices(seen.positions.shape[:2])
+    columns = {
+        "frame": 3 * frame + 7,  # a camera that was read out every third time
+        "id": 100 + 2 * grain,
+        "x": seen.positions[..., 0],
+        "y": seen.positions[..., 1],
+        "vx": seen.velocities[..., 0],
+        "vy": seen.velocities[..., 1],
+        "diameter": np.broadcast_to(seen.diameters, frame.shape),
+    }
+    rows = pd.DataFrame({name: column.ravel() for name, column in columns.items()}).dropna()
+    return rows.sample(frac=1, random_state=0)  # in any order
+
+
+def peculiar(seen: Tracks) -> Tracks:
+    velocities = seen.velocities.copy()
+    velocities[..., 0] -= seen.shear_rate * seen.positions[..., 1]
+    return replace(seen, velocities=velocities)
+
+
+def write_csv(path: Path, seen: Tracks) -> None:
+    rows_of(seen).to_csv(path, index=False)
+
+
+def write_spaces(path: Path, seen: Tracks) -> None:
+    rows = rows_of(seen)
+    radii = rows.assign(Radius=rows.diameter / 2, Particle=rows.id).drop(columns=["diameter", "id"])
+    path.write_text("# tracked by hand\n" + radii.to_csv(index=False, sep=" "))
+
+
+def write_fields(path: Path, seen: Tracks) -> None:
+    with h5py.File(path, "w") as file:
+        file["tracks"] = rows_of(seen).to_records(index=False)
+
+
+def write_datasets(path: Path, seen: Tracks) -> None:
+    with h5py.File(path, "w") as file:
+        for name, column in rows_of(seen).items():
+            file[f"discs/{name}"] = column.to_numpy()
+
+
+def write_dump(path: Path, seen: Tracks, scaled: bool = False) -> None:
+    """As LAMMPS writes it, with bounds that hold the tilted cell."""
+    with path.open("w") as file:
+        for k in range(len(seen.time)):
+            width, height, offset = seen.cell[k]
+            here = np.isfinite(seen.positions[k, :, 0])
+            file.write(f"ITEM: TIMESTEP\n{500 * k}\nITEM: NUMBER OF ATOMS\n{here.sum()}\n")
+            file.write("ITEM: BOX BOUNDS xy xz yz pp pp pp\n")
+            file.write(
+                f"{min(0, offset):.9f} {width + max(0, offset):.9f} {offset:.9f}\n0 {height:.9f} 0\n-0.5 0.5 0\n"
+            )
+            kind = ("xs", "ys", "zs") if scaled else ("x", "y", "z")
+            file.write(f"ITEM: ATOMS id type {' '.join(kind)} vx vy radius\n")
+            for grain in np.flatnonzero(here)[::-1]:
+                (x, y), (u, v) = seen.positions[k, grain], seen.velocities[k, grain]
+                if scaled:
+                    x, y = (x - offset * y / height) / width, y / height
+                file.write(f"{grain + 1} 1 {x:.9f} {y:.9f} 0 {u:.9f} {v:.9f} {seen.diameters[grain] / 2:.9f}\n")
+
+
+def write_gsd(path: Path, seen: Tracks, three: bool = True, flat: bool = True) -> None:
+    """As HOOMD-blue writes it: single precision, types, a box of three dimensions, no logs."""
+    with gsd.hoomd.open(path, "w") as file:
+        for k in range(len(seen.time)):
+            width, height, offset = seen.cell[k]
+            frame = gsd.hoomd.Frame()
+            frame.configuration.step = 100 * k
+            frame.configuration.dimensions = 3 if three else 2
+            frame.configuration.box = [width, height, 1 if three else 0, offset / height, 0, 0]
+            frame.particles.N = GRAINS
+            frame.particles.types = ["A", "B"]
+            frame.particles.typeid = np.arange(GRAINS) % 2
+            y = seen.positions[k, :, 1] - height / 2
+            x = seen.positions[k, :, 0] - width / 2
+            z = np.zeros(GRAINS) if flat else np.linspace(-0.5, 0.5, GRAINS)
+            frame.particles.position = np.stack([x, y, z], axis=-1)
+            frame.particles.velocity = np.pad(seen.velocities[k], ((0, 0), (0, 1)))
+            frame.particles.diameter = seen.diameters
+            file.append(frame)
+
+
+WRITERS = {
+    "discs.csv": write_csv,
+    "discs.txt": write_spaces,
+    "fields.h5": write_fields,
+    "datasets.hdf5": write_datasets,
+    "dump.lammpstrj": write_dump,
+    "scaled.dump": lambda path, seen: write_dump(path, seen, scaled=True),
+    "hoomd.gsd": write_gsd,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_tracks_are_the_same_from_every_file(name: str, tmp_path: Path) -> None:
+    seen = tracks() if name.endswith("gsd") else noisy(tracks(), 0.0, 0.0, missing=0.1)
+    WRITERS[name](tmp_path / name, seen)
+    read = read_tracks(tmp_path / name, interval=INTERVAL)
+    rounding = 1e-5 if name.endswith("gsd") else 1e-8
+    np.testing.assert_allclose(read.time - read.time[0], seen.time - seen.time[0], rtol=1e-9)
+    np.testing.assert_allclose(read.diameters, seen.diameters, rtol=rounding)
+    np.testing.assert_allclose(read.velocities, seen.velocities, rtol=0, atol=10 * rounding)
+    apart = np.diff(read.positions, axis=1) - np.diff(seen.positions, axis=1)
+    apart = nearest_image(apart, read.cell[:, None])
+    np.testing.assert_allclose(apart, np.where(np.isnan(apart), np.nan, 0), rtol=0, atol=10 * rounding)
+    if np.isfinite(read.cell).all():
+        np.testing.assert_allclose(read.cell, seen.cell, rtol=0, atol=rounding)
+        assert read.shear_rate == pytest.approx(1.0, rel=1e-4)
+    fit = fit_restitution(read)  # which finds out how masses go with diameters
+    assert abs(fit.restitution - RESTITUTION) < max(4 * fit.stderr, 1e-4) and fit.collisions > 15
+
+
+def test_time_between_frames_is_that_of_the_displacements(tmp_path: Path) -> None:
+    seen = noisy(tracks(), 1e-5, 0.01)
+    write_dump(tmp_path / "flow.dump", seen)
+    read = read_tracks(tmp_path / "flow.dump")
+    np.testing.assert_allclose(np.diff(read.time), INTERVAL, rtol=2e-3)
+    assert read.shear_rate == pytest.approx(1.0, rel=2e-3)
+
+
+def test_peculiar_velocities_are_those_of_the_laboratory_without_the_shear(tmp_path: Path) -> None:
+    write_dump(tmp_path / "flow.dump", peculiar(tracks()))
+    read = read_tracks(tmp_path / "flow.dump", peculiar=True, shear_rate=1.0, interval=INTERVAL)
+    np.testing.assert_allclose(read.velocities, tracks().velocities, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_states_are_tracks_and_so_is_their_file(dtype: type, tmp_path: Path) -> None:
+    """In single precision too, which a fit in double precision once refused."""
+    seen = peculiar(tracks())
+    grains = Grains(*(jnp.asarray(x, dtype) for x in (seen.diameters / 2, seen.masses)))
+    flow = ShearFlow(GRAINS, RESTITUTION, 0.5, 1e-4)
+    side = cell_side(grains.radii, 0.5)
+    parts = (seen.positions, seen.velocities, np.full(FRAMES, side), seen.cell[:, 2] / seen.cell[:, 0])
+    frames = jax.tree.map(lambda x: jnp.broadcast_to(x, (FRAMES, *x.shape)), grains)
+    states = State(frames, *(jnp.asarray(x, dtype) for x in parts))
+    found = tracks_of_states(seen.time, states)
+    np.testing.assert_allclose(found.velocities, tracks().velocities, rtol=0, atol=1e-4)
+    fit = fit_restitution(found)
+    assert abs(fit.restitution - RESTITUTION) < 1e-3
+    write_trajectory(tmp_path / "flow.gsd", flow, states, np.round(seen.time, 4))
+    read = read_tracks(tmp_path / "flow.gsd")
+    np.testing.assert_array_equal(read.positions, found.positions)
+    with pytest.raises(InputError, match="says its time, shear rate and diameters itself"):
+        read_tracks(tmp_path / "flow.gsd", interval=1.0)
+
+
+def changed(column: str, value) -> str:
+    rows = rows_of(tracks()).head(400)
+    rows[column] = value(rows[column]) if callable(value) else value
+    return rows.to_csv(index=False)
+
+
+def without(column: str) -> str:
+    return rows_of(tracks()).head(400).drop(columns=column).to_csv(index=False)
+
+
+def dump_with(path: Path, old: str, new: str) -> None:
+    write_dump(path, tracks())
+    path.write_text(path.read_text().replace(old, new, 1))
+
+
+def truncated(path: Path, write, size: int) -> None:
+    write(path, tracks())
+    path.write_bytes(path.read_bytes()[:size])
+
+
+def doubled_rows(path: Path) -> None:
+    rows = rows_of(tracks())
+    pd.concat([rows, rows.head(1)]).to_csv(path, index=False)
+
+
+def hdf5_of(path: Path, **columns) -> None:
+    with h5py.File(path, "w") as file:
+        for name, column in columns.items():
+            file[name] = column
+
+
+def other_numbers_of_discs(path: Path) -> None:
+    with gsd.hoomd.open(path, "w") as file:
+        for count in (5, 6):
+            frame = gsd.hoomd.Frame()
+            frame.configuration.box = [9, 9, 0, 0, 0, 0]
+            frame.particles.N, frame.particles.position = count, np.zeros((count, 3))
+            file.append(frame)
+
+
+def text(content: str | Callable[[], str]) -> Callable[[Path], None]:
+    return lambda path: path.write_text(content if isinstance(content, str) else content()) and None
+
+
+def cut(write: Callable, size: int) -> Callable[[Path], None]:
+    return lambda path: truncated(path, write, size)
+
+
+def dump(old: str, new: str) -> Callable[[Path], None]:
+    return lambda path: dump_with(path, old, new)
+
+
+def datasets(**columns) -> Callable[[Path], None]:
+    return lambda path: hdf5_of(path, **columns)
+
+
+FRAME_OF_DUMP = """ITEM: TIMESTEP
+{}
+ITEM: NUMBER OF ATOMS
+2
+ITEM: BOX BOUNDS pp pp pp
+0 9
+0 9
+-0.5 0.5
+ITEM: ATOMS id x y
+1 1.0 1.0
+2 3.0 1.0
+"""
+ONE_DUMP = FRAME_OF_DUMP.format(0) + FRAME_OF_DUMP.format(10)
+ONE_FRAME = "frame,id,x,y,d\n1,1,0,0,1\n1,2,2,2,1\n"
+ONE_DISC = "frame,id,x,y,d\n1,1,0,0,1\n2,1,0.1,0,1\n"
+LONG_ROW = "frame,id,x,y,d\n1,1,0,0,1\n1,2,2,2,1,5,6\n"
+HEIGHTS = "frame,id,x,y,z,d\n1,1,0,0,0,1\n1,2,2,2,1,1\n2,1,0,0,0,1\n"
+PICTURE = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
+GIVEN_MATRIX = {"frame": np.ones((3, 2)), "id": [1], "x": [1.0], "y": [1.0]}
+SHEAR = "by a shear of rate 0.*give --shear-rate, and --peculiar"
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no_rows.csv": (text("frame,id,x,y,diameter\n"), "it has no rows"),
+    "empty.csv": (text(""), "cannot be read: No columns to parse"),
+    "no_header.csv": (text("1,2,3.0,4.0\n1,3,4.0,5.0\n"), "there is no column id among 1, 2"),
+    "no_frames.csv": (text(lambda: without("frame")), "there is no column frame or time"),
+    "no_ids.csv": (text(lambda: without("id")), "there is no column id"),
+    "no_y.csv": (text(lambda: without("y")), "there is no column y"),
+    "no_diameters.csv": (text(lambda: without("diameter")), "give --diameter"),
+    "words.csv": (text(lambda: changed("x", "left")), "column x has something that is not a number"),
+    "infinite.csv": (text(lambda: changed("x", "inf")), "a number that is infinite"),
+    "no_id_in_a_row.csv": (text(lambda: changed("id", "")), "without a number in the column id"),
+    "one_frame.csv": (text(ONE_FRAME), "has one frame"),
+    "one_disc.csv": (text(ONE_DISC), "has one disc"),
+    "an_id_twice.csv": (doubled_rows, "has an id twice in one frame"),
+    "no_size.csv": (text(lambda: changed("diameter", 0)), "diameter is not a positive number"),
+    "ragged.csv": (text(LONG_ROW), "cannot be read: Error tokenizing"),
+    "three_dimensions.csv": (text(HEIGHTS), "it has three dimensions"),
+    "picture.csv": (lambda path: path.write_bytes(PICTURE), "codec can't decode"),
+    "other_units.csv": (text(lambda: changed("vx", lambda x: 1e3 * x)), "differ from its displacements"),
+    "text.h5": (text("no table"), "it is not an HDF5 file"),
+    "cut.h5": (cut(write_fields, 3000), "it is not an HDF5 file"),
+    "nothing.h5": (datasets(), "there is no column id"),
+    "other_lengths.h5": (datasets(frame=[1, 2], id=[1], x=[1.0], y=[1.0]), "do not have one length"),
+    "matrix.hdf5": (datasets(**GIVEN_MATRIX), "is not a list of numbers"),
+    "text.dump": (text("no dump\n"), "cannot be read: "),
+    "cut.dump": (cut(write_dump, 5000), "are not as many as it says"),
+    "no_ids.dump": (dump("ATOMS id", "ATOMS mol"), "there is no column id"),
+    "one_step_twice.dump": (dump("TIMESTEP\n500\n", "TIMESTEP\n0\n"), "have the same time step"),
+    "no_sizes.lammpstrj": (text(ONE_DUMP), "give --diameter"),
+    "text.gsd": (text("no trajectory"), "cannot be read: "),
+    "cut.gsd": (cut(write_gsd, 2000), "cannot be read: "),
+    "no_frames.gsd": (lambda path: gsd.hoomd.open(path, "w").close(), "it has no frames"),
+    "three_dimensions.gsd": (lambda path: write_gsd(path, tracks(), flat=False), "it has three dimensions"),
+    "discs_come_and_go.gsd": (other_numbers_of_discs, "do not have one number of discs"),
+    "peculiar_velocities.gsd": (lambda path: write_gsd(path, peculiar(tracks())), SHEAR),
+    "another_ending.xyz": (text("2\n\nA 0 0 0\n"), "must be a file that ends in .csv"),
+    "folder.csv": (Path.mkdir, "there is no file"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_or_foreign_file_is_one_sentence_and_status_2(name: str, tmp_path: Path) -> None:
+    write, why = BROKEN[name]
+    write(tmp_path / name)
+    outcome = jaxgran(tmp_path, "fit", name)
+    assert (outcome.status, outcome.out) == (2, "")
+    sentence = outcome.err.removeprefix("jaxgran: ").rstrip("\n")
+    assert one_sentence(sentence)
+    assert re.search(why, sentence)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    {
+        "--frame-time 0": "--frame-time must be a positive number, not 0",
+        "--frame-strain 0.1 --frame-time 1": "--frame-strain goes without --frame-time",
+        "--frame-strain 0.1 --shear-rate 0": "--shear-rate must be positive beside a strain",
+        "--peculiar": "--peculiar goes with a shear rate",
+        "--diameter -1": "--diameter must be a positive number",
+        "--position-noise -1": "--position-noise must be a number of at least 0",
+        "--pressure 3": "--pressure goes with a map, and 'discs.csv' is not one",
+        "--frame-time 1": "must be in one unit",
+    }.items(),
+)
+def test_options_that_cannot_be_are_one_sentence(options: str, why: str, tmp_path: Path) -> None:
+    write_csv(tmp_path / "discs.csv", tracks())
+    outcome = jaxgran(tmp_path, "fit", "discs.csv", *options.split())
+    assert (outcome.status, outcome.out) == (2, "")
+    assert why in outcome.err and one_sentence(outcome.err.removeprefix("jaxgran: ").rstrip("\n"))
+
+
+def test_missing_library_of_dumps_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymatgen.io.lammps.outputs", None)
+    write_dump(tmp_path / "flow.dump", tracks())
+    with pytest.raises(InputError, match=r"pymatgen must be installed .* pip install pymatgen\.$"):
+        read_tracks(tmp_path / "flow.dump")
