@@ -273,6 +273,12 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "fit_coverage",
+        "How often do 95 % intervals of a restitution fitted to tracks hold, at which noise?",
+        (40, 1.5),
+        options=(Option("--runs", "number of trajectories", int),),
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),

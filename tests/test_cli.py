@@ -477,7 +477,14 @@ def rows_of(table: str) -> dict[str, str]:
 
 def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded, given = read_trajectory(small_run[0] / "flow.gsd"), []
-    numbers = {"stderr": 0.01, "low": 0.69, "high": 0.7331, "position_noise": 1e-5, "velocity_noise": math.nan}
+    numbers = {
+        "stderr": 0.01,
+        "low": 0.69,
+        "high": 0.7331,
+        "position_noise": 1e-5,
+        "velocity_noise": math.nan,
+        "diameter_noise": 0.01,
+    }
     found = SimpleNamespace(restitution=0.712, **numbers, collisions=123, rejected=4, misfit=1.0)
     monkeypatch.setattr(restitution, "fit_restitution", lambda *x, **noise: given.append((*x, noise)) or found)
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"), "--velocity-noise", "1e-3")

@@ -43,6 +43,16 @@ def test_noise_is_measured() -> None:
     assert fit.misfit < 1.2
 
 
+@pytest.mark.parametrize("error", [0.0, 0.03])
+def test_error_of_the_diameters_is_measured(error: float) -> None:
+    """That of a distance at contact has two of these in it, each by half."""
+    seen = tracks()
+    diameters = seen.diameters + error * np.random.default_rng(0).normal(size=seen.diameters.shape)
+    fit = fit_restitution(replace(noisy(seen, 1e-4, 0.01), diameters=diameters))
+    assert error / np.sqrt(2) / 1.5 <= fit.diameter_noise <= error / np.sqrt(2) * 1.5 + 1e-3
+    assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
+
+
 @pytest.mark.parametrize("shear_rate", [0.0, 1.0])
 def test_units_do_not_matter(shear_rate: float) -> None:
     """Lengths in pixels and times in frames, of a free gas and of a sheared one."""

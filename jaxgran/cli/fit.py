@@ -48,7 +48,7 @@ def fit_command(
         float | None, typer.Option(help="Standard error of a velocity. [default: as above]")
     ] = None,
     diameter_noise: Annotated[
-        float | None, typer.Option(help="Standard error of a diameter. [default: a hundredth of it]")
+        float | None, typer.Option(help="Standard error of the distance at contact. [default: as above]")
     ] = None,
     packing_fraction: Annotated[
         float | None, typer.Option(help="Of a flow whose restitution is sought from its stresses, with a map.")
@@ -122,6 +122,7 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
             "noise of the velocities",
             "none given" if math.isnan(found.velocity_noise) else f"{found.velocity_noise:.2g}",
         ],
+        ["error of the distance at contact", f"{found.diameter_noise:.2g}"],
         ["misfit over the noise", f"{found.misfit:.2g}"],
     ]
     print_table(Table("", ("of the tracks", "value"), rows, numbers=False))

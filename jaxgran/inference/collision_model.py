@@ -23,7 +23,8 @@ _CHUNK = 256  # collisions that are fitted at once
 class Fitted(NamedTuple):
     """Collisions at one restitution; each is (collisions,).
 
-    misfit, gradient and curvature are χ², half its derivative by α, and half the second one, at the best unknowns.
+    misfit, gradient and curvature are χ², half its derivative by α, and half the second one, at the best unknowns. The
+    gap is the distance at contact less that of the diameters, with the variance that it has with these.
     """
 
     unknowns: np.ndarray
@@ -32,6 +33,8 @@ class Fitted(NamedTuple):
     curvature: np.ndarray
     normal_velocity: np.ndarray
     normal_error: np.ndarray
+    gap: np.ndarray
+    gap_variance: np.ndarray
 
 
 class Collisions:
@@ -76,7 +79,10 @@ class Collisions:
         across = -(velocity + (approach / distance)[:, None] * contact) / distance[:, None]  # its derivative by contact
         slope = np.concatenate([across, np.zeros((len(best), 1)), -contact / distance[:, None]], axis=1)
         error = np.sqrt(np.maximum(np.einsum("ci,cij,cj->c", slope, covariance, slope), 0))
-        return Fitted(best, misfit, gradient[:, UNKNOWNS], curvature, approach, error)
+        towards = contact / distance[:, None]
+        spread = np.einsum("ci,cij,cj->c", towards, covariance[:, :2, :2], towards)
+        gap = distance - self.data[-2][: self.count]
+        return Fitted(best, misfit, gradient[:, UNKNOWNS], curvature, approach, error, gap, spread)
 
     def part(self, chosen: np.ndarray) -> "Collisions":
         """The chosen ones alone."""
@@ -101,8 +107,9 @@ def _residuals(
     contact, when, u = unknowns[:2], unknowns[2], unknowns[3:]
     distance = jnp.sqrt(contact @ contact)
     normal = contact / distance
-    velocities = u[None] - jnp.outer(after, (1 + restitution) * (u @ normal) * normal)
-    positions = contact[None] + (time - when)[:, None] * velocities
+    lost = (1 + restitution) * (u @ normal) * normal
+    velocities = u[None] - jnp.outer(after, lost)
+    positions = contact[None] + (time - when)[:, None] * u[None] - jnp.outer(jnp.maximum(time - when, 0), lost)
     return jnp.concatenate(
         [
             (wx[:, None] * (separation - positions)).ravel(),

@@ -22,7 +22,8 @@ from scipy.stats import chi2
 from jaxgran.io.tracks import Tracks, displacements, nearest_image
 
 LONGEST = 8  # frames of a flight beside those of its window
-_RARE = 1e-3  # probability with which noise alone ends a flight
+_RARE = 1e-3  # probability with which noise alone bends the flight of a centre of mass
+_BEND = 0.02  # probability with which noise alone ends a flight
 _LEAST_CHANGE = 3.0  # of the relative velocity of a candidate, over its error
 _POWERS = (2, 3, 0)  # of the diameter: discs, spheres, equal masses
 _FRAMES_TO_WEIGH = 100
@@ -77,6 +78,7 @@ class Candidates(NamedTuple):
     velocity           (pairs, frames, 2)  its rate of change, 0 where it is not known
     known              (pairs, frames)     whether it is
     before, after      (pairs, frames)     which frames belong to the flights
+    duration           (pairs,)            of the window
     guess              (pairs, 5)          separation at contact (2), time of contact, velocity before (2)
     drift              (pairs,)            χ² of the straight flight of the centre of mass
     drift_freedom      (pairs,)            its degrees of freedom
@@ -92,6 +94,7 @@ class Candidates(NamedTuple):
     known: Bool[np.ndarray, "pairs frames"]
     before: Bool[np.ndarray, "pairs frames"]
     after: Bool[np.ndarray, "pairs frames"]
+    duration: Float[np.ndarray, " pairs"]
     guess: Float[np.ndarray, "pairs 5"]
     drift: Float[np.ndarray, " pairs"]
     drift_freedom: Float[np.ndarray, " pairs"]
@@ -169,18 +172,28 @@ def relative_step(flights: Flights, share: float = 0.5) -> float:
     return float(np.quantile(np.concatenate(steps), share)) if steps else np.nan
 
 
-def candidates(flights: Flights, noise: Noise) -> Candidates | None:
-    """All pairs that may have collided, of all windows; None where there are none."""
-    if not np.isfinite(flights.masses).all():
-        flights = _weighed(flights, noise)
+def candidates(flights: Flights, noise: Noise, struck: np.ndarray | None = None) -> Candidates | None:
+    """All pairs that may have collided, of all windows; None where there are none.
+
+    Args:
+      flights: of all discs, with masses.
+      noise: of what was seen.
+      struck: (frames - 1, grains), in which windows a disc is known to collide: no flight goes past them.
+    """
     margin = _REACH * relative_step(flights, _QUICK) + 0.1
-    found = [part for k in range(len(flights.time) - 1) if (part := _of_window(flights, noise, k, margin)) is not None]
+    found = [
+        part
+        for k in range(len(flights.time) - 1)
+        if (part := _of_window(flights, noise, struck, k, margin)) is not None
+    ]
     return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
 
 
-def _weighed(flights: Flights, noise: Noise) -> Flights:
+def weighed(flights: Flights, noise: Noise) -> Flights:
     """The flights with masses, by how many collisions in some of the frames leave the centre of mass on its way."""
     part = slice(0, _FRAMES_TO_WEIGH)
+    if np.isfinite(flights.masses).all():
+        return flights
     few = flights._replace(
         **{name: getattr(flights, name)[part] for name in ("time", "positions", "velocities", "places", "cell")}
     )
@@ -232,7 +245,7 @@ def _wrapped(places: np.ndarray, cell: np.ndarray) -> np.ndarray:
     return np.stack([x - width * np.floor(x / width), places[:, 1] - rows * height], axis=-1)
 
 
-def _of_window(flights: Flights, noise: Noise, k: int, margin: float) -> Candidates | None:
+def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int, margin: float) -> Candidates | None:
     i, j, apart = _near(flights, k, margin)
     if len(i) == 0:
         return None
@@ -261,7 +274,13 @@ def _of_window(flights: Flights, noise: Noise, k: int, margin: float) -> Candida
         together = relative.misfit + common.misfit
         added = np.diff(together, axis=1, prepend=0)
         freedom = 4.0 * (1 + pair.known[:, outwards])
-        straight = np.cumprod(~relative.settled | (added < chi2.isf(_RARE, freedom)), axis=1).astype(bool)
+        total = np.cumsum(freedom * pair.seen[:, outwards], axis=1) - 8
+        likely = (added < chi2.isf(_BEND, freedom)) & (together < chi2.isf(_BEND, np.maximum(total, 1)))
+        straight = np.cumprod(~relative.settled | likely, axis=1).astype(bool)
+        if struck is not None:  # in the window before each further frame, outwards
+            ends = np.minimum(np.minimum(frames[outwards][1:], frames[outwards][:-1]), len(struck) - 1)
+            passed = struck[ends][:, i] | struck[ends][:, j]
+            straight[:, 1:] &= np.cumsum(passed, axis=0).T == 0
         belongs = np.zeros(pair.seen.shape, bool)
         belongs[:, outwards] = straight & pair.seen[:, outwards]
         last = straight.sum(axis=1) - 1
@@ -299,6 +318,7 @@ def _of_window(flights: Flights, noise: Noise, k: int, margin: float) -> Candida
             pair.known,
             before,
             after,
+            until,
             guess,
             drift.misfit[:, -1],
             freedom,

@@ -1,14 +1,15 @@
 """The restitution of discs from their tracks, by a likelihood that knows the noise of what was seen.
 
-A collision of two discs, without friction, turns their relative velocity u into u − (1 + α)(u·n) n. What was seen of it
-are separations and relative velocities in some frames before and after, each with noise. The model of a collision has
-five unknowns: the separation at contact (its direction is n), the time of contact, and u. The misfit of a collision at
-a trial α is the least χ² over these five (errors in variables); the diameters belong to it with an error of their own.
+Each collision of two discs alone is modelled with five unknowns of its own (``collision_model``), which are estimated
+with α: errors in variables. The misfit of a collision at a trial α is the least χ² over these five.
 
 The loss of α is the sum of −2 ln(exp(−χ²/2) + exp(−c/2)) over the collisions: what fits worse than c is no collision of
 these two discs alone, and counts as a constant. The least loss gives α, by Gauss-Newton steps with the derivative of
 the misfit by α at the five unknowns. The interval is that of the profile likelihood: all α with a loss of at most 3.84
 above the least.
+
+The collisions are found twice: flights of the second search end where the first has found another collision, which
+straight lines alone would not show in positions with noise. In between, the error of the diameters is estimated.
 
 Masses cancel, and so does everything that happens elsewhere. So discs may be missing, and the cell need not be seen.
 
@@ -26,18 +27,20 @@ from scipy.stats import chi2
 
 from jaxgran.inference.collision_model import Collisions, Fitted
 from jaxgran.inference.collisions import (
+    Flights,
     Noise,
     candidates,
     flights_of,
     measured_noise,
     relative_step,
     straight_drift,
+    weighed,
 )
 from jaxgran.io.tracks import Tracks
 from jaxgran.model.checks import InputError, require_number, require_untraced, shown
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the iteration
-DIAMETER_NOISE = 0.01  # of a diameter: larger than most errors, and it costs little
+DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
 _LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
 _CLEAR = 4.0  # normal velocity of a collision that is used, over its error
 _UNLIKELY = 1e-3  # probability with which a true collision fits worse than the cut
@@ -46,7 +49,8 @@ _LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; 
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
 _MOST_STEPS = 50
 _CHOOSING = 10  # steps, after which the collisions that are used stay the same
-_APART = 2  # windows within which a pair does not collide twice
+_APART = 2.0  # windows within which a pair does not collide twice
+_AT_ONCE = 1.0  # windows within which a disc does not collide twice, where it can be told
 _SETTLED = 1e-3  # step in standard errors, at which the iteration ends
 _LEVEL = chi2.ppf(0.95, 1)
 
@@ -66,6 +70,7 @@ class RestitutionFit:
                           noise: a third disc took part, or an id changed
     position_noise  ℓ     standard deviation of a component of a position
     velocity_noise  ℓ/t   standard deviation of a component of a velocity; NaN without velocities
+    diameter_noise  ℓ     standard error of the distance at contact
     misfit          –     median χ² of the collisions over that expected; above 1, the errors were enlarged by its root
     ==============  ====  =======================================================================================
     """
@@ -78,6 +83,7 @@ class RestitutionFit:
     rejected: int
     position_noise: float
     velocity_noise: float
+    diameter_noise: float
     misfit: float
 
 
@@ -96,7 +102,7 @@ def fit_restitution(
         or more between two collisions.
       position_noise: standard deviation of a component of a position, in the unit of the tracks; None to estimate it.
       velocity_noise: the same of a velocity.
-      diameter_noise: standard error of a diameter; a hundredth of the mean diameter by default.
+      diameter_noise: standard error of the distance at contact, which two diameters share; None to estimate it.
 
     Returns:
       The restitution with its standard error and its 95 % interval.
@@ -128,13 +134,12 @@ def fit_restitution(
             f"tracks must show discs that move by {_LONGEST_STEP} diameters at most between frames, and neighbours "
             f"move apart by {step:.2g}: take more frames in the same time."
         )
-    seen = candidates(flights, noise)
-    if seen is None:
-        raise InputError(_nothing(0, 0))
+    flights = weighed(flights, noise)
     with jax.enable_x64(True):
-        best = _settled(Collisions(seen, noise))
-        if best.used.sum() < _FEWEST:
-            raise InputError(_nothing(int(best.used.sum()), len(seen.window)))
+        best = _found(flights, noise, None)
+        if diameter_noise is None:
+            noise = noise._replace(diameter=_diameter_noise(best, noise.diameter))
+        best = _found(flights, noise, _struck(best, flights))
         low, high = _interval(best)
     return RestitutionFit(
         restitution=best.restitution,
@@ -145,16 +150,9 @@ def fit_restitution(
         rejected=best.rejected,
         position_noise=noise.position * length,
         velocity_noise=noise.velocity * length / duration if np.isfinite(noise.velocity) else np.nan,
+        diameter_noise=noise.diameter * length,
         misfit=best.misfit,
     )
-
-
-def _nothing(collisions: int, changes: int) -> str:
-    """What would help where too few collisions are found."""
-    found = f"tracks must show {_FEWEST} or more collisions of two discs, and {collisions} can be told from noise"
-    if changes > 10 * _FEWEST:
-        return f"{found} among {changes} changes of velocity: take more frames in the same time, or a looser flow."
-    return f"{found}: take more frames or follow more discs, with less noise if there is much."
 
 
 class _Best(NamedTuple):
@@ -165,6 +163,45 @@ class _Best(NamedTuple):
     stderr: float
     misfit: float
     rejected: int
+
+
+def _found(flights: Flights, noise: Noise, struck: np.ndarray | None) -> _Best:
+    """The collisions in flights and their restitution; an InputError where they are too few."""
+    seen = candidates(flights, noise, struck)
+    if seen is None:
+        raise InputError(_nothing(0, 0))
+    best = _settled(Collisions(seen, noise))
+    if best.used.sum() < _FEWEST:
+        raise InputError(_nothing(int(best.used.sum()), len(seen.window)))
+    return best
+
+
+def _diameter_noise(best: _Best, assumed: float) -> float:
+    """The error of the distance at contact, by the median of what it differs by, over what noise alone explains."""
+    gap, variance = best.fitted.gap[best.used], best.fitted.gap_variance[best.used]
+    told = variance < 0.9 * assumed**2  # by more than the assumption
+    if told.sum() < _FEWEST:
+        return assumed
+    variance = 1 / (1 / variance[told] - 1 / assumed**2)
+    free = gap[told] * (1 + variance / assumed**2)
+
+    def excess(error: float) -> float:
+        return float(np.median(free**2 / (error**2 + variance)) - chi2.ppf(0.5, 1))
+
+    if excess(_LEAST_NOISE) <= 0:
+        return _LEAST_NOISE
+    if excess(1.0) >= 0:
+        return assumed
+    found: Any = brentq(excess, _LEAST_NOISE, 1.0)
+    return float(found)
+
+
+def _nothing(collisions: int, changes: int) -> str:
+    """What would help where too few collisions are found."""
+    found = f"tracks must show {_FEWEST} or more collisions of two discs, and {collisions} can be told from noise"
+    if changes > 10 * _FEWEST:
+        return f"{found} among {changes} changes of velocity: take more frames in the same time, or a looser flow."
+    return f"{found}: take more frames or follow more discs, with less noise if there is much."
 
 
 def _settled(collisions: Collisions) -> _Best:
@@ -180,13 +217,13 @@ def _settled(collisions: Collisions) -> _Best:
 
     alpha, fitted = min(trials, key=lambda trial: loss(trial[1]))
     alone, scale = _alone(collisions, fitted), 1.0
-    used = _once(collisions, fitted.misfit, alone)
+    used = _once(collisions, fitted, alone)
     for k in range(_MOST_STEPS):
         fitted = collisions.fitted(alpha, fitted.unknowns)
         if k < _CHOOSING:
             scale = max(1.0, float(np.median((fitted.misfit / middle)[used]))) if used.any() else 1.0
             alone = _alone(collisions, fitted)
-            used = _once(collisions, fitted.misfit, alone & (fitted.misfit < scale * cut))
+            used = _once(collisions, fitted, alone & (fitted.misfit < scale * cut))
         weights = np.where(used, 1 / (1 + np.exp(np.clip((fitted.misfit / scale - cut) / 2, -50, 50))), 0)
         information = np.sum(weights * fitted.curvature)
         if used.sum() < _FEWEST or not information > 0:
@@ -195,8 +232,8 @@ def _settled(collisions: Collisions) -> _Best:
         now, error = float(np.clip(alpha + step, 0, 1)), float(np.sqrt(scale / information))
         alpha, moved = now, abs(now - alpha)
         if moved <= _SETTLED * error and k > 1:
-            rejected = _once(collisions, fitted.misfit, alone, used) & ~used
-            return _Best(collisions, fitted, used, alpha, error, scale, int(rejected.sum()))
+            rejected = int(_once(collisions, fitted, alone).sum() - used.sum())
+            return _Best(collisions, fitted, used, alpha, error, scale, max(rejected, 0))
     raise RuntimeError(f"the restitution did not settle: it was last {alpha:.3g}.")
 
 
@@ -207,21 +244,40 @@ def _alone(collisions: Collisions, fitted: Fitted) -> np.ndarray:
     return clear & straight_drift(seen)
 
 
-def _once(
-    collisions: Collisions, misfit: np.ndarray, chosen: np.ndarray, first: np.ndarray | None = None
-) -> np.ndarray:
-    """Which of the chosen candidates are no repeats: a collision near a frame is seen in neighbouring windows.
+def _once(collisions: Collisions, fitted: Fitted, chosen: np.ndarray) -> np.ndarray:
+    """Which of the chosen candidates are no repeats: one collision may be seen in several windows.
 
-    Of these the one with the least misfit is kept, or one that is already in ``first``.
+    Of these the one with the most frames is kept, and of those the one with the least misfit.
     """
-    seen, taken, kept = collisions.seen, set(), np.zeros(len(chosen), bool)
-    order = misfit / collisions.freedom
-    for k in np.argsort(order if first is None else np.where(first, -1, order), kind="stable"):
-        pair, window = tuple(seen.grains[k]), int(seen.window[k])
-        if chosen[k] and not any((pair, window + step) in taken for step in range(-_APART, _APART + 1)):
+    seen, kept = collisions.seen, np.zeros(len(chosen), bool)
+    contact = seen.window + fitted.unknowns[:, 2] / seen.duration
+    taken: dict[tuple, list] = {}
+    for k in np.lexsort((fitted.misfit / collisions.freedom, -collisions.freedom)):
+        others = taken.setdefault(tuple(seen.grains[k]), [])
+        if chosen[k] and all(abs(contact[k] - other) > _APART for other in others):
             kept[k] = True
-            taken.add((pair, window))
+            others.append(contact[k])
+    # A disc strikes one other at a time: where two pairs with a common disc fit one change, the better one is kept
+    of_disc: dict[int, list] = {}
+    for k in np.argsort((fitted.misfit + seen.drift) / (collisions.freedom + np.maximum(seen.drift_freedom, 0))):
+        others = [of_disc.setdefault(int(disc), []) for disc in seen.grains[k]]
+        if kept[k] and all(abs(contact[k] - other) > _AT_ONCE for times in others for other in times):
+            for times in others:
+                times.append(contact[k])
+        else:
+            kept[k] = False
     return kept
+
+
+def _struck(best: _Best, flights: Flights) -> np.ndarray:
+    """In which windows each disc collides, by the collisions that are found."""
+    struck = np.zeros((len(flights.time) - 1, len(flights.diameters)), bool)
+    seen = best.collisions.seen
+    contact = seen.window + best.fitted.unknowns[:, 2] / seen.duration
+    windows = np.clip(np.floor(contact), 0, len(struck) - 1).astype(int)
+    for disc in (0, 1):
+        struck[windows[best.used], seen.grains[best.used, disc]] = True
+    return struck
 
 
 def _interval(best: _Best) -> tuple[float, float]:
