@@ -57,7 +57,7 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     "fit": (
         fit_command,
         "Infer a restitution, or the law of a map.",
-        "Infer the restitution of a trajectory, or fit a closure to a map and infer a restitution from stresses.",
+        "Infer the restitution of tracked discs, or fit a closure to a map and infer a restitution from stresses.",
         FIT_EXAMPLES,
     ),
     "info": (

@@ -178,7 +178,8 @@ def _gsd_table(path: Path) -> Table:
                 **dict(zip("xyz", np.asarray(grains.position, float).T, strict=True)),
                 **dict(zip(("vx", "vy"), np.asarray(grains.velocity, float).T[:2], strict=True)),
                 **{name: np.asarray(getattr(grains, name), float) for name in ("diameter", "mass")},
-                **{"frame": np.full(grains.N, float(step)), "id": np.arange(grains.N, dtype=float)},
+                "frame": np.full(grains.N, float(step)),
+                "id": np.arange(grains.N, dtype=float),
             }
             if not file.file.chunk_exists(0, "particles/mass"):
                 del columns["mass"]  # the library then says one
