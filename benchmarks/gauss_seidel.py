@@ -12,8 +12,15 @@ from jaxgran.contact.solver import Solution
 from jaxgran.model.status import Status
 
 
-def gauss_seidel(contacts: Contacts, grains: int, tolerance: float, max_sweeps: int, shear_rate: float = 1) -> Solution:
-    """Impulses by projected Gauss–Seidel sweeps over the contacts in their order, from zero impulses.
+def gauss_seidel(
+    contacts: Contacts,
+    grains: int,
+    tolerance: float,
+    max_sweeps: int,
+    shear_rate: float = 1,
+    start: np.ndarray | None = None,
+) -> Solution:
+    """Impulses by projected Gauss–Seidel sweeps over the contacts in their order.
 
     The residual and the tolerance are those of ``jaxgran.contact.solver.solve``. The updates of a sweep estimate the
     residual for nothing; it is computed only when that estimate has met the tolerance, and then decides.
@@ -24,6 +31,7 @@ def gauss_seidel(contacts: Contacts, grains: int, tolerance: float, max_sweeps: 
       tolerance: relative residual to reach.
       max_sweeps: cap of the sweeps.
       shear_rate: γ̇; sets the absolute floor of the residual.
+      start: impulses to begin with, (contacts,); zero by default.
 
     Returns:
       The solution, of NumPy arrays; ``iterations`` counts the sweeps, each of the cost of one product with W.
@@ -34,6 +42,10 @@ def gauss_seidel(contacts: Contacts, grains: int, tolerance: float, max_sweeps: 
     target = kind(tolerance * scale + 10 * eps * shear_rate)
     count = int(np.sum(used))
     impulses, kicks = np.zeros_like(approach), np.zeros((grains, 2), normals.dtype)
+    if start is not None:
+        impulses[:] = start
+        np.add.at(kicks, i, (start * inverse_i)[:, None] * normals)
+        np.add.at(kicks, j, -(start * inverse_j)[:, None] * normals)
     sweeps, residual = _sweep(
         i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count, target**2, max_sweeps
     )

@@ -203,6 +203,17 @@ BENCHMARKS = (
         module="collection.make",
     ),
     Benchmark(
+        "solvers",
+        "Which contact solver is best where, this program's or one of another package?",
+        (10, 2),
+        (
+            *("solvers.json", "solvers.png", "solvers_iterations.png", "solvers_profiles.png"),
+            *("solvers_scaling.png", "solvers_warm.png"),
+        ),
+        one_core=True,
+        module="solvers.run",
+    ),
+    Benchmark(
         "engine_cost",
         "What does each engine cost, and the original design: JAX alone, in lockstep, by Jacobi iterations?",
         (4, 1),

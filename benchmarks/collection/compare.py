@@ -88,7 +88,7 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
 def projected(method: str, entry: Entry, tolerance: float) -> Solve:
     """A projected method of this program, compiled for one of few shapes."""
     network, count = padded(entry.problem), len(entry.problem.approach)
-    call = partial(_solved, network, method, jnp.asarray(tolerance))
+    call = partial(solved_network, network, method, jnp.asarray(tolerance))
 
     def solve() -> Answer | None:
         solution = jax.block_until_ready(call())
@@ -100,7 +100,7 @@ def projected(method: str, entry: Entry, tolerance: float) -> Solve:
 
 
 @partial(jax.jit, static_argnums=1)
-def _solved(network: jg.ContactNetwork, method: str, tolerance: jax.Array) -> jg.ContactSolution:
+def solved_network(network: jg.ContactNetwork, method: str, tolerance: jax.Array) -> jg.ContactSolution:
     return jg.solve_contacts(network, method=method, tolerance=tolerance, max_iterations=CAP)
 
 

@@ -1,0 +1,75 @@
+"""The contact solve of the engine ``machine_code``, called alone: isolated pairs, then cluster by cluster."""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from benchmarks.collection import Entry
+from benchmarks.collection.compare import CAP, Answer, Solve
+from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
+from jaxgran.dynamics.machine_code.layout import (
+    APPROACH,
+    EPSILON,
+    FIRST,
+    IMPULSE,
+    INFEASIBLE,
+    INVERSE_MASS,
+    NX,
+    NY,
+    OK,
+    SECOND,
+    WORDS,
+    WORDS_PER_GRAIN,
+)
+from jaxgran.dynamics.machine_code.loop import residual_target
+from jaxgran.dynamics.machine_code.memory import arrays_of
+from jaxgran.dynamics.machine_code.network import solve_isolated, sort_by_cluster
+
+
+def by_cluster(entry: Entry, tolerance: float) -> Solve:
+    """The impulses as a step of the engine computes them; counts the most iterations of a cluster."""
+    problem = entry.problem
+    ends, count = np.ascontiguousarray(problem.ends.T, np.uint32), len(problem.masses)
+    normals, inverse_masses = np.ascontiguousarray(problem.normals.T), 1 / problem.masses
+    block = np.empty(WORDS + WORDS_PER_GRAIN * count)
+
+    def solve() -> Answer | None:
+        impulses, memory = np.empty_like(problem.approach), np.array([block.ctypes.data])
+        iterations, outcome = _solve(
+            memory, ends, normals, inverse_masses, problem.approach, impulses, float(tolerance), CAP
+        )
+        return None if outcome == INFEASIBLE else Answer(impulses, iterations)
+
+    return solve
+
+
+@njit(error_model="numpy")
+def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance, most_iterations):
+    """As ``_collide`` of the engine, for a given network."""
+    count, contacts = inverse_masses.size, approach.size
+    arrays, _ = arrays_of(memory, count)
+    grains, network, clusters = arrays.grains, arrays.network, arrays.clusters
+    for g in range(count):
+        grains.constants[g, INVERSE_MASS] = inverse_masses[g]
+    scale = 0.0
+    for c in range(contacts):
+        for end in (FIRST, SECOND):
+            network.ends[end, c] = ends[end, c]
+            network.degree[ends[end, c]] += 1
+        network.rows[NX, c], network.rows[NY, c] = normals[0, c], normals[1, c]
+        network.rows[APPROACH, c], network.rows[IMPULSE, c] = approach[c], 0.0
+        scale += min(approach[c], 0.0) ** 2
+    target = residual_target(math.sqrt(scale), tolerance, 1.0, EPSILON)
+    coupled = solve_isolated(contacts, grains, network, clusters)
+    iterations, outcome = 1, OK
+    if coupled > 0:
+        found = sort_by_cluster(coupled, network, clusters)
+        starts = clusters.starts
+        for m in range(found):
+            share = target * target * (starts[m + 1] - starts[m]) / starts[found]
+            needed, _, missed = solve_cluster(m, share, most_iterations, grains, network, clusters)
+            iterations, outcome = max(iterations, needed), max(outcome, missed)
+    for c in range(contacts):
+        impulses[c] = network.rows[IMPULSE, c]
+    return iterations, outcome

@@ -1,0 +1,129 @@
+"""Contact solvers side by side: this program's and those of other packages, on the collection of contact problems.
+
+python -m benchmarks solvers          # solvers.json and its charts; about 10 minutes
+python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
+
+The other packages come with pip install "jaxgran[solver-peers]". One that is missing is named, and left out. All solve
+in this process, on one core, with one thread; times are those of the processor. A call from Python is part of them: about
+10 µs for the machine code, 100 µs for JAX.
+"""
+
+import itertools
+import os
+import time
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+
+from benchmarks.collection import Entry, load
+from benchmarks.networks import SLOTS
+from benchmarks.output import Output
+from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
+from benchmarks.solvers.groups import summary, table
+from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, Row, measured
+from benchmarks.solvers.roster import Solver, own, peers, versions
+from benchmarks.solvers.warm import WarmRow, compared
+
+_QUICK_STEP, _QUICK_CONTACTS = 10, 600
+_AGREED = 1e-8  # residual of solutions whose velocities are compared
+
+
+def run(output: Output) -> None:
+    """Measure, print the tables, and write ``solvers.json`` and its charts."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    solvers = roster()
+    entries = load(most_contacts=_QUICK_CONTACTS)[::_QUICK_STEP] if output.quick else load()
+    start, load_before = time.perf_counter(), os.getloadavg()
+    compile_for(entries, solvers)
+    finest: dict[str, dict[str, np.ndarray]] = {}
+
+    def note(name: str, entry: Entry, runs: list[Attempt]) -> None:
+        if entry.solution.feasible and runs[-1].residual <= _AGREED:
+            after = entry.matrix @ runs[-1].impulses + entry.problem.approach
+            finest.setdefault(entry.name, {})[name] = after / -np.min(entry.problem.approach)
+
+    rows = measured(solvers, entries, note)
+    warm = compared(entries, output.quick) if set(solvers) > set(own()) else []
+    agreed = agreement(finest)
+    print(table(rows), told(agreed, solvers), sep="\n\n")
+    head = {
+        "packages": versions(),
+        "settings": {name: solver.settings for name, solver in solvers.items()},
+        "counts": {name: solver.counts for name, solver in solvers.items()},
+        "targets": TARGETS,
+        "limit_seconds": LIMIT,
+        "problems": len(entries),
+        "load_averages": [load_before, os.getloadavg()],
+        "wall_seconds": round(time.perf_counter() - start),
+        "agreement": agreed,
+        "warm": warm_summary(warm),
+    }
+    output.write_rows("solvers", head, "summary", summary(rows))
+    output.write_picture(draw_work(rows, "seconds"), "solvers", dpi=110)
+    output.write_picture(draw_work(rows, "iterations"), "solvers", "_iterations.png", dpi=110)
+    output.write_picture(draw_profiles(rows), "solvers", "_profiles.png", dpi=110)
+    output.write_picture(draw_scaling(rows), "solvers", "_scaling.png", dpi=110)
+    if warm:
+        output.write_picture(draw_warm(warm), "solvers", "_warm.png", dpi=110)
+
+
+def roster() -> dict[str, Solver]:
+    """Our solvers, and those of the packages that are installed."""
+    try:
+        return {**own(), **peers()}
+    except ModuleNotFoundError as error:
+        print(f"{error}; only this program's solvers are compared.", flush=True)
+        return own()
+
+
+def compile_for(entries: Sequence[Entry], solvers: Mapping[str, Solver]) -> None:
+    """Compile ours for each of the shapes that problems are filled up to."""
+    shapes = {}
+    for entry in entries:
+        shapes.setdefault(min(slots for slots in SLOTS if slots >= len(entry.problem.approach)), entry)
+    for entry, solver in itertools.product(shapes.values(), solvers.values()):
+        if solver.ours:
+            solver.prepare(entry, 0.1)()
+
+
+def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
+    """Of each pair of solvers: problems that both solve to 1e-8, and the largest difference of velocities.
+
+    Velocities are in units of the fastest approach of the problem.
+    """
+    names = sorted({name for found in finest.values() for name in found})
+    pairs = []
+    for one, other in itertools.combinations(names, 2):
+        both = [found for found in finest.values() if one in found and other in found]
+        if both:
+            largest = max(float(np.max(np.abs(found[one] - found[other]))) for found in both)
+            pairs.append({"solvers": [one, other], "problems": len(both), "largest_difference": float(f"{largest:.2g}")})
+    return pairs
+
+
+def told(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
+    """The agreement as text: the pairs of ours with others, and the worst of all."""
+    lines = ["largest difference of velocities between solutions to 1e-8, over the fastest approach"]
+    for pair in pairs:
+        if sum(solvers[name].ours for name in pair["solvers"]) == 1:
+            lines.append(f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})")
+    return "\n".join(lines)
+
+
+def warm_summary(rows: Sequence[WarmRow]) -> list[dict]:
+    """Of each solver and start: the medians of time and iterations over those of a cold start."""
+    cold = {(row.solver, row.problem): row for row in rows if row.start == "cold"}
+    members: dict[tuple[str, str], list[WarmRow]] = {}
+    for row in rows:
+        members.setdefault((row.solver, row.start), []).append(row)
+    lines = []
+    for (solver, start), held in members.items():
+        line = {"solver": solver, "start": start, "problems": len(held)}
+        line["distance"] = float(f"{np.median([row.distance for row in held]):.3g}")
+        for of in ("seconds", "iterations"):
+            shares = [getattr(row, of) / getattr(cold[solver, row.problem], of) for row in held]
+            line[f"{of}_over_cold"] = float(f"{np.nanmedian(shares):.3g}")
+        lines.append(line)
+    return lines

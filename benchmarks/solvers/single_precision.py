@@ -1,0 +1,24 @@
+"""The projected methods in single precision."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.collection import Entry
+from benchmarks.collection.compare import Answer, Solve, solved_network
+from benchmarks.collection.make import padded
+from jaxgran.model.status import Status
+
+
+def projected_in_float32(method: str, entry: Entry, tolerance: float) -> Solve:
+    """As ``benchmarks.collection.compare.projected``, with all numbers of the problem in single precision."""
+    network = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, padded(entry.problem))
+    count = len(entry.problem.approach)
+
+    def solve() -> Answer | None:
+        solution = jax.block_until_ready(solved_network(network, method, jnp.float32(tolerance)))
+        if solution.status == Status.infeasible:
+            return None
+        return Answer(np.asarray(solution.impulses, float)[:count], int(solution.iterations))
+
+    return solve
