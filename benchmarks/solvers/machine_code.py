@@ -24,7 +24,7 @@ from jaxgran.dynamics.machine_code.layout import (
 )
 from jaxgran.dynamics.machine_code.loop import residual_target
 from jaxgran.dynamics.machine_code.memory import arrays_of
-from jaxgran.dynamics.machine_code.network import solve_isolated, sort_by_cluster
+from jaxgran.dynamics.machine_code.network import find_clusters, solve_isolated
 
 
 def by_cluster(entry: Entry, tolerance: float) -> Solve:
@@ -52,24 +52,27 @@ def _solve(memory, ends, normals, inverse_masses, approach, impulses, tolerance,
     grains, network, clusters = arrays.grains, arrays.network, arrays.clusters
     for g in range(count):
         grains.constants[g, INVERSE_MASS] = inverse_masses[g]
-    scale = 0.0
+    scale, hits = 0.0, 0
     for c in range(contacts):
         for end in (FIRST, SECOND):
-            network.ends[end, c] = ends[end, c]
-            network.degree[ends[end, c]] += 1
+            g = network.ends[end, c] = ends[end, c]
+            if network.degree[g] == 0:
+                network.touched[hits] = g
+                hits += 1
+            network.degree[g] += 1
         network.rows[NX, c], network.rows[NY, c] = normals[0, c], normals[1, c]
         network.rows[APPROACH, c], network.rows[IMPULSE, c] = approach[c], 0.0
         scale += min(approach[c], 0.0) ** 2
     target = residual_target(math.sqrt(scale), tolerance, 1.0, EPSILON)
-    coupled = solve_isolated(contacts, grains, network, clusters)
-    iterations, outcome = 1, OK
-    if coupled > 0:
-        found = sort_by_cluster(coupled, network, clusters)
+    iterations, spare, outcome = 1, target * target, OK
+    if solve_isolated(contacts, grains, network) > 0:
+        found = find_clusters(contacts, hits, network, clusters)
         starts = clusters.starts
         for m in range(found):
-            share = target * target * (starts[m + 1] - starts[m]) / starts[found]
-            needed, _, missed = solve_cluster(m, share, most_iterations, grains, network, clusters)
+            share = spare * (starts[m + 1] - starts[m]) / (starts[found] - starts[m])
+            needed, left, missed = solve_cluster(m, share, most_iterations, grains, network, clusters)
             iterations, outcome = max(iterations, needed), max(outcome, missed)
+            spare -= left if left < share else share
     for c in range(contacts):
         impulses[c] = network.rows[IMPULSE, c]
     return iterations, outcome

@@ -90,6 +90,7 @@ def ladder(solver: Solver, entry: Entry, matrix) -> list[Attempt]:
             power = 6
         seconds, answer = timed(solver.prepare(entry, 10.0**-power))
         impulses, iterations = answer if isinstance(answer, Answer) else (answer, np.nan)
+        iterations = max(iterations, 1)  # some count from zero
         residual = np.nan if impulses is None else natural_residual(entry, matrix, impulses)
         runs.append(Attempt(10.0**-power, seconds, iterations, residual, impulses))
         if seconds > LIMIT or residual <= TARGETS[-1] or not entry.solution.feasible:
