@@ -155,11 +155,7 @@ def draw_warm(rows: Sequence[WarmRow]) -> Figure:
         cold = {(row.solver, row.problem): getattr(row, of) for row in rows if row.start == "cold"}
         for place, name in enumerate(names):
             shares = [
-                [
-                    getattr(row, of) / cold[name, row.problem]
-                    for row in rows
-                    if (row.solver, row.start) == (name, start)
-                ]
+                [getattr(row, of) / cold[name, row.problem] for row in rows if (row.solver, row.start) == (name, start)]
                 for start in starts
             ]
             low, middle, high = np.array([np.nanquantile(one, (0.25, 0.5, 0.75)) for one in shares]).T

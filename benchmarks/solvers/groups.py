@@ -80,5 +80,3 @@ def words(name: str, members: Sequence[Row]) -> str:
     time, solved = median([cost(row) for row in members]), sum(row.outcome == "ok" for row in members)
     share = "" if solved == len(members) else f", {solved} of {len(members)}"
     return f"{name}: {1e6 * time:.3g} µs{share}" if np.isfinite(time) else f"{name}: –{share}"
-
-

@@ -1,8 +1,8 @@
 """What a residual costs: each solver from a loose tolerance to a tight one, judged by the residual of this program.
 
 Tolerances of packages mean different things. So each solver is run with tolerances of its own, a power of ten after the
-other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. What a target costs is the cheapest
-run that meets it. A solve of more than ``LIMIT`` seconds is a failure; after it, no tighter tolerance is tried, and no
+other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. A target costs what the cheapest
+run does that meets it. A solve of more than ``LIMIT`` seconds is a failure; after it, no tighter tolerance is tried, and no
 problem of that family whose time, growing as the square of the contacts, would be beyond the limit as well.
 
 Times are those of the processor, of this process on one core, so that other work on the machine counts little.
@@ -39,7 +39,7 @@ class Row(NamedTuple):
 
     ``outcome`` is ok, missed (the residual is not reached), slow (beyond the limit), or skipped (see the module). Costs
     and errors of a failure are not a number, and so are iterations that a solver does not count. ``velocity_error`` is
-    max |w − w_exact| / max |min(u⁻, 0)|, and ``stress_error`` that of Σ p n⊗n. A problem without a solution has one row,
+    max |w − w_exact| / max |min(u⁻, 0)|, and ``stress_error`` that of Σ p n⊗n. One without a solution has one row,
     with the target 0: ok if the solver says so.
     """
 

@@ -34,7 +34,9 @@ ADMM = {"admm_update_rule": "OSQP", "anderson_capacity": 5, "lanczos_size": 10}
 def _widen_stack() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_STACK)
     if soft != resource.RLIM_INFINITY and soft < _STACK:
-        resource.setrlimit(resource.RLIMIT_STACK, (_STACK if hard == resource.RLIM_INFINITY else min(_STACK, hard), hard))
+        resource.setrlimit(
+            resource.RLIMIT_STACK, (_STACK if hard == resource.RLIM_INFINITY else min(_STACK, hard), hard)
+        )
 
 
 _widen_stack()

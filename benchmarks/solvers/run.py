@@ -4,7 +4,7 @@ python -m benchmarks solvers          # solvers.json and its charts; about 10 mi
 python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
 
 The other packages come with pip install "jaxgran[solver-peers]". One that is missing is named, and left out. All solve
-in this process, on one core, with one thread; times are those of the processor. A call from Python is part of them: about
+in this process, on one core, with one thread; times are those of the processor. A call from Python counts: about
 10 µs for the machine code, 100 µs for JAX.
 """
 
@@ -13,7 +13,6 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 
-import jax
 import numpy as np
 
 from benchmarks.collection import Entry, load
@@ -21,7 +20,7 @@ from benchmarks.networks import SLOTS
 from benchmarks.output import Output
 from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
 from benchmarks.solvers.groups import summary, table
-from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, Row, measured
+from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, measured
 from benchmarks.solvers.roster import Solver, own, peers, versions
 from benchmarks.solvers.warm import WarmRow, compared
 
@@ -99,7 +98,9 @@ def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
         both = [found for found in finest.values() if one in found and other in found]
         if both:
             largest = max(float(np.max(np.abs(found[one] - found[other]))) for found in both)
-            pairs.append({"solvers": [one, other], "problems": len(both), "largest_difference": float(f"{largest:.2g}")})
+            pairs.append(
+                {"solvers": [one, other], "problems": len(both), "largest_difference": float(f"{largest:.2g}")}
+            )
     return pairs
 
 
@@ -108,7 +109,7 @@ def told(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
     lines = ["largest difference of velocities between solutions to 1e-8, over the fastest approach"]
     for pair in pairs:
         if sum(solvers[name].ours for name in pair["solvers"]) == 1:
-            lines.append(f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})")
+            lines.append(f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})")  # noqa: PERF401
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
 """Cold against warm: what a solver gains when it starts near the solution.
 
-It starts from zero, from the exact impulses with relative errors of 10 %, 1 % and 0.1 % of each, or from the impulses of
-the step before, contact by contact. The last is what a flow could give. The first three are the best that any guess could
+Starts are zero, the exact impulses with relative errors of 10 %, 1 % and 0.1 % of each, or the impulses of
+the step before, contact by contact. The last is what a flow could give. The others are the best that any guess could
 do, on networks of flows.
 """
 
