@@ -2,7 +2,7 @@
 
 Tolerances of packages mean different things. So each solver is run with tolerances of its own, a power of ten after the
 other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. A target costs what the cheapest
-run does that meets it. A solve of more than ``LIMIT`` seconds is a failure; after it, no tighter tolerance is tried, and no
+run does that meets it. A solve of more than ``LIMIT`` seconds is a failure; after it, none tighter is tried, and no
 problem of that family whose time, growing as the square of the contacts, would be beyond the limit as well.
 
 Times are those of the processor, of this process on one core, so that other work on the machine counts little.
