@@ -10,6 +10,25 @@ from matplotlib.axes import Axes
 
 LARGEST_FACTOR = 1e3
 Style = tuple  # colour, marker, line style
+STYLES: dict[str, Style] = {  # of the solvers that are known; full lines are those of this program
+    "machine code": ("black", "o", "-"),
+    "barzilai-borwein": ("tab:red", "s", "-"),
+    "nesterov": ("tab:orange", "^", "-"),
+    "jacobi": ("tab:brown", "v", "-"),
+    "jacobi-count": ("rosybrown", "<", "-"),
+    "jacobi-diagonal": ("tab:gray", "X", "-"),
+    "barzilai-borwein, float32": ("tab:pink", "s", (0, (1, 1))),
+    "Gauss–Seidel": ("gold", "D", "-"),
+    "Pinocchio PGS": ("yellowgreen", "D", "--"),
+    "Pinocchio ADMM": ("tab:green", "P", "--"),
+    "Pinocchio ADMM, dense": ("darkgreen", "P", ":"),
+    "ProxQP": ("tab:blue", "h", "--"),
+    "ProxQP, dense": ("navy", "h", ":"),
+    "OSQP": ("tab:cyan", "p", "--"),
+    "Clarabel": ("tab:purple", "*", "--"),
+    "PIQP": ("magenta", ">", "--"),
+    "SciPy NNLS": ("teal", "d", "-."),
+}
 _EXTRA_COLOURS = ("tab:purple", "tab:green", "tab:brown", "tab:pink", "tab:olive", "navy")
 _EXTRA_MARKERS = ("P", "*", "<", ">", "p", "h")
 

@@ -87,14 +87,16 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
 
 def test_stress_of_a_solve_in_the_committed_chart_is_within_half_the_target() -> None:
     """Of flows: static packings and chains of hundreds of discs, which no flow forms, need a tighter tolerance."""
-    chart = json.loads((RESULTS / "methods.json").read_text())
-    rows = [r for r in chart["summary"] if r["group"].startswith("flow") and r["method"] == "barzilai-borwein"]
-    found = [(r["tolerance"], r["stress_error"]["worst"]) for r in rows if r["precision"] == "float64"]
-    assert found
+    chart = json.loads((RESULTS / "solvers.json").read_text())
+    found = [
+        row["worst_stress_error_over_tolerance"]
+        for row in chart["summary"]
+        if row["group"].startswith("flows") and row["solver"] in ("barzilai-borwein", "machine code")
+        if row["target"] >= 1e-6  # tighter ones are chosen for errors below these
+    ]
+    assert len(found) == 2 * 3 * 3
     for target_error in (0.1, 0.02, 1e-3, 1e-4):
-        tolerance = automatic_tolerance(target_error)
-        worst = max(error / near for near, error in found if 1e-8 <= near <= 1e-2)
-        assert worst * tolerance <= target_error / 2
+        assert max(found) * automatic_tolerance(target_error) <= target_error / 2
 
 
 def test_nothing_cheaper_than_the_default_has_a_better_pressure_in_the_committed_chart() -> None:

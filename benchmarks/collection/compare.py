@@ -20,8 +20,8 @@ import jaxgran as jg
 from benchmarks.collection.files import Entry
 from benchmarks.collection.make import padded
 from benchmarks.gauss_seidel import gauss_seidel
-from benchmarks.method_chart import METHODS, timed
-from benchmarks.profiles import draw_shares, with_styles
+from benchmarks.profiles import STYLES, draw_shares, with_styles
+from benchmarks.timing import timed
 from jaxgran.contact.problem import as_contacts
 from jaxgran.model.status import Status
 
@@ -69,7 +69,8 @@ def compare(
 
 def _row(name: str, prepare: Prepare, entry: Entry, tolerance: float, timings: int) -> Row:
     solve = prepare(entry, tolerance)
-    seconds, answer = timed(lambda times: [solve() for _ in range(max(1, times))][-1], timings)
+    solve()  # compiles
+    seconds, answer = timed(solve, timings)
     impulses, products = answer if isinstance(answer, Answer) else (answer, np.nan)
     residual = np.nan if impulses is None else residual_of(entry, impulses)
     right = residual <= tolerance * _JUDGED if entry.solution.feasible else impulses is None
@@ -85,10 +86,10 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
     return float(jg.contact_residuals(network, jnp.asarray(filled)).natural_map)
 
 
-def projected(method: str, entry: Entry, tolerance: float) -> Solve:
-    """A projected method of this program, compiled for one of few shapes."""
+def projected(method: str, entry: Entry, tolerance: float, relaxation: float = 1.8) -> Solve:
+    """A projected method of this program, compiled for one of few shapes; ω is that of the Jacobi methods."""
     network, count = padded(entry.problem), len(entry.problem.approach)
-    call = partial(solved_network, network, method, jnp.asarray(tolerance))
+    call = partial(solved_network, network, method, jnp.asarray(tolerance), jnp.asarray(relaxation))
 
     def solve() -> Answer | None:
         solution = jax.block_until_ready(call())
@@ -100,8 +101,11 @@ def projected(method: str, entry: Entry, tolerance: float) -> Solve:
 
 
 @partial(jax.jit, static_argnums=1)
-def solved_network(network: jg.ContactNetwork, method: str, tolerance: jax.Array) -> jg.ContactSolution:
-    return jg.solve_contacts(network, method=method, tolerance=tolerance, max_iterations=CAP)
+def solved_network(
+    network: jg.ContactNetwork, method: str, tolerance: jax.Array, relaxation: jax.Array
+) -> jg.ContactSolution:
+    """The solution of a network, with the cap of these methods."""
+    return jg.solve_contacts(network, method=method, tolerance=tolerance, max_iterations=CAP, relaxation=relaxation)
 
 
 def swept(entry: Entry, tolerance: float) -> Solve:
@@ -128,7 +132,7 @@ def draw_profile(rows: Sequence[Row]) -> Figure:
     rows = [row for row in rows if row.feasible]
     names = list(dict.fromkeys(row.solver for row in rows))
     counting = [name for name in names if all(row.products == row.products for row in rows if row.solver == name)]
-    styles = with_styles(names, METHODS)
+    styles = with_styles(names, STYLES)
     shown = [("seconds", names, "time over that of the best")]
     shown += [("products", counting, "products with W over those of the best")] if counting else []
     figure = Figure(figsize=(5 * len(shown) + 0.5, 4.6), layout="constrained")

@@ -6,32 +6,18 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.profiles import draw_shares
+from benchmarks.profiles import STYLES, draw_shares
 from benchmarks.solvers.groups import CONSTRUCTED, FLOW_GROUPS, cost, grouped, median
 from benchmarks.solvers.measure import LIMIT, TARGETS, Row
 from benchmarks.solvers.warm import WarmRow
 
-STYLES = {  # colour, marker, line; ours have full lines
-    "machine code": ("black", "o", "-"),
-    "barzilai-borwein": ("tab:red", "s", "-"),
-    "nesterov": ("tab:orange", "^", "-"),
-    "jacobi": ("tab:brown", "v", "-"),
-    "jacobi-count": ("rosybrown", "<", "-"),
-    "jacobi-diagonal": ("tab:gray", "X", "-"),
-    "barzilai-borwein, float32": ("tab:pink", "s", (0, (1, 1))),
-    "Gauss–Seidel, numba": ("gold", "D", "-"),
-    "Pinocchio PGS": ("yellowgreen", "D", "--"),
-    "Pinocchio ADMM": ("tab:green", "P", "--"),
-    "Pinocchio ADMM, dense": ("darkgreen", "P", ":"),
-    "ProxQP": ("tab:blue", "h", "--"),
-    "ProxQP, dense": ("navy", "h", ":"),
-    "OSQP": ("tab:cyan", "p", "--"),
-    "Clarabel": ("tab:purple", "*", "--"),
-    "PIQP": ("magenta", ">", "--"),
-    "SciPy NNLS": ("teal", "d", "-."),
-}
 _PANELS = (*FLOW_GROUPS, *CONSTRUCTED)
-_UNIT = {"seconds": (1e3, "time (ms)"), "iterations": (1, "products, sweeps or iterations")}
+_UNIT = {"seconds": (1e3, "time (ms)"), "iterations": (1, "products with W, or sweeps")}
+# Where an iteration is a product or a sweep. Those of the others solve linear systems, and are not compared by number.
+FIRST_ORDER = frozenset(name for name in STYLES if STYLES[name][2] == "-") | {
+    "barzilai-borwein, float32",
+    "Pinocchio PGS",
+}
 
 
 def draw_work(rows: Sequence[Row], of: str) -> Figure:
@@ -47,9 +33,12 @@ def draw_work(rows: Sequence[Row], of: str) -> Figure:
             for name in names
             if (group, name, TARGETS[0]) in members
         }
+        axes.set_visible(bool(curves))  # a quick run has not all groups
+        if not curves:
+            continue
         _draw_curves(axes, curves)
-        number = len(members.get((group, names[0], TARGETS[0]), []))
-        axes.set_title(f"{group} ({number} problems)", fontsize="medium")
+        number = len(members[group, next(iter(curves)), TARGETS[0]])
+        axes.set_title(f"{group} ({number} of them)", fontsize="medium")
         axes.set_ylabel(label if axes in panels[::4] else "")
         axes.set_xlabel("residual" if axes in panels[4:] else "")
     handles = [panels[0].plot([], [], **_line(name), label=name)[0] for name in names]
@@ -59,7 +48,8 @@ def draw_work(rows: Sequence[Row], of: str) -> Figure:
 
 
 def _counts(rows: Sequence[Row], name: str, of: str) -> bool:
-    return any(np.isfinite(getattr(row, of)) for row in rows if row.solver == name)
+    comparable = of == "seconds" or name in FIRST_ORDER
+    return comparable and any(np.isfinite(getattr(row, of)) for row in rows if row.solver == name)
 
 
 def _line(name: str) -> dict:
@@ -69,7 +59,7 @@ def _line(name: str) -> dict:
 
 def _draw_curves(axes: Axes, curves: Mapping[str, Sequence[float]]) -> None:
     values = np.array([value for curve in curves.values() for value in curve])
-    most = np.max(values[np.isfinite(values)], initial=1.0)
+    most = np.max(values[np.isfinite(values)], initial=0.0)
     axes.set(xscale="log", yscale="log")
     axes.axhline(2 * most, color="0.6", lw=0.8)
     for place, (name, curve) in enumerate(curves.items()):
@@ -78,7 +68,7 @@ def _draw_curves(axes: Axes, curves: Mapping[str, Sequence[float]]) -> None:
         axes.plot(TARGETS, np.where(np.isfinite(curve), curve, np.nan), **line)
         missed = [target for target, value in zip(TARGETS, curve, strict=True) if not np.isfinite(value)]
         axes.plot(missed, [failed] * len(missed), **(line | {"linestyle": "none"}))
-    axes.invert_xaxis()
+    axes.set_xlim(2 * TARGETS[0], TARGETS[-1] / 2)
     axes.grid(alpha=0.3)
 
 
@@ -87,7 +77,7 @@ def draw_profiles(rows: Sequence[Row], targets: Sequence[float] = (1e-4, 1e-8)) 
     figure = Figure(figsize=(12.5, 9.4), layout="constrained")
     panels = figure.subplots(2, len(targets), sharey=True)
     for line, (of, label) in zip(
-        panels, (("seconds", "time"), ("iterations", "products, sweeps or iterations")), strict=True
+        panels, (("seconds", "time"), ("iterations", "products with W or sweeps")), strict=True
     ):
         for axes, target in zip(line, targets, strict=True):
             held = [row for row in rows if row.target == target]

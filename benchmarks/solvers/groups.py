@@ -42,18 +42,34 @@ def median(costs: Sequence[float]) -> float:
 
 
 def summary(rows: Sequence[Row]) -> list[dict]:
-    """Of each group, solver and target: how many are solved, and medians; null where the median solve fails."""
-    lines = []
+    """Of each group, solver and target: how many are solved, on how many none is faster, and medians of the costs.
+
+    A median is null where the median solve fails. Errors are the worst of those that are solved.
+    """
+    lines, best = [], fastest(rows)
     for (group, solver, target), members in grouped(rows).items():
         line = {"group": group, "solver": solver, "target": target, "problems": len(members)}
         line |= {word: sum(row.outcome == word for row in members) for word in ("ok", "missed", "slow", "skipped")}
+        line["fastest"] = sum(best[row.problem, target] == solver for row in members)
         for key in ("seconds", "iterations"):
             line[key] = _rounded(median([cost(row, key) for row in members]))
         for key in ("residual", "velocity_error", "stress_error"):
             values = [getattr(row, key) for row in members if row.outcome == "ok"]
             line[f"worst_{key}"] = _rounded(max(values)) if values else None
+        ratios = [row.stress_error / row.tolerance for row in members if row.outcome == "ok"]
+        line["worst_stress_error_over_tolerance"] = _rounded(max(ratios)) if ratios else None
         lines.append(line)
     return lines
+
+
+def fastest(rows: Sequence[Row]) -> dict[tuple[str, float], str | None]:
+    """The solver that is fastest on each problem, to each target; None where all fail."""
+    best: dict[tuple[str, float], Row] = {}
+    for row in rows:
+        key = row.problem, row.target
+        if key not in best or cost(row) < cost(best[key]):
+            best[key] = row
+    return {key: row.solver if row.outcome == "ok" else None for key, row in best.items()}
 
 
 def _rounded(value: float) -> float | None:

@@ -1,14 +1,13 @@
 """What a residual costs: each solver from a loose tolerance to a tight one, judged by the residual of this program.
 
-Tolerances of packages mean different things. So each solver is run with tolerances of its own, a power of ten after the
-other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. A target costs what the cheapest
-run does that meets it. A solve of more than ``LIMIT`` seconds is a failure; after it, none tighter is tried, and no
-problem of that family whose time, growing as the square of the contacts, would be beyond the limit as well.
+Tolerances of packages mean different things. So each solver is run with tolerances of its own, a power of ten after
+the other, until its residual ‖min(W_cc p, w)‖ / ‖min(u⁻, 0)‖ is below the smallest target. A target costs what the
+cheapest run does that meets it. A solve of more than ``LIMIT`` seconds is a failure. After it no tighter tolerance is
+tried, and no problem of that family whose time, growing as the square of the contacts, would be beyond the limit too.
 
 Times are those of the processor, of this process on one core, so that other work on the machine counts little.
 """
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -17,11 +16,12 @@ import numpy as np
 from benchmarks.collection import Entry
 from benchmarks.collection.compare import Answer
 from benchmarks.solvers.roster import Solver
+from benchmarks.timing import timed
 
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8)
 LIMIT = 1.0  # seconds
-_TIGHTEST, _LARGE = 12, 300  # power of the last tolerance; contacts from which only every second one is tried
-_SHORTEST, _MOST_SOLVES, _LONG = 2e-3, 200, 0.02  # seconds of a timing, solves in it, seconds of a solve timed once
+_TIGHTEST, _LARGE = 14, 300  # power of the last tolerance; contacts from which only every second one is tried
+_MANY = 1000  # iterations, from which a run that repeats the one before has come to its limit
 
 
 class Attempt(NamedTuple):
@@ -39,8 +39,8 @@ class Row(NamedTuple):
 
     ``outcome`` is ok, missed (the residual is not reached), slow (beyond the limit), or skipped (see the module). Costs
     and errors of a failure are not a number, and so are iterations that a solver does not count. ``velocity_error`` is
-    max |w − w_exact| / max |min(u⁻, 0)|, and ``stress_error`` that of Σ p n⊗n. One without a solution has one row,
-    with the target 0: ok if the solver says so.
+    max |w − w_exact| / max |min(u⁻, 0)|, and ``stress_error`` that of Σ p n⊗n. A problem without a solution has one
+    row, with the target 0: ok if the solver says so.
     """
 
     solver: str
@@ -93,25 +93,10 @@ def ladder(solver: Solver, entry: Entry, matrix) -> list[Attempt]:
         iterations = max(iterations, 1)  # some count from zero
         residual = np.nan if impulses is None else natural_residual(entry, matrix, impulses)
         runs.append(Attempt(10.0**-power, seconds, iterations, residual, impulses))
-        if seconds > LIMIT or residual <= TARGETS[-1] or not entry.solution.feasible:
+        stuck = iterations > _MANY and len(runs) > 1 and runs[-2].residual == residual
+        if seconds > LIMIT or residual <= TARGETS[-1] or stuck or not entry.solution.feasible:
             break
     return runs
-
-
-def timed(solve: Callable[[], object]) -> tuple[float, object]:
-    """Seconds of the processor for a solve: of one if it is long, else the median of three timings of many."""
-    start = time.process_time()
-    answer = solve()
-    once = time.process_time() - start
-    if once > _LONG:
-        return once, answer
-    repeats, seconds = int(np.clip(_SHORTEST / max(once, 1e-6), 1, _MOST_SOLVES)), []
-    for _ in range(3):
-        start = time.process_time()
-        for _ in range(repeats):
-            solve()
-        seconds.append((time.process_time() - start) / repeats)
-    return float(np.median(seconds)), answer
 
 
 def natural_residual(entry: Entry, matrix, impulses: np.ndarray) -> float:

@@ -24,7 +24,7 @@ LIMIT = 1.0  # seconds of a solve, where a package has a limit of time
 OSQP = {"form": "impulses", "check_termination": 25, "adaptive_rho_interval": 25}
 PROXQP_DENSE = {"form": "impulses", "max_iter": 100, "max_iter_in": 100}
 PROXQP = {"sparse_backend": "SparseCholesky"} | PROXQP_DENSE  # its own choice for large problems has no factors
-CLARABEL = {"form": "velocities"}
+CLARABEL = {"form": "impulses", "static_regularization_constant": 1e-12}
 PIQP = {"form": "impulses"}
 _FREE = 1e20  # an upper bound that does not bind
 _LEAST_REST = 1e-12  # of the least-distance problem: less is none
@@ -43,7 +43,7 @@ def osqp(entry: Entry, tolerance: float, start: np.ndarray | None = None, settin
         solver.setup(P=p, q=program.q, A=program.g, l=program.h, u=above, **given)
         if start is not None:
             solver.warm_start(x=start / program.scale)
-        result = solver.solve()
+        result = solver.solve(raise_error=False)
         if "infeasible" in result.info.status:
             return None
         impulses = result.x if form == "impulses" else -result.y

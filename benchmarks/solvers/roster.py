@@ -25,12 +25,19 @@ class Solver(NamedTuple):
 
 def own() -> dict[str, Solver]:
     """The solvers of this program, and plain Gauss–Seidel sweeps."""
-    methods = {name: Solver(partial(projected, name), "products with W", {}, True) for name in get_args(Method)}
+    settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
+    settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
+    methods = {
+        name: Solver(
+            partial(projected, name, **settings.get(name, {})), "products with W", settings.get(name, {}), True
+        )
+        for name in get_args(Method)
+    }
     return {
         MACHINE_CODE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
         **methods,
         f"{DEFAULT}, float32": Solver(partial(projected_in_float32, DEFAULT), "products with W", {}, True),
-        "Gauss–Seidel, numba": Solver(swept, "sweeps", {}, True),
+        "Gauss–Seidel": Solver(swept, "sweeps", {}, True),
     }
 
 

@@ -1,5 +1,7 @@
 """The projected methods in single precision."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,10 @@ def projected_in_float32(method: str, entry: Entry, tolerance: float) -> Solve:
     """As ``benchmarks.collection.compare.projected``, with all numbers of the problem in single precision."""
     network = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, padded(entry.problem))
     count = len(entry.problem.approach)
+    call = partial(solved_network, network, method, jnp.float32(tolerance), jnp.float32(1.8))
 
     def solve() -> Answer | None:
-        solution = jax.block_until_ready(solved_network(network, method, jnp.float32(tolerance)))
+        solution = jax.block_until_ready(call())
         if solution.status == Status.infeasible:
             return None
         return Answer(np.asarray(solution.impulses, float)[:count], int(solution.iterations))

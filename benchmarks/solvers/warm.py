@@ -1,8 +1,8 @@
 """Cold against warm: what a solver gains when it starts near the solution.
 
-Starts are zero, the exact impulses with relative errors of 10 %, 1 % and 0.1 % of each, or the impulses of
-the step before, contact by contact. The last is what a flow could give. The others are the best that any guess could
-do, on networks of flows.
+It starts from zero, from the exact impulses with relative errors of 10 %, 1 % and 0.1 % of each, or from the impulses
+of the step before, contact by contact. The last is what a flow could give; the others show what a good guess would do.
+The problems are networks of flows.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,8 @@ from benchmarks.collection.compare import Answer, Solve
 from benchmarks.collection.make import padded
 from benchmarks.collection.problems import compact
 from benchmarks.gauss_seidel import gauss_seidel
-from benchmarks.solvers.measure import natural_residual, timed
+from benchmarks.solvers.measure import natural_residual
+from benchmarks.timing import timed
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.problem import as_contacts
 from jaxgran.dynamics.collision import contacts_now
@@ -44,12 +45,12 @@ class WarmRow(NamedTuple):
     iterations: float
 
 
-def startable(quick: bool) -> dict[str, Startable]:
+def startable() -> dict[str, Startable]:
     """Solvers that take a start; ours and the interior-point methods take none."""
     from benchmarks.solvers import pinocchio, quadratic
 
     return {
-        "Gauss–Seidel, numba": swept_from,
+        "Gauss–Seidel": swept_from,
         "Pinocchio PGS": pinocchio.gauss_seidel,
         "Pinocchio ADMM": pinocchio.multipliers,
         "OSQP": quadratic.osqp,
@@ -69,7 +70,7 @@ def swept_from(entry: Entry, tolerance: float, start: np.ndarray | None = None) 
 
 def compared(entries: Sequence[Entry], quick: bool) -> list[WarmRow]:
     """All starts of all solvers that take one."""
-    rows, solvers = [], startable(quick)
+    rows, solvers = [], startable()
     flows = [one for one in entries if one.family == "flow" and len(one.problem.approach) >= _FEWEST]
     noise = np.random.default_rng(0)
     cases = []

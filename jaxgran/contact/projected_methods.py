@@ -20,7 +20,7 @@ Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)
 The objective does not fall in every step, and with a projection the iterates can cycle. The safeguard needs no values
 of the objective: where the best residual has not halved over 100 steps, the method goes on as Nesterov's. So either the
 residual falls at that rate, or the iteration is one that converges. This is the default: in flows it needs a fifth to a
-third fewer products than Nesterov's method alone (``benchmarks/method_chart.py``).
+third fewer products than Nesterov's method alone (``benchmarks solvers``).
 
 Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988); Birgin, Martínez
 and Raydan (2000) for projected spectral gradients; Tonge, Benevolenski and Voroshilov (2012) for mass splitting.

@@ -1,0 +1,226 @@
+"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the charts."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from benchmarks import networks
+from benchmarks.collection import Entry
+from benchmarks.collection.certificates import delassus, obstructed, solved
+from benchmarks.collection.compare import Answer
+from benchmarks.collection.problems import compact
+from benchmarks.exact_contacts import certified_impulses
+from benchmarks.exact_contacts import incidence as dense_incidence
+from benchmarks.networks import Network
+from benchmarks.profiles import STYLES
+from benchmarks.solvers import groups, measure
+from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
+from benchmarks.solvers.forms import in_impulses, in_velocities, weighted
+from benchmarks.solvers.machine_code import by_cluster
+from benchmarks.solvers.measure import TARGETS, Row, measured
+from benchmarks.solvers.roster import Solver, own, peers
+from benchmarks.solvers.run import agreement, compile_for, warm_summary
+from benchmarks.solvers.warm import WarmRow, swept_from
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+
+
+def entry_of(name: str, network: Network) -> Entry:
+    problem, used = compact(network.contacts, network.masses), np.asarray(network.contacts.used)
+    g = dense_incidence(network.contacts, network.grains)[used] / np.repeat(np.sqrt(network.masses), 2)
+    guess = certified_impulses(g, np.asarray(network.contacts.approach)[used])
+    solution = obstructed(problem) if guess is None else solved(problem, guess)
+    assert solution is not None and solution.feasible == network.feasible
+    return Entry(name, name, name, problem, solution)
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[Entry]:
+    return [
+        entry_of("chain", networks.chain(16)),
+        entry_of("size ratio 10", networks.size_ratio(1, 0)),
+        entry_of("mass ratio 10000", networks.mass_ratio(4, 0)),
+        entry_of("hexagonal cluster", networks.hexagonal(2, True)),
+        entry_of("jammed row", networks.jammed_row(10)),
+    ]
+
+
+def test_solution_is_optimal_in_both_forms(entries):
+    for entry in entries[:4]:
+        impulses = entry.solution.impulses
+        program = in_impulses(entry)
+        slope = program.scale * (program.p @ (impulses / program.scale) + program.q)
+        np.testing.assert_allclose(slope, entry.solution.velocities, atol=1e-12)
+        program = in_velocities(entry)
+        changes = program.g.T @ impulses / program.scale  # of optimal x: x = Gᵀ p
+        after = program.scale * (program.g @ changes - program.h)
+        np.testing.assert_allclose(after, entry.solution.velocities, atol=1e-12)
+        g = weighted(entry)
+        np.testing.assert_allclose((g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12)
+
+
+@pytest.mark.slow  # compiles for 13 s
+def test_machine_code_alone_solves_all(entries):
+    for entry in entries[:4]:
+        answer = by_cluster(entry, 1e-10)()
+        assert measure.velocity_error(entry, entry.matrix, answer.impulses) < 1e-8 and answer.products >= 1
+    assert by_cluster(entries[4], 1e-6)() is None
+
+
+def test_start_at_the_solution_needs_one_sweep(entries):
+    entry = entries[1]
+    assert swept_from(entry, 1e-6, entry.solution.impulses)().products == 1
+    assert swept_from(entry, 1e-6)().products > 50
+
+
+@pytest.mark.slow
+def test_peers_and_ours_find_the_same_velocities(entries):
+    """Each that is installed; all know that a full row has no solution, apart from those that only iterate."""
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("proxsuite")
+    solvers = {name: own()[name] for name in ("machine code", "barzilai-borwein")} | peers()
+    finest: dict = {}
+    compile_for(entries, solvers)
+    rows = measured(
+        solvers, entries, lambda name, entry, runs: finest.setdefault(entry.name, {}).update({name: runs[-1]})
+    )
+    assert {row.outcome for row in rows} <= {"ok", "missed"}
+    for entry in entries[:4]:
+        good = {name: run for name, run in finest[entry.name].items() if run.residual <= TARGETS[-1]}
+        assert set(good) >= {
+            "machine code",
+            "barzilai-borwein",
+            "Pinocchio ADMM",
+            "PIQP",
+            "ProxQP",
+            "OSQP",
+            "SciPy NNLS",
+        }
+        for run in good.values():
+            assert measure.velocity_error(entry, entry.matrix, run.impulses) <= 1e-6
+    denying = {name for name, run in finest["jammed row"].items() if run.impulses is None}
+    assert denying >= {"machine code", "barzilai-borwein", "PIQP", "ProxQP", "SciPy NNLS"}
+
+
+def scripted(*residuals: float, seconds: float = 0.0):
+    """A solver whose answer is off by a share of the exact impulses, one share for each tolerance in turn."""
+    left = list(residuals)
+
+    def prepare(entry: Entry, tolerance: float):
+        share = left.pop(0) if len(left) > 1 else left[0]
+        impulses = entry.solution.impulses * (1 + share) if entry.solution.feasible else np.ones(10)
+        return lambda: Answer(impulses, 7)
+
+    return Solver(prepare, "products", {})
+
+
+def test_a_target_costs_what_the_cheapest_run_does_that_meets_it(entries, monkeypatch):
+    times = iter([3.0, 1.0, 2.0, 0.5])
+    monkeypatch.setattr(measure, "LIMIT", 10.0)
+    monkeypatch.setattr(measure, "timed", lambda solve: (next(times), solve()))
+    rows = measured({"one": scripted(1e-1, 1e-5, 1e-7, 0.0)}, entries[:1], lambda *_: None)
+    assert [row.outcome for row in rows] == ["ok"] * 4
+    assert [row.seconds for row in rows] == [0.5] * 4 and rows[0].iterations == 7
+    assert all(row.residual <= row.target for row in rows)
+
+
+def test_failures_are_missed_slow_or_skipped(entries, monkeypatch):
+    monkeypatch.setattr(measure, "timed", lambda solve: (0.3, solve()))
+    rows = measured({"one": scripted(1e-3)}, [entries[0]] * 2, lambda *_: None)
+    assert [row.outcome for row in rows[:4]] == ["ok", "missed", "missed", "missed"]
+    longer = entries[0]._replace(problem=networks_problem(64), solution=None)
+    monkeypatch.setattr(measure, "targets", lambda entry: TARGETS)
+    rows = measured({"one": scripted(1e-3)}, [entries[0], longer], lambda *_: None)
+    assert {row.outcome for row in rows[4:]} == {"skipped"}
+    monkeypatch.setattr(measure, "timed", lambda solve: (1.3, solve()))
+    rows = measured({"one": scripted(0.0)}, entries[:1], lambda *_: None)
+    assert {row.outcome for row in rows} == {"slow"}
+
+
+def networks_problem(discs: int):
+    network = networks.chain(discs)
+    return compact(network.contacts, network.masses)
+
+
+def row(solver: str, problem: int, family: str, target: float, seconds: float | None) -> Row:
+    if seconds is None:
+        return Row(solver, str(problem), family, 20 * (problem + 1), target, "missed")
+    return Row(
+        solver, str(problem), family, 20 * (problem + 1), target, "ok", target, seconds, 10.0, target, 0.0, target
+    )
+
+
+@pytest.fixture
+def rows() -> list[Row]:
+    costs = {"machine code": (1e-5, 1e-5, 4e-5), "PIQP": (2e-5, 3e-5, 1e-5), "Pinocchio PGS": (1e-4, None, None)}
+    return [
+        row(solver, problem, "flow" if problem < 2 else "chain", target, seconds)
+        for solver, each in costs.items()
+        for problem, seconds in enumerate(each)
+        for target in TARGETS
+    ]
+
+
+def test_table_names_the_fastest_and_counts_failures(rows):
+    lines = groups.table(rows, targets=(1e-4,)).splitlines()
+    small, medium, chains = (line.split(" | ") for line in lines[2:])
+    assert small[2].startswith("machine code: 10 µs") and small[3].startswith("PIQP: 20 µs")
+    assert medium[4].startswith("Pinocchio PGS: –, 0 of 1")
+    assert chains[2].startswith("PIQP: 10 µs") and chains[3].startswith("machine code: 40 µs")
+
+
+def test_summary_has_a_null_where_the_median_fails(rows):
+    lines = groups.summary(rows)
+    line = next(x for x in lines if (x["group"], x["solver"]) == ("chain", "Pinocchio PGS"))
+    assert line["seconds"] is None and line["missed"] == 1 and line["ok"] == 0
+    json.dumps(lines, allow_nan=False)
+
+
+def test_failures_are_drawn_above_the_line(rows):
+    figure: Figure = draw_work(rows, "seconds")
+    shown = {axes.get_title().rpartition(" (")[0]: axes for axes in figure.axes if axes.get_visible()}
+    assert set(shown) == {"flows, up to 30 contacts", "flows, 31 to 300", "chain"}
+    limit = shown["chain"].lines[0].get_ydata()[0]
+    colour = STYLES["Pinocchio PGS"][0]
+    heights = [line.get_ydata() for line in shown["chain"].lines if line.get_color() == colour]
+    assert np.min(heights[-1]) > limit and len(heights[-1]) == len(TARGETS) and np.all(np.isnan(heights[0]))
+
+
+def test_other_charts_hold_the_numbers(rows):
+    profiles = draw_profiles(rows)
+    in_time, _, in_products, _ = profiles.axes
+    ends = {line.get_label(): line.get_ydata()[-1] for line in in_time.lines}
+    assert ends == {"machine code": 1, "PIQP": 1, "Pinocchio PGS": pytest.approx(1 / 3)}
+    assert {line.get_label() for line in in_products.lines} == {"machine code", "Pinocchio PGS"}
+    flows, _ = draw_scaling(rows).axes
+    drawn = next(line for line in flows.lines if line.get_color() == "black")
+    np.testing.assert_allclose(drawn.get_ydata(), 0.01)
+    warm = [WarmRow("OSQP", "1", "cold", 1, 2.0, 10), WarmRow("OSQP", "1", "exact to 0.1", 0.1, 1.0, 4)]
+    in_time, in_iterations = draw_warm(warm).axes
+    assert [axes.containers[0].lines[0].get_ydata()[0] for axes in (in_time, in_iterations)] == [0.5, 0.4]
+    assert warm_summary(warm)[1]["iterations_over_cold"] == 0.4
+
+
+def test_agreement_is_the_largest_difference_of_a_pair():
+    zero, one = np.zeros(2), np.array([0.0, 1e-7])
+    found = agreement({"a": {"x": zero, "y": one}, "b": {"x": zero, "y": zero}, "c": {"x": zero}})
+    assert found == [{"solvers": ["x", "y"], "problems": 2, "largest_difference": 1e-7}]
+
+
+def test_committed_solutions_of_ours_agree_with_those_of_peers():
+    told = json.loads((RESULTS / "solvers.json").read_text())
+    peers_there = set(told["settings"]) - set(own())
+    assert len(peers_there) == 9 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(told["packages"])
+    for ours in ("machine code", "barzilai-borwein"):
+        pairs = {
+            name: pair
+            for pair in told["agreement"]
+            for name in pair["solvers"]
+            if ours in pair["solvers"] and name in peers_there
+        }
+        assert len(pairs) >= 5
+        assert sum(pair["problems"] >= 150 for pair in pairs.values()) >= 3
+        assert all(pair["largest_difference"] <= 1e-6 for pair in pairs.values())
