@@ -86,17 +86,13 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
 
 
 def test_stress_of_a_solve_in_the_committed_chart_is_within_half_the_target() -> None:
-    """Of flows: static packings and chains of hundreds of discs, which no flow forms, need a tighter tolerance."""
+    """At the tolerances that it chooses for these targets, in flows: static packings and long chains need tighter ones."""
     chart = json.loads((RESULTS / "solvers.json").read_text())
-    found = [
-        row["worst_stress_error_over_tolerance"]
-        for row in chart["summary"]
-        if row["group"].startswith("flows") and row["solver"] in ("barzilai-borwein", "machine code")
-        if row["target"] >= 1e-6  # tighter ones are chosen for errors below these
-    ]
-    assert len(found) == 2 * 3 * 3
-    for target_error in (0.1, 0.02, 1e-3, 1e-4):
-        assert max(found) * automatic_tolerance(target_error) <= target_error / 2
+    for ratios in chart["worst_stress_error_of_flows_over_tolerance"].values():
+        found = [ratio for tolerance, ratio in ratios.items() if 1e-6 <= float(tolerance) <= 1e-2]
+        assert len(found) >= 3
+        for target_error in (0.1, 0.02, 1e-3, 1e-4):
+            assert max(found) * automatic_tolerance(target_error) <= target_error / 2
 
 
 def test_nothing_cheaper_than_the_default_has_a_better_pressure_in_the_committed_chart() -> None:

@@ -56,8 +56,6 @@ def summary(rows: Sequence[Row]) -> list[dict]:
         for key in ("residual", "velocity_error", "stress_error"):
             values = [getattr(row, key) for row in members if row.outcome == "ok"]
             line[f"worst_{key}"] = _rounded(max(values)) if values else None
-        ratios = [row.stress_error / row.tolerance for row in members if row.outcome == "ok"]
-        line["worst_stress_error_over_tolerance"] = _rounded(max(ratios)) if ratios else None
         lines.append(line)
     return lines
 

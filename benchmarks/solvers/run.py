@@ -19,9 +19,9 @@ from benchmarks.collection import Entry, load
 from benchmarks.networks import SLOTS
 from benchmarks.output import Output
 from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
-from benchmarks.solvers.groups import summary, table
-from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, measured
-from benchmarks.solvers.roster import Solver, own, peers, versions
+from benchmarks.solvers.groups import FLOWS, summary, table
+from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, measured, stress_error
+from benchmarks.solvers.roster import DEFAULT, MACHINE_CODE, Solver, own, peers, versions
 from benchmarks.solvers.warm import WarmRow, compared
 
 _QUICK_STEP, _QUICK_CONTACTS = 10, 600
@@ -37,11 +37,16 @@ def run(output: Output) -> None:
     start, load_before = time.perf_counter(), os.getloadavg()
     compile_for(entries, solvers)
     finest: dict[str, dict[str, np.ndarray]] = {}
+    stress: dict[str, dict[float, float]] = {name: {} for name in (MACHINE_CODE, DEFAULT)}
 
     def note(name: str, entry: Entry, runs: list[Attempt]) -> None:
         if entry.solution.feasible and runs[-1].residual <= _AGREED:
             after = entry.matrix @ runs[-1].impulses + entry.problem.approach
             finest.setdefault(entry.name, {})[name] = after / -np.min(entry.problem.approach)
+        if name in stress and entry.family in FLOWS:
+            for run in runs:
+                ratio = stress_error(entry, run.impulses) / run.tolerance
+                stress[name][run.tolerance] = max(stress[name].get(run.tolerance, 0.0), ratio)
 
     rows = measured(solvers, entries, note)
     warm = compared(entries, output.quick) if set(solvers) > set(own()) else []
@@ -57,6 +62,10 @@ def run(output: Output) -> None:
         "load_averages": [load_before, os.getloadavg()],
         "wall_seconds": round(time.perf_counter() - start),
         "agreement": agreed,
+        "worst_stress_error_of_flows_over_tolerance": {
+            name: {f"{tolerance:.0e}": float(f"{ratio:.3g}") for tolerance, ratio in found.items()}
+            for name, found in stress.items()
+        },
         "warm": warm_summary(warm),
     }
     output.write_rows("solvers", head, "summary", summary(rows))
