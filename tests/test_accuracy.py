@@ -86,7 +86,7 @@ def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_it
 
 
 def test_stress_of_a_solve_in_the_committed_chart_is_within_half_the_target() -> None:
-    """At the tolerances that it chooses for these targets, in flows: static packings and long chains need tighter ones."""
+    """Of flows, at the tolerances that these targets ask for. Static packings and long chains need tighter ones."""
     chart = json.loads((RESULTS / "solvers.json").read_text())
     for ratios in chart["worst_stress_error_of_flows_over_tolerance"].values():
         found = [ratio for tolerance, ratio in ratios.items() if 1e-6 <= float(tolerance) <= 1e-2]

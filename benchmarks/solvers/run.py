@@ -116,9 +116,8 @@ def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
 def told(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
     """The agreement as text: the pairs of ours with others, and the worst of all."""
     lines = ["largest difference of velocities between solutions to 1e-8, over the fastest approach"]
-    for pair in pairs:
-        if sum(solvers[name].ours for name in pair["solvers"]) == 1:
-            lines.append(f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})")
+    mixed = [pair for pair in pairs if sum(solvers[name].ours for name in pair["solvers"]) == 1]
+    lines += [f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})" for pair in mixed]
     return "\n".join(lines)
 
 
