@@ -20,7 +20,7 @@ from benchmarks.timing import timed
 
 TARGETS = (1e-2, 1e-4, 1e-6, 1e-8)
 LIMIT = 1.0  # seconds
-_TIGHTEST, _LARGE = 14, 300  # power of the last tolerance; contacts from which only every second one is tried
+_TIGHTEST, _LARGE = 16, 300  # power of the last tolerance; contacts from which only every second one is tried
 _MANY = 1000  # iterations, from which a run that repeats the one before has come to its limit
 
 

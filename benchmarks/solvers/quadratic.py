@@ -21,8 +21,8 @@ from benchmarks.solvers.forms import columns, in_impulses, in_velocities, scaled
 
 FORMS = {"impulses": in_impulses, "velocities": in_velocities}
 LIMIT = 1.0  # seconds of a solve, where a package has a limit of time
-OSQP = {"form": "impulses", "check_termination": 25, "adaptive_rho_interval": 25}
-PROXQP_DENSE = {"form": "impulses", "max_iter": 100, "max_iter_in": 100}
+OSQP = {"form": "impulses", "adaptive_rho_interval": 25, "alpha": 1.8, "eps_dual_inf": 1e-8}
+PROXQP_DENSE = {"form": "impulses", "max_iter": 100, "max_iter_in": 100, "eps_dual_inf": 1e-10}
 PROXQP = {"sparse_backend": "SparseCholesky"} | PROXQP_DENSE  # its own choice for large problems has no factors
 CLARABEL = {"form": "impulses", "static_regularization_constant": 1e-12}
 PIQP = {"form": "impulses"}
