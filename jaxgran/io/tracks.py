@@ -176,7 +176,9 @@ def _in_one_unit(tracks: Tracks, said: Observation, known_time: bool, name: str)
         seen = np.isfinite(moved) & np.isfinite(mean)
         if np.any(mean[..., 1][seen[..., 1]]):
             seen[..., 0] = False  # along x they may lack the shear
-        slope = np.sum((moved * mean)[seen]) / max(np.sum((mean**2)[seen]), 1e-300)
+        quick = seen & (np.abs(mean) >= np.median(np.abs(mean[seen]))) & (mean != 0) if seen.any() else seen
+        # The median, as the few that collide in between do not go with their mean velocity
+        slope = float(np.median(moved[quick] / mean[quick])) if quick.any() else 0.0
         if not known_time and slope > 0:
             tracks = _with(tracks, time=tracks.time * slope)
         elif not _SAME_TIME[0] < slope < _SAME_TIME[1]:
