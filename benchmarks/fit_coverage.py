@@ -1,10 +1,11 @@
 """How often do the intervals of a fitted restitution hold? 100 trajectories of tracked discs for each noise.
 
-    python -m benchmarks fit_coverage           # all noises at one restitution, some at two more; 40 minutes
+    python -m benchmarks fit_coverage           # all noises at one restitution, some at two more; an hour
     python -m benchmarks fit_coverage --quick   # one restitution, ten trajectories; --runs 40 for another number
 
 The trajectories are made by the event-driven reference, which shares no code with the fit: N = 64, ν = 0.6, 100 frames
-over a strain of 0.5. Positions, velocities and presence are then spoilt. The noise is not given to the fit.
+over a strain of 0.5. Positions, velocities and presence are then spoilt. The noise is not given to the fit. The
+limits of the fit were chosen on trajectories of another seed.
 """
 
 import time
@@ -24,16 +25,17 @@ RUNS, FEW_RUNS = 100, 10
 CONTACT_DURATION = 1e-6  # of the reference, in 1/γ̇: no collapse can last
 SETTLING = 2.0  # strain before the first trajectory
 BETWEEN = 0.5  # strain from one trajectory to the next
+SEED = 1  # 0 made the trajectories on which the limits of the fit were chosen
 
 # Noise of velocities over their root mean square (None: no velocities), of positions in σ, and share of discs not seen
 NOISES = [(v, x, m) for v in (0.0, 0.01, 0.05, None) for x in (1e-4, 1e-3) for m in (0.0, 0.1)]
 FEW_NOISES = [(0.0, 1e-4, 0.0), (0.05, 1e-3, 0.0), (0.05, 1e-3, 0.1), (None, 1e-4, 0.0)]
 
 
-def trajectories(restitution: float, runs: int) -> list[jg.Tracks]:
+def trajectories(restitution: float, runs: int, fraction: float = FRACTION) -> list[jg.Tracks]:
     """Tracks without noise, one after the other of one flow."""
-    flow = jg.ShearFlow(GRAINS, restitution, FRACTION, 1e-3)
-    discs, law = discs_of(jg.prepare(flow, jax.random.key(0))), Law(restitution, CONTACT_DURATION)
+    flow = jg.ShearFlow(GRAINS, restitution, fraction, 1e-3)
+    discs, law = discs_of(jg.prepare(flow, jax.random.key(SEED))), Law(restitution, CONTACT_DURATION)
     discs, _ = sheared(discs, law, SETTLING)
     found = []
     for _ in range(runs):
@@ -60,7 +62,7 @@ def observed(discs: Discs, law: Law) -> tuple[Discs, jg.Tracks]:
 
 def spoilt(seen: jg.Tracks, velocity: float | None, position: float, missing: float, seed: int) -> jg.Tracks:
     """Tracks with noise."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([SEED, seed])
     peculiar = seen.velocities - np.stack([seen.positions[..., 1], 0 * seen.positions[..., 1]], axis=-1)
     error = np.nan if velocity is None else velocity * np.sqrt(np.mean(peculiar**2))
     positions = seen.positions + position * rng.normal(size=seen.positions.shape)
