@@ -7,6 +7,7 @@ import pytest
 from observed import FRAMES, RESTITUTION, noisy, tracks, without_velocities
 from synthetic import one_sentence
 
+from jaxgran.inference.collisions import flights_of
 from jaxgran.inference.restitution import fit_restitution
 from jaxgran.io.tracks import Tracks
 from jaxgran.model.checks import InputError
@@ -81,6 +82,23 @@ def test_a_region_of_the_cell_suffices() -> None:
     fit, whole = fit_restitution(region), fit_restitution(seen)
     assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
     assert 10 < fit.collisions < whole.collisions
+
+
+def test_a_disc_flies_straight_on_through_the_sides_of_a_sheared_cell() -> None:
+    """Two discs that never meet, seen at their places in the cell; the second leaves it at the top, unseen in a frame."""
+    time, side, velocities = np.linspace(0, 3, 31), 5.0, np.array([[0.0, 0.0], [0.8, 2.5]])
+    straight = np.array([[1.0, 1.0], [3.0, 4.0]]) + time[:, None, None] * velocities
+    rows = np.floor(straight[..., 1] / side)
+    columns = np.floor((straight[..., 0] - rows * side * time[:, None]) / side)
+    image = np.stack([columns + rows * time[:, None], rows], axis=-1) * side
+    moving = velocities - side * np.stack([rows, 0 * rows], axis=-1)
+    places, cell = straight - image, np.stack([side + 0 * time, side + 0 * time, side * time], axis=-1)
+    places[20, 1], moving[20, 1] = np.nan, np.nan
+    flights, length, _ = flights_of(Tracks(time, np.ones(2), np.ones(2), places, moving, cell, 1.0))
+    assert rows.max() == 2 and np.isnan(flights.positions[20, 1]).all()
+    seen = np.isfinite(places)
+    np.testing.assert_allclose(flights.positions[seen], straight[seen], atol=1e-12)
+    assert length == 1
 
 
 def test_frames_may_be_left_out() -> None:

@@ -125,16 +125,22 @@ def flights_of(tracks: Tracks) -> tuple[Flights, float, float]:
 
 
 def _unwrapped(tracks: Tracks) -> np.ndarray:
-    """Positions that follow each disc through the sides of the cell, also past frames in which it is not seen."""
+    """Positions that follow each disc through the sides of the cell, also past frames in which it is not seen.
+
+    A disc that has left through the upper side is seen as an image, which the shear leaves behind: its rows slide.
+    """
     positions = tracks.positions.copy()
     place, follows = positions[0].copy(), positions[0].copy()
+    last = np.full(len(tracks.diameters), tracks.time[0])
     for k in range(1, len(positions)):
         now = tracks.positions[k]
         step = nearest_image(now - place, tracks.cell[k])
+        step[:, 0] += tracks.shear_rate * (follows - place)[:, 1] * (tracks.time[k] - last)
         follows_now = np.where(np.isfinite(place), follows + step, now)
         seen = np.isfinite(now)
         positions[k] = np.where(seen, follows_now, np.nan)
         place, follows = np.where(seen, now, place), np.where(seen, follows_now, follows)
+        last = np.where(seen[:, 0], tracks.time[k], last)
     return positions
 
 
