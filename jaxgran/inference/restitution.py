@@ -33,24 +33,19 @@ from jaxgran.inference.collisions import (
     flights_of,
     measured_noise,
     relative_step,
-    straight_drift,
     weighed,
 )
+from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, struck_windows, without_repeats
 from jaxgran.io.tracks import Tracks
 from jaxgran.model.checks import InputError, require_number, require_untraced, shown
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the iteration
 DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
-_LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
-_CLEAR = 4.0  # normal velocity of a collision that is used, over its error
-_UNLIKELY = 1e-3  # probability with which a true collision fits worse than the cut
-_FEWEST = 4  # collisions
-_LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
+LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
+LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
 _MOST_STEPS = 50
 _CHOOSING = 10  # steps, after which the collisions that are used stay the same
-_APART = 2.0  # windows within which a pair does not collide twice
-_AT_ONCE = 1.0  # windows within which a disc does not collide twice, where it can be told
 _SETTLED = 1e-3  # step in standard errors, at which the iteration ends
 _LEVEL = chi2.ppf(0.95, 1)
 
@@ -124,14 +119,14 @@ def fit_restitution(
     known = {name: None if value is None else float(value) / in_units[name] for name, value in given.items()}
     position, velocity = measured_noise(flights)
     noise = Noise(
-        max(position if known["position_noise"] is None else known["position_noise"], _LEAST_NOISE),
-        max(velocity if known["velocity_noise"] is None else known["velocity_noise"], _LEAST_NOISE),
-        max(DIAMETER_NOISE if known["diameter_noise"] is None else known["diameter_noise"], _LEAST_NOISE),
+        max(position if known["position_noise"] is None else known["position_noise"], LEAST_NOISE),
+        max(velocity if known["velocity_noise"] is None else known["velocity_noise"], LEAST_NOISE),
+        max(DIAMETER_NOISE if known["diameter_noise"] is None else known["diameter_noise"], LEAST_NOISE),
     )
     step = relative_step(flights)
-    if not step <= _LONGEST_STEP:
+    if not step <= LONGEST_STEP:
         raise InputError(
-            f"tracks must show discs that move by {_LONGEST_STEP} diameters at most between frames, and neighbours "
+            f"tracks must show discs that move by {LONGEST_STEP} diameters at most between frames, and neighbours "
             f"move apart by {step:.2g}: take more frames in the same time."
         )
     flights = weighed(flights, noise)
@@ -139,7 +134,8 @@ def fit_restitution(
         best = _found(flights, noise, None)
         if diameter_noise is None:
             noise = noise._replace(diameter=_diameter_noise(best, noise.diameter))
-        best = _found(flights, noise, _struck(best, flights))
+        struck = struck_windows(best.collisions, best.fitted, best.used, *flights.positions.shape[:2])
+        best = _found(flights, noise, struck)
         low, high = _interval(best)
     return RestitutionFit(
         restitution=best.restitution,
@@ -171,7 +167,7 @@ def _found(flights: Flights, noise: Noise, struck: np.ndarray | None) -> _Best:
     if seen is None:
         raise InputError(_nothing(0, 0))
     best = _settled(Collisions(seen, noise))
-    if best.used.sum() < _FEWEST:
+    if best.used.sum() < FEWEST:
         raise InputError(_nothing(int(best.used.sum()), len(seen.window)))
     return best
 
@@ -180,7 +176,7 @@ def _diameter_noise(best: _Best, assumed: float) -> float:
     """The error of the distance at contact, by the median of what it differs by, over what noise alone explains."""
     gap, variance = best.fitted.gap[best.used], best.fitted.gap_variance[best.used]
     told = variance < 0.9 * assumed**2  # by more than the assumption
-    if told.sum() < _FEWEST:
+    if told.sum() < FEWEST:
         return assumed
     variance = 1 / (1 / variance[told] - 1 / assumed**2)
     free = gap[told] * (1 + variance / assumed**2)
@@ -188,18 +184,18 @@ def _diameter_noise(best: _Best, assumed: float) -> float:
     def excess(error: float) -> float:
         return float(np.median(free**2 / (error**2 + variance)) - chi2.ppf(0.5, 1))
 
-    if excess(_LEAST_NOISE) <= 0:
-        return _LEAST_NOISE
+    if excess(LEAST_NOISE) <= 0:
+        return LEAST_NOISE
     if excess(1.0) >= 0:
         return assumed
-    found: Any = brentq(excess, _LEAST_NOISE, 1.0)
+    found: Any = brentq(excess, LEAST_NOISE, 1.0)
     return float(found)
 
 
 def _nothing(collisions: int, changes: int) -> str:
     """What would help where too few collisions are found."""
-    found = f"tracks must show {_FEWEST} or more collisions of two discs, and {collisions} can be told from noise"
-    if changes > 10 * _FEWEST:
+    found = f"tracks must show {FEWEST} or more collisions of two discs, and {collisions} can be told from noise"
+    if changes > 10 * FEWEST:
         return f"{found} among {changes} changes of velocity: take more frames in the same time, or a looser flow."
     return f"{found}: take more frames or follow more discs, with less noise if there is much."
 
@@ -209,81 +205,38 @@ def _settled(collisions: Collisions) -> _Best:
 
     Errors begin as large as the misfit of the best trial says, and shrink with it, at most to the noise.
     """
-    cut, middle = chi2.isf(_UNLIKELY, collisions.freedom), chi2.ppf(0.5, collisions.freedom)
+    cut, middle = largest_misfit(collisions), chi2.ppf(0.5, collisions.freedom)
     trials = [(alpha, collisions.fitted(alpha)) for alpha in TRIALS]
 
     def loss(fitted: Fitted) -> float:
-        return float(np.sum(np.log1p(fitted.misfit / cut)[_alone(collisions, fitted)]))
+        return float(np.sum(np.log1p(fitted.misfit / cut)[of_two_discs(collisions, fitted)]))
 
     alpha, fitted = min(trials, key=lambda trial: loss(trial[1]))
-    alone, scale = _alone(collisions, fitted), 1.0
-    used = _once(collisions, fitted, alone)
+    alone, scale = of_two_discs(collisions, fitted), 1.0
+    used = without_repeats(collisions, fitted, alone)
     for k in range(_MOST_STEPS):
         fitted = collisions.fitted(alpha, fitted.unknowns)
         if k < _CHOOSING:
             scale = max(1.0, float(np.median((fitted.misfit / middle)[used]))) if used.any() else 1.0
-            alone = _alone(collisions, fitted)
-            used = _once(collisions, fitted, alone & (fitted.misfit < scale * cut))
+            alone = of_two_discs(collisions, fitted)
+            used = without_repeats(collisions, fitted, alone & (fitted.misfit < scale * cut))
         weights = np.where(used, 1 / (1 + np.exp(np.clip((fitted.misfit / scale - cut) / 2, -50, 50))), 0)
         information = np.sum(weights * fitted.curvature)
-        if used.sum() < _FEWEST or not information > 0:
+        if used.sum() < FEWEST or not information > 0:
             return _Best(collisions, fitted, used, alpha, np.inf, scale, 0)
         step = float(np.clip(-np.sum(weights * fitted.gradient) / information, -_LARGEST_STEP, _LARGEST_STEP))
         now, error = float(np.clip(alpha + step, 0, 1)), float(np.sqrt(scale / information))
         alpha, moved = now, abs(now - alpha)
         if moved <= _SETTLED * error and k > 1:
-            rejected = int(_once(collisions, fitted, alone).sum() - used.sum())
+            rejected = int(without_repeats(collisions, fitted, alone).sum() - used.sum())
             return _Best(collisions, fitted, used, alpha, error, scale, max(rejected, 0))
     raise RuntimeError(f"the restitution did not settle: it was last {alpha:.3g}.")
-
-
-def _alone(collisions: Collisions, fitted: Fitted) -> np.ndarray:
-    """Which candidates are clear of the noise and took place in their window, with no third disc."""
-    seen = collisions.seen
-    clear = fitted.normal_velocity > _CLEAR * fitted.normal_error
-    return clear & straight_drift(seen)
-
-
-def _once(collisions: Collisions, fitted: Fitted, chosen: np.ndarray) -> np.ndarray:
-    """Which of the chosen candidates are no repeats: one collision may be seen in several windows.
-
-    Of these the one with the most frames is kept, and of those the one with the least misfit.
-    """
-    seen, kept = collisions.seen, np.zeros(len(chosen), bool)
-    contact = seen.window + fitted.unknowns[:, 2] / seen.duration
-    taken: dict[tuple, list] = {}
-    for k in np.lexsort((fitted.misfit / collisions.freedom, -collisions.freedom)):
-        others = taken.setdefault(tuple(seen.grains[k]), [])
-        if chosen[k] and all(abs(contact[k] - other) > _APART for other in others):
-            kept[k] = True
-            others.append(contact[k])
-    # A disc strikes one other at a time: where two pairs with a common disc fit one change, the better one is kept
-    of_disc: dict[int, list] = {}
-    for k in np.argsort((fitted.misfit + seen.drift) / (collisions.freedom + np.maximum(seen.drift_freedom, 0))):
-        others = [of_disc.setdefault(int(disc), []) for disc in seen.grains[k]]
-        if kept[k] and all(abs(contact[k] - other) > _AT_ONCE for times in others for other in times):
-            for times in others:
-                times.append(contact[k])
-        else:
-            kept[k] = False
-    return kept
-
-
-def _struck(best: _Best, flights: Flights) -> np.ndarray:
-    """In which windows each disc collides, by the collisions that are found."""
-    struck = np.zeros((len(flights.time) - 1, len(flights.diameters)), bool)
-    seen = best.collisions.seen
-    contact = seen.window + best.fitted.unknowns[:, 2] / seen.duration
-    windows = np.clip(np.floor(contact), 0, len(struck) - 1).astype(int)
-    for disc in (0, 1):
-        struck[windows[best.used], seen.grains[best.used, disc]] = True
-    return struck
 
 
 def _interval(best: _Best) -> tuple[float, float]:
     """Where the loss is 3.84 above its least, within [0, 1]."""
     part = best.collisions.part(best.used)
-    cut = chi2.isf(_UNLIKELY, part.freedom)
+    cut = largest_misfit(part)
     unknowns = best.fitted.unknowns[best.used]
 
     def loss(alpha: float) -> float:
