@@ -85,7 +85,7 @@ def test_a_region_of_the_cell_suffices() -> None:
 
 
 def test_a_disc_flies_straight_on_through_the_sides_of_a_sheared_cell() -> None:
-    """Two discs that never meet, seen at their places in the cell; the second leaves it at the top, unseen in a frame."""
+    """Two discs that never meet, seen in the cell; the second leaves it at the top, and is not seen in one frame."""
     time, side, velocities = np.linspace(0, 3, 31), 5.0, np.array([[0.0, 0.0], [0.8, 2.5]])
     straight = np.array([[1.0, 1.0], [3.0, 4.0]]) + time[:, None, None] * velocities
     rows = np.floor(straight[..., 1] / side)
