@@ -280,6 +280,11 @@ BENCHMARKS = (
         options=(Option("--runs", "number of trajectories", int),),
     ),
     Benchmark(
+        "tracked_discs",
+        "What is the restitution of the discs in this file, which a camera could have made?",
+        (0.3, 0.3),
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),

@@ -214,6 +214,7 @@ def _settled(collisions: Collisions) -> _Best:
     alpha, fitted = min(trials, key=lambda trial: loss(trial[1]))
     alone, scale = of_two_discs(collisions, fitted), 1.0
     used = without_repeats(collisions, fitted, alone)
+    last, damping = 0.0, 1.0
     for k in range(_MOST_STEPS):
         fitted = collisions.fitted(alpha, fitted.unknowns)
         if k < _CHOOSING:
@@ -225,7 +226,10 @@ def _settled(collisions: Collisions) -> _Best:
         if used.sum() < FEWEST or not information > 0:
             return _Best(collisions, fitted, used, alpha, np.inf, scale, 0)
         step = float(np.clip(-np.sum(weights * fitted.gradient) / information, -_LARGEST_STEP, _LARGEST_STEP))
-        now, error = float(np.clip(alpha + step, 0, 1)), float(np.sqrt(scale / information))
+        if k >= _CHOOSING and step * last < 0:  # the misfit bends more than its linear part says
+            damping /= 2
+        last = damping * step
+        now, error = float(np.clip(alpha + last, 0, 1)), float(np.sqrt(scale / information))
         alpha, moved = now, abs(now - alpha)
         if moved <= _SETTLED * error and k > 1:
             rejected = int(without_repeats(collisions, fitted, alone).sum() - used.sum())
