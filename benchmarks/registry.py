@@ -285,6 +285,11 @@ BENCHMARKS = (
         (0.3, 0.3),
     ),
     Benchmark(
+        "fit_lammps",
+        "Is the restitution of soft discs that LAMMPS has moved found from its dump?",
+        (6, 1),
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),

