@@ -6,6 +6,7 @@ velocities in some frames before and after, each with noise; the distance at con
 error. The least χ² over the unknowns is found for all collisions at once, with its derivatives by α.
 """
 
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from jaxgran.inference.collisions import Candidates, Noise
 
 UNKNOWNS = 5  # of a collision
 _CHUNK = 256  # collisions that are fitted at once
+_STEPS, _MORE_STEPS = 15, 10  # from the guess, and from the best unknowns at a near restitution
 
 
 class Fitted(NamedTuple):
@@ -61,12 +63,13 @@ class Collisions:
             )
         )
 
-    def fitted(self, restitution: float, unknowns: np.ndarray | None = None, steps: int = 15) -> Fitted:
+    def fitted(self, restitution: float, unknowns: np.ndarray | None = None) -> Fitted:
+        """At a trial restitution, from the guess or from unknowns that are nearly the best."""
         start = self.guess if unknowns is None else _padded(unknowns, len(self.guess))
-        alpha, most = jnp.asarray(restitution), jnp.asarray(steps)
+        alpha, most = jnp.asarray(restitution), jnp.asarray(_STEPS if unknowns is None else _MORE_STEPS)
         chunks = [
-            _best_unknowns(alpha, most, *(jnp.asarray(x[k : k + _CHUNK]) for x in (start, *self.data)))
-            for k in range(0, len(start), _CHUNK)
+            _best_unknowns(alpha, most, jnp.asarray(start[k * _CHUNK : (k + 1) * _CHUNK]), *data)
+            for k, data in enumerate(self._chunks)
         ]
         found = (np.concatenate(x)[: self.count] for x in zip(*chunks, strict=True))
         best, misfit, products, gradient = found
@@ -83,6 +86,11 @@ class Collisions:
         spread = np.einsum("ci,cij,cj->c", towards, covariance[:, :2, :2], towards)
         gap = distance - self.data[-2][: self.count]
         return Fitted(best, misfit, gradient[:, UNKNOWNS], curvature, approach, error, gap, spread)
+
+    @cached_property
+    def _chunks(self) -> list[tuple[Array, ...]]:
+        ends = range(0, len(self.guess), _CHUNK)
+        return [tuple(jnp.asarray(x[k : k + _CHUNK]) for x in self.data) for k in ends]
 
     def part(self, chosen: np.ndarray) -> "Collisions":
         """The chosen ones alone."""

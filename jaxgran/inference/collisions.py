@@ -32,6 +32,7 @@ _QUICK = 0.9  # quantile of these steps
 _CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, over its error
 _ALONG = 0.95  # cosine of the angle between two changes of one contact
 _FEWEST_CHANGES = 20  # of which a share is taken
+_BENT = np.append(np.inf, chi2.isf(_BEND, np.arange(1, 8 * (LONGEST + 1) + 1)))  # χ² of a bend, by degrees of freedom
 
 
 class Noise(NamedTuple):
@@ -299,9 +300,9 @@ def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int
         relative, common = (_lines(seen, outwards, of) for seen, of in ((pair, of_pair), (centre, noise)))
         together = relative.misfit + common.misfit
         added = np.diff(together, axis=1, prepend=0)
-        freedom = 4.0 * (1 + pair.known[:, outwards])
+        freedom = 4 * (1 + pair.known[:, outwards].astype(int))
         total = np.cumsum(freedom * pair.seen[:, outwards], axis=1) - 8
-        likely = (added < chi2.isf(_BEND, freedom)) & (together < chi2.isf(_BEND, np.maximum(total, 1)))
+        likely = (added < _BENT[freedom]) & (together < _BENT[np.maximum(total, 1)])
         straight = np.cumprod(~relative.settled | likely, axis=1).astype(bool)
         if struck is not None:  # in the window before each further frame, outwards
             ends = np.minimum(np.minimum(frames[outwards][1:], frames[outwards][:-1]), len(struck) - 1)
