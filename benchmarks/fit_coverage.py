@@ -45,19 +45,19 @@ def trajectories(restitution: float, runs: int, fraction: float = FRACTION) -> l
     return found
 
 
-def observed(discs: Discs, law: Law) -> tuple[Discs, jg.Tracks]:
+def observed(discs: Discs, law: Law, frames: int = FRAMES, strain: float = STRAIN) -> tuple[Discs, jg.Tracks]:
     """The discs after a trajectory, and its tracks."""
     positions, velocities, cell = [], [], []
-    for k in range(FRAMES):
+    for k in range(frames):
         if k:
-            discs, _ = sheared(discs, law, STRAIN / (FRAMES - 1))
+            discs, _ = sheared(discs, law, strain / (frames - 1))
         positions.append(discs.positions.copy())
         velocities.append(discs.velocities.copy())
         velocities[-1][:, 0] += law.shear_rate * discs.positions[:, 1]
         cell.append((discs.side, discs.side, discs.side * (discs.tilt - np.floor(discs.tilt + 0.5))))
-    strain = STRAIN * np.arange(FRAMES) / (FRAMES - 1)
     arrays = (np.array(x) for x in (positions, velocities, cell))
-    return discs, jg.Tracks(strain, 2 * discs.radii, discs.masses, *arrays, law.shear_rate)
+    time = strain * np.arange(frames) / (frames - 1)
+    return discs, jg.Tracks(time, 2 * discs.radii, discs.masses, *arrays, law.shear_rate)
 
 
 def spoilt(seen: jg.Tracks, velocity: float | None, position: float, missing: float, seed: int) -> jg.Tracks:

@@ -290,6 +290,13 @@ BENCHMARKS = (
         (6, 1),
     ),
     Benchmark(
+        "fit_map",
+        "In which flows do the intervals of a fitted restitution hold, and where do clusters spoil them?",
+        (12, 1),
+        ("fit_map.json", "fit_map.png"),
+        one_core=True,
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),

@@ -1,0 +1,163 @@
+"""In which flows do the intervals of a fitted restitution hold? A map over restitution and packing fraction.
+
+    python -m benchmarks fit_map           # 20 points, and dense ones again by a quicker camera
+    python -m benchmarks fit_map --quick   # three points, few trajectories
+
+At each point 16 trajectories of the event-driven reference, N = 64, 50 frames, with 1 % of noise in the velocities and
+1e-4 σ in the positions, of which the fit is told nothing. One camera takes a frame each 0.005/γ̇, the other ten frames
+in the mean time between two collisions of a disc. At two points the discs are those of jaxgran itself, at a time step
+of 1e-4, where grains of a cluster stay in touch.
+
+Where discs collide in clusters, the reference has its duration of contact, 1e-6/γ̇: a disc that collides again within
+that time loses no energy. The share of such collisions is written beside each point; those are no collisions with α.
+"""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import binomtest
+
+import jaxgran as jg
+from benchmarks.event_driven import Law, averages, discs_of, sheared
+from benchmarks.fit_coverage import BETWEEN, CONTACT_DURATION, GRAINS, SETTLING, observed, spoilt
+from benchmarks.output import Output
+from jaxgran.model.checks import InputError
+
+RESTITUTIONS, FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.4, 0.6, 0.75, 0.8)
+DENSE = (0.75, 0.8)  # also by the quicker camera
+QUICK_POINTS = ((0.3, 0.4), (0.9, 0.6), (0.3, 0.75))
+OWN = ((0.6, 0.6), (0.3, 0.75))  # discs of jaxgran
+VELOCITY, POSITION = 0.01, 1e-4
+RUNS, FEW_RUNS, FRAMES = 16, 3, 50
+INTERVAL, PER_COLLISION = 0.005, 10  # strain between frames of one camera; frames per collision of the other
+OWN_TIMESTEP = 1e-4
+SEED, NOISE_SEED = 2, 1000  # those of fit_coverage are 1, and 0 to 99
+
+
+def by_reference(alpha: float, nu: float, runs: int, quicker: bool) -> tuple[list[jg.Tracks], dict]:
+    """Trajectories of the event-driven reference, and what describes the flow."""
+    flow = jg.ShearFlow(GRAINS, alpha, nu, 1e-3)
+    discs, law = discs_of(jg.prepare(flow, jax.random.key(SEED))), Law(alpha, CONTACT_DURATION)
+    discs, _ = sheared(discs, law, SETTLING)
+    discs, sums = sheared(discs, law, SETTLING)
+    mean = {name: float(value[0]) for name, value in averages(sums, discs).items()}
+    interval = 1 / (PER_COLLISION * mean["collision_rate"]) if quicker else INTERVAL
+    found = []
+    for _ in range(runs):
+        discs, seen = observed(discs, law, FRAMES, interval * (FRAMES - 1))
+        found.append(seen)
+        discs, _ = sheared(discs, law, BETWEEN)
+    told = {name: mean[name] for name in ("collision_rate", "granular_temperature", "elastic_share")}
+    return found, {"interval": interval, **told}
+
+
+def by_jaxgran(alpha: float, nu: float, runs: int) -> tuple[list[jg.Tracks], dict]:
+    """Trajectories of contact dynamics with time steps."""
+    flow = jg.ShearFlow(GRAINS, alpha, nu, OWN_TIMESTEP)
+    state, found = jg.prepare(flow, jax.random.key(SEED), SETTLING), []
+    strain = INTERVAL * np.arange(1, FRAMES + 1)
+    for _ in range(runs):
+        state, seen = jg.snapshot_series(flow, state, INTERVAL * FRAMES, FRAMES)
+        found.append(jg.tracks_of_states(strain, seen.state))
+        state, _ = jg.advance(flow, state, jnp.int32(round(BETWEEN / OWN_TIMESTEP)))
+    return found, {"interval": INTERVAL}
+
+
+def fitted(found: list[jg.Tracks], alpha: float) -> dict:
+    """How often the intervals of a point hold, with the 95 % interval of that share by Wilson, and by how much not."""
+    fits, refused, start = [], 0, time.process_time()
+    for k, seen in enumerate(found):
+        try:
+            fits.append(jg.fit_restitution(spoilt(seen, VELOCITY, POSITION, 0.0, NOISE_SEED + k)))
+        except (InputError, RuntimeError):
+            refused += 1
+    row = {"fits": len(fits), "refused": refused, "seconds": (time.process_time() - start) / len(found)}
+    if not fits:
+        return row
+    off, errors = np.array([(fit.restitution - alpha, fit.stderr) for fit in fits]).T
+    held = sum(fit.low <= alpha <= fit.high for fit in fits)
+    wilson = binomtest(held, len(fits)).proportion_ci(method="wilson")
+    return row | {
+        "held": held,
+        "coverage": (wilson.low, wilson.high),
+        "bias_in_errors": float(np.mean(off / errors)),
+        "spread_in_errors": float(np.std(off / errors, ddof=1)),
+        "bias": float(np.mean(off)),
+        "bias_stderr": float(np.std(off, ddof=1) / np.sqrt(len(off))),
+        "stderr": float(np.median(errors)),
+        "collisions": float(np.mean([fit.collisions for fit in fits])),
+        "rejected": float(np.mean([fit.rejected for fit in fits])),
+        "misfit": float(np.median([fit.misfit for fit in fits])),
+    }
+
+
+def sentence(row: dict) -> str:
+    words = (
+        f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['camera']}, frames {row['interval']:.2g} apart"
+    )
+    if not row["fits"]:
+        return f"{words}: all {row['refused']} refused"
+    return (
+        f"{words}: {row['held']} of {row['fits']} hold, {row['refused']} refused, bias {row['bias_in_errors']:+.2f} ± "
+        f"{row['spread_in_errors'] / np.sqrt(row['fits']):.2f} errors of {row['stderr']:.1e}, {row['collisions']:.0f} "
+        f"collisions, {row['rejected']:.0f} left out, misfit {row['misfit']:.2f}, {row['seconds']:.2f} s"
+    )
+
+
+def draw(rows: list[dict]) -> Figure:
+    """Coverage, bias and the share of collisions left out against ν; a marker for each α, filled where it is large."""
+    figure = Figure(figsize=(10.8, 3.6), layout="constrained")
+    panels = figure.subplots(1, 3)
+    marks = dict(zip(RESTITUTIONS, "svoD^", strict=True))
+    for row in rows:
+        if not row["fits"] or row["restitution"] not in marks or row["camera"] == "jaxgran":
+            continue
+        place = RESTITUTIONS.index(row["restitution"])
+        grey, quicker = f"{0.75 - 0.17 * place:.2f}", row["camera"] == "quicker"
+        x = row["packing_fraction"] + 0.006 * (place - 2)
+        style = {
+            "color": grey if not quicker else "tab:red", "marker": marks[row["restitution"]], "ms": 5, "lw": 1.2,
+            "mfc": "white" if quicker else grey,
+        }  # fmt: skip
+        low, high = row["coverage"]
+        share = row["held"] / row["fits"]
+        panels[0].errorbar(x, share, [[max(share - low, 0)], [max(high - share, 0)]], **style)
+        bias, error = row["bias_in_errors"], row["spread_in_errors"] / np.sqrt(row["fits"])
+        panels[1].errorbar(x, bias, error, **style)
+        panels[2].plot(x, row["rejected"] / (row["rejected"] + row["collisions"]), **style)
+    panels[0].axhline(0.95, color="0.5", lw=0.8, ls=":")
+    panels[1].axhline(0, color="0.5", lw=0.8, ls=":")
+    for axis, label in zip(
+        panels, ("intervals that hold", "bias, in errors", "share of collisions left out"), strict=True
+    ):
+        axis.set(xlabel="packing fraction ν", ylabel=label)
+    panels[0].set_ylim(0, 1.03)
+    panels[2].set_ylim(0, 1)
+    for place, (alpha, mark) in enumerate(marks.items()):
+        panels[2].plot([], [], mark, color=f"{0.75 - 0.17 * place:.2f}", ms=5, label=f"α = {alpha:g}")
+    panels[2].plot([], [], "o", color="tab:red", mfc="white", ms=5, label="quicker camera")
+    panels[2].legend(fontsize=8, frameon=False, loc="upper left")
+    return figure
+
+
+def run(output: Output) -> None:
+    """Fit the trajectories of all points, print, and write JSON and PNG."""
+    runs = FEW_RUNS if output.quick else RUNS
+    points = QUICK_POINTS if output.quick else [(alpha, nu) for nu in FRACTIONS for alpha in RESTITUTIONS]
+    cases = [("steady", *point) for point in points]
+    cases += [] if output.quick else [("quicker", alpha, nu) for alpha, nu in points if nu in DENSE]
+    cases += [("jaxgran", *point) for point in OWN[: 1 if output.quick else None]]
+    rows = []
+    for camera, alpha, nu in cases:
+        made = (
+            by_jaxgran(alpha, nu, runs) if camera == "jaxgran" else by_reference(alpha, nu, runs, camera == "quicker")
+        )
+        found, told = made
+        rows.append({"camera": camera, "restitution": alpha, "packing_fraction": nu, **told, **fitted(found, alpha)})
+        print(sentence(rows[-1]), flush=True)
+    head = {"grains": GRAINS, "frames": FRAMES, "velocity_noise": VELOCITY, "position_noise": POSITION}
+    output.write_rows("fit_map", head | {"contact_duration": CONTACT_DURATION, "timestep": OWN_TIMESTEP}, "rows", rows)
+    output.write_picture(draw(rows), "fit_map")
