@@ -1,7 +1,7 @@
 """Other ways to find the restitution of tracked discs. All are told the noise, which the fit of jaxgran is not.
 
-``by_hand``: two near discs whose velocities change between two frames, and whose momentum does not; the normal of the
-frame in which they are closest; −u'ₙ/uₙ of each collision, and their mean with weights.
+``by_hand``: two near discs whose velocities change between two frames, and whose momentum does not; the normal where
+straight lines bring them into touch; −u'ₙ/uₙ of each collision, and their mean with weights.
 
 ``of_simulations``: frames start runs of the event-driven program, which also made the data, so its model has no error;
 the restitution with which the next frames fit best, without derivatives.
@@ -42,20 +42,26 @@ class Noise(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Tracks as these methods need them.
+    """Tracks as these methods need them, with all pairs i < j.
 
-    ============  =========================  ====================================================================
-    velocities    (frames, grains, 2)        of the laboratory, without jumps through the sides of the cell
-    slide         (frames, grains, grains)   what the image of j that is near i moves faster than j along x
-    separations   (frames, grains, grains, 2)  of i from the nearest image of j
-    gaps          (frames, grains, grains)   distance less that at contact; infinite for i ≥ j
-    ============  =========================  ====================================================================
+    ===========  ===================  ========================================================================
+    velocities   (frames, grains, 2)  of the laboratory, without jumps through the sides of the cell
+    peculiar     (frames, grains, 2)  less the shear
+    first        (pairs,)             the disc i
+    second       (pairs,)             the disc j
+    separations  (frames, pairs, 2)   of i from the nearest image of j
+    slide        (frames, pairs)      along x, by which that image is faster than j
+    gaps         (frames, pairs)      distance less that at contact
+    ===========  ===================  ========================================================================
     """
 
     tracks: jg.Tracks
     velocities: np.ndarray
-    slide: np.ndarray
+    peculiar: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
     separations: np.ndarray
+    slide: np.ndarray
     gaps: np.ndarray
 
 
@@ -63,14 +69,14 @@ def seen_of(tracks: jg.Tracks) -> Seen:
     """What follows from tracks in which no disc is missing."""
     y, rate = tracks.positions[..., 1], tracks.shear_rate
     heights = y[0] + np.concatenate([0 * y[:1], np.cumsum(displacements(tracks)[..., 1], axis=0)])
-    velocities = tracks.velocities.copy()
+    velocities, peculiar = tracks.velocities.copy(), tracks.velocities.copy()
     velocities[..., 0] += rate * (heights - y)
-    apart = nearest_image(tracks.positions[:, :, None] - tracks.positions[:, None], tracks.cell[:, None, None])
-    slide = rate * (heights[:, :, None] - heights[:, None] - apart[..., 1])
-    radii = tracks.diameters / 2
-    gaps = np.linalg.norm(apart, axis=-1) - radii[:, None] - radii
-    gaps[:, np.tri(len(radii), dtype=bool)] = np.inf
-    return Seen(tracks, velocities, slide, apart, gaps)
+    peculiar[..., 0] -= rate * y
+    i, j = np.triu_indices(len(tracks.diameters), 1)
+    apart = nearest_image(tracks.positions[:, i] - tracks.positions[:, j], tracks.cell[:, None])
+    slide = rate * (heights[:, i] - heights[:, j] - apart[..., 1])
+    gaps = np.linalg.norm(apart, axis=-1) - (tracks.diameters[i] + tracks.diameters[j]) / 2
+    return Seen(tracks, velocities, peculiar, i, j, apart, slide, gaps)
 
 
 def by_hand(seen: Seen, noise: Noise, averaged: int = 3) -> float:
@@ -82,8 +88,9 @@ def by_hand(seen: Seen, noise: Noise, averaged: int = 3) -> float:
     v, masses, frames = seen.velocities, seen.tracks.masses, len(seen.velocities)
     changed = np.linalg.norm(np.diff(v, axis=0), axis=-1) > CHANGE * np.sqrt(2) * noise.velocity
     lost = weight = 0.0
-    near = np.minimum(seen.gaps[:-1], seen.gaps[1:]) < NEAR
-    for k, i, j in zip(*np.nonzero(near & changed[:, :, None] & changed[:, None]), strict=True):
+    near = (np.minimum(seen.gaps[:-1], seen.gaps[1:]) < NEAR) & changed[:, seen.first] & changed[:, seen.second]
+    for k, pair in zip(*np.nonzero(near), strict=True):
+        i, j = seen.first[pair], seen.second[pair]
         of_pair = changed[:, i] | changed[:, j]
         before = min(averaged, next((n for n in range(1, k + 1) if of_pair[k - n]), k + 1))
         after = min(averaged, next((n for n in range(1, frames - 1 - k) if of_pair[k + n]), frames - 1 - k))
@@ -92,16 +99,26 @@ def by_hand(seen: Seen, noise: Noise, averaged: int = 3) -> float:
         spread = noise.velocity * np.sqrt((masses[i] ** 2 + masses[j] ** 2) * (1 / before + 1 / after))
         if np.linalg.norm(gained) > MOMENTUM * spread:
             continue
-        closest = min((k, k + 1), key=lambda frame: seen.gaps[frame, i, j])
-        normal = seen.separations[closest, i, j] / np.linalg.norm(seen.separations[closest, i, j])
-        image = np.array([seen.slide[closest, i, j], 0.0])
-        approach, recession = -(first[i] - first[j] - image) @ normal, (second[i] - second[j] - image) @ normal
+        image, apart = np.array([seen.slide[k, pair], 0.0]), seen.separations[k, pair]
+        u, w = first[i] - first[j] - image, second[i] - second[j] - image
+        touch = np.linalg.norm(apart) - seen.gaps[k, pair]
+        contact = apart + u * min(_until(apart, u, touch), seen.tracks.time[k + 1] - seen.tracks.time[k])
+        normal = contact / np.linalg.norm(contact)
+        approach, recession = -u @ normal, w @ normal
         error = noise.velocity * np.sqrt(2 / before)
         if approach > CLEAR * error:
             share = 1 / (1 / before + 1 / after)
             lost += share * approach * recession
             weight += share * approach**2
     return lost / weight if weight else np.nan
+
+
+def _until(apart: np.ndarray, u: np.ndarray, touch: float) -> float:
+    """The time until two points are at a distance, or else closest; 0 where they recede."""
+    closing, square = -(apart @ u), u @ u
+    if closing <= 0:
+        return 0.0
+    return max(0.0, (closing - np.sqrt(max(0.0, closing**2 - square * (apart @ apart - touch**2)))) / square)
 
 
 def of_simulations(
@@ -116,7 +133,6 @@ def of_simulations(
     """
     tracks, tried = seen.tracks, 0
     interval, rate = float(np.diff(tracks.time).mean()), tracks.shear_rate
-    peculiar = tracks.velocities - rate * np.stack([tracks.positions[..., 1], 0 * tracks.positions[..., 1]], axis=-1)
     never = np.full(len(tracks.diameters), -np.inf)
     frames = len(tracks.time)
     starts = range(0, frames - 1, every)
@@ -126,13 +142,15 @@ def of_simulations(
         law, found = Law(alpha, contact_duration, rate), []
         for k in starts:
             side, _, offset = tracks.cell[k]
-            discs = Discs(*fixed, tracks.positions[k].copy(), peculiar[k].copy(), never.copy(), side, offset / side)
+            discs = Discs(
+                *fixed, tracks.positions[k].copy(), seen.peculiar[k].copy(), never.copy(), side, offset / side
+            )
             for m in range(1, min(window, frames - 1 - k) + 1):
                 discs, _ = sheared(discs, law, interval)
                 moved = nearest_image(discs.positions - tracks.positions[k + m], tracks.cell[k + m])
                 # The start has the noise too, and carries that of its velocity into the position
                 errors = noise.position * np.sqrt(2) + m * interval * noise.velocity, noise.velocity * np.sqrt(2)
-                found.append(np.stack([moved / errors[0], (discs.velocities - peculiar[k + m]) / errors[1]]))
+                found.append(np.stack([moved / errors[0], (discs.velocities - seen.peculiar[k + m]) / errors[1]]))
         return np.array(found)
 
     def loss(alpha: float, of_positions: float = 0.0, of_velocities: float = 0.0) -> float:
@@ -147,38 +165,40 @@ def of_simulations(
 
     if scales:
         start = np.array([[0.5, 0, 0], [0.8, 0, 0], [0.5, 0.3, 0], [0.5, 0, 0.3]])
-        options = {"initial_simplex": start, "xatol": 1e-4, "fatol": 1e-7, "maxiter": 200}
+        options = {"initial_simplex": start, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 60}
         return float(minimize(lambda x: loss(*x), start[0], method="Nelder-Mead", options=options).x[0]), tried
     return float(minimize_scalar(loss, bounds=(0.0, 1.0), method="bounded", options={"xatol": 1e-5}).x), tried
 
 
 def sums_of(seen: Seen, noise: Noise) -> np.ndarray:
     """Sums over the discs and the pairs of each frame, (frames, sums), of which ``statistics`` makes its numbers."""
-    tracks, v, rate = seen.tracks, seen.velocities, seen.tracks.shear_rate
-    c = tracks.velocities - rate * np.stack([tracks.positions[..., 1], 0 * tracks.positions[..., 1]], axis=-1)
-    mass, squares = tracks.masses, np.sum(c**2, axis=-1)
-    energies = mass * squares
-    sums = [energies.sum(1), (mass * c[..., 0] ** 2).sum(1), (mass * c[..., 0] * c[..., 1]).sum(1)]
-    sums += [(energies**2).sum(1)]
-    change = np.diff(v, axis=0, prepend=v[:1])
+    mass, c = seen.tracks.masses, seen.peculiar
+    energies = mass * np.sum(c**2, axis=-1)
+    change = np.diff(seen.velocities, axis=0, prepend=seen.velocities[:1])
     size = np.linalg.norm(change, axis=-1)
     struck = size > CHANGE * np.sqrt(2) * noise.velocity
-    sums += [struck.sum(1), (struck * size).sum(1), (struck * mass * size**2).sum(1)]
-    distance = np.linalg.norm(seen.separations, axis=-1) + np.eye(len(mass))
-    apart = v[:, :, None] - v[:, None]
-    apart[..., 0] -= seen.slide
-    normal = np.einsum("fijd,fijd->fij", apart, seen.separations) / distance
-    met = struck[:, :, None] & struck[:, None] & (seen.gaps < NEAR)
-    impulse = np.einsum("fid,fijd->fij", mass[:, None] * change, seen.separations) * met
-    shear = (mass[:, None] * change)[:, :, None, 0] * seen.separations[..., 1] * met
-    sums += [impulse.sum((1, 2)), shear.sum((1, 2))]
-    reduced = mass[:, None] * mass / (mass[:, None] + mass)
-    energy = reduced * normal**2
-    sums += [(np.diff(energy, axis=0, prepend=energy[:1]) * met).sum((1, 2))]
+    of_discs = [energies, mass * c[..., 0] ** 2, mass * c[..., 0] * c[..., 1], energies**2]
+    of_discs += [struck, struck * size, struck * mass * size**2]
+    sums = [x.sum(axis=1) for x in of_discs]
+
+    frame, pair = np.nonzero(seen.gaps < GAPS[-1])
+    i, j, apart, gap = seen.first[pair], seen.second[pair], seen.separations[frame, pair], seen.gaps[frame, pair]
+    u = seen.velocities[frame, i] - seen.velocities[frame, j]
+    u[:, 0] -= seen.slide[frame, pair]
+    normal = np.sum(u * apart, axis=-1) / np.linalg.norm(apart, axis=-1)
+
+    def added(values: np.ndarray) -> np.ndarray:
+        return np.bincount(frame, values, len(c))
+
+    met = struck[frame, i] & struck[frame, j]
+    given = (mass[i, None] * change[frame, i] - mass[j, None] * change[frame, j]) / 2 * met[:, None]
+    sums += [added(np.sum(given * apart, axis=-1)), added(given[:, 0] * apart[:, 1])]
+    reduced, turned = mass[i] * mass[j] / (mass[i] + mass[j]), change[frame, i] - change[frame, j]
+    sums += [added(met * reduced * (np.sum(u**2, axis=-1) - np.sum((u - turned) ** 2, axis=-1)))]
     for least, most in pairwise(GAPS):
-        pair = (seen.gaps >= least) & (seen.gaps < most)
-        for side in (pair & (normal < 0), pair & (normal > 0)):
-            sums += [side.sum((1, 2)), (side * np.abs(normal)).sum((1, 2)), (side * normal**2).sum((1, 2))]
+        inside = (gap >= least) & (gap < most)
+        for side in (inside & (normal < 0), inside & (normal > 0)):
+            sums += [added(side), added(side * np.abs(normal)), added(side * normal**2)]
     return np.stack(sums, axis=-1)
 
 

@@ -297,6 +297,13 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "fit_methods",
+        "How well, and how fast, do other methods find a restitution from the same tracks?",
+        (12, 1),
+        ("fit_methods.json", "fit_methods.png"),
+        one_core=True,
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),
