@@ -207,8 +207,8 @@ def statistics(sums: np.ndarray) -> np.ndarray:
 
     Granular temperature, anisotropy, kinetic shear stress, kurtosis; collisions, changes of velocity and their squares,
     contact pressure, shear stress and dissipation, each without the unit of time; and in shells of the gap between
-    discs, how many approach and recede, how fast, and the ratios of both. Recession over approach near contact is
-    α itself, but for the noise.
+    discs, how many approach and recede, how fast, and the ratios of both. As many recede as approach in a time, so near
+    contact the sums of squared normal velocities have the ratio α, but for the noise.
     """
     small = 1e-9
     energy, along, across, fourth, struck, jumps, squares, pressure, shear, dissipated = np.moveaxis(

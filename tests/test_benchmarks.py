@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from observed import RESTITUTION, noisy, tracks
 
 from benchmarks import __main__ as door
-from benchmarks import output, run_chart, timestep_study
+from benchmarks import fit_map, fit_methods, fit_rivals, output, run_chart, timestep_study
 from benchmarks.output import Output
 from benchmarks.registry import BENCHMARKS
 
@@ -167,3 +168,65 @@ def test_extrapolation_finds_the_limit_of_two_power_laws_within_its_interval() -
         assert low - width <= limit <= high + width
         if width < 0.1 * (1 + limit):
             np.testing.assert_allclose(powers, exponents, atol=0.15)
+
+
+def test_other_methods_find_the_restitution_of_tracked_discs() -> None:
+    """Single collisions by hand, simulations that follow eight frames, and fits of these with two more unknowns."""
+    discs = noisy(tracks(), 1e-4, 0.01)
+    noise = fit_rivals.Noise(float(np.std(discs.velocities - tracks().velocities)), 1e-4)
+    seen = fit_rivals.seen_of(discs)
+    assert abs(fit_rivals.by_hand(seen, noise) - RESTITUTION) < 3e-3
+    for scales in (False, True):
+        found, tried = fit_rivals.of_simulations(seen, noise, 1e-9, window=8, every=8, scales=scales)
+        assert abs(found - RESTITUTION) < 5e-3
+        assert tried > 5
+
+
+def test_statistics_of_pairs_do_not_jump_where_discs_leave_through_the_sides() -> None:
+    """As many discs recede as approach, so that in a thin shell the sums of u² have the ratio α, and those of u one."""
+    seen = fit_rivals.seen_of(tracks(strain=3.0))
+    lifted = seen.velocities[..., 0] - seen.tracks.velocities[..., 0]
+    assert np.abs(lifted).max() == pytest.approx(seen.tracks.cell[0, 1])
+    sums = fit_rivals.sums_of(seen, fit_rivals.Noise(1e-9, 1e-9)).sum(axis=0)
+    (_, speed, square), (_, speed_after, square_after) = sums[10:16].reshape(2, 3)  # in the smallest gap
+    assert speed_after / speed == pytest.approx(1, rel=0.25)
+    assert square_after / square == pytest.approx(RESTITUTION, rel=0.25)
+
+
+def test_a_regression_finds_what_statistics_were_made_with() -> None:
+    rng = np.random.default_rng(0)
+    alpha = rng.uniform(0.1, 0.9, 300)
+
+    def numbers(value):
+        noise = 0.02 * rng.normal(size=(*np.shape(value), 3))
+        return np.stack([value**2, np.exp(value), 0 * value], axis=-1) + noise
+
+    regression = fit_rivals.Regression(alpha, numbers(alpha))
+    off = [regression.restitution(numbers(np.array(value))) - value for value in np.linspace(0.2, 0.8, 40)]
+    assert np.sqrt(np.mean(np.square(off))) < 0.03
+
+
+def test_charts_of_fits_show_every_point_with_a_result_and_no_other() -> None:
+    row = {
+        "restitution": 0.3,
+        "packing_fraction": 0.6,
+        "camera": "steady",
+        "fits": 4,
+        "held": 3,
+        "coverage": (0.3, 0.95),
+    }
+    row |= {"bias_in_errors": -1.0, "spread_in_errors": 1.0, "rejected": 1.0, "collisions": 3.0}
+    figure = fit_map.draw([row, row | {"fits": 0}, row | {"camera": "quicker"}])
+    share, bias, left_out = figure.axes
+    assert [len(axes.containers) for axes in (share, bias)] == [2, 2]
+    assert [line.get_ydata()[0] for line in left_out.lines if len(line.get_ydata())] == [0.25, 0.25]
+
+    done = {"restitution": 0.6, "velocity_noise": 0.01, "position_noise": 1e-4, "interval": 0.005, "seconds": 1.0}
+    done |= {"error": 1e-3, "error_stderr": 1e-4}
+    name, other = list(fit_methods.STYLES)[:2]
+    rows = [done | {"method": name, "frames": n} for n in (20, 50)]
+    rows.append({**done, "method": other, "frames": 20, "error": None})
+    frames, interval, _ = fit_methods.draw(rows).axes
+    drawn = {each.get_label(): each.lines[0].get_xdata().tolist() for each in frames.containers}
+    assert drawn[name] == [20, 50] and drawn[other] == []
+    assert interval.containers[0].lines[0].get_xdata().tolist() == [0.005]
