@@ -117,7 +117,7 @@ def draw(rows: list[dict]) -> Figure:
             continue
         place = RESTITUTIONS.index(row["restitution"])
         grey, quicker = f"{0.75 - 0.17 * place:.2f}", row["camera"] == "quicker"
-        x = row["packing_fraction"] + 0.006 * (place - 2)
+        x = FRACTIONS.index(row["packing_fraction"]) + 0.17 * (place - 2) + 0.06 * quicker
         style = {
             "color": grey if not quicker else "tab:red", "marker": marks[row["restitution"]], "ms": 5, "lw": 1.2,
             "mfc": "white" if quicker else grey,
@@ -133,7 +133,8 @@ def draw(rows: list[dict]) -> Figure:
     for axis, label in zip(
         panels, ("intervals that hold", "bias, in errors", "share of collisions left out"), strict=True
     ):
-        axis.set(xlabel="packing fraction ν", ylabel=label)
+        axis.set(xlabel="packing fraction ν", ylabel=label, xlim=(-0.5, len(FRACTIONS) - 0.5))
+        axis.set_xticks(range(len(FRACTIONS)), [f"{nu:g}" for nu in FRACTIONS])
     panels[0].set_ylim(0, 1.03)
     panels[2].set_ylim(0, 1)
     for place, (alpha, mark) in enumerate(marks.items()):
