@@ -292,14 +292,14 @@ BENCHMARKS = (
     Benchmark(
         "fit_map",
         "In which flows do the intervals of a fitted restitution hold, and where do clusters spoil them?",
-        (12, 1),
+        (14, 1),
         ("fit_map.json", "fit_map.png"),
         one_core=True,
     ),
     Benchmark(
         "fit_methods",
         "How well, and how fast, do other methods find a restitution from the same tracks?",
-        (12, 1),
+        (9, 1),
         ("fit_methods.json", "fit_methods.png"),
         one_core=True,
     ),
