@@ -32,14 +32,16 @@ NOISES = [(v, x, m) for v in (0.0, 0.01, 0.05, None) for x in (1e-4, 1e-3) for m
 FEW_NOISES = [(0.0, 1e-4, 0.0), (0.05, 1e-3, 0.0), (0.05, 1e-3, 0.1), (None, 1e-4, 0.0)]
 
 
-def trajectories(restitution: float, runs: int, fraction: float = FRACTION) -> list[jg.Tracks]:
+def trajectories(
+    restitution: float, runs: int, fraction: float = FRACTION, frames: int = FRAMES, strain: float = STRAIN
+) -> list[jg.Tracks]:
     """Tracks without noise, one after the other of one flow."""
     flow = jg.ShearFlow(GRAINS, restitution, fraction, 1e-3)
     discs, law = discs_of(jg.prepare(flow, jax.random.key(SEED))), Law(restitution, CONTACT_DURATION)
     discs, _ = sheared(discs, law, SETTLING)
     found = []
     for _ in range(runs):
-        discs, seen = observed(discs, law)
+        discs, seen = observed(discs, law, frames, strain)
         found.append(seen)
         discs, _ = sheared(discs, law, BETWEEN)
     return found
@@ -55,9 +57,9 @@ def observed(discs: Discs, law: Law, frames: int = FRAMES, strain: float = STRAI
         velocities.append(discs.velocities.copy())
         velocities[-1][:, 0] += law.shear_rate * discs.positions[:, 1]
         cell.append((discs.side, discs.side, discs.side * (discs.tilt - np.floor(discs.tilt + 0.5))))
+    times = strain * np.arange(frames) / (frames - 1)
     arrays = (np.array(x) for x in (positions, velocities, cell))
-    time = strain * np.arange(frames) / (frames - 1)
-    return discs, jg.Tracks(time, 2 * discs.radii, discs.masses, *arrays, law.shear_rate)
+    return discs, jg.Tracks(times, 2 * discs.radii, discs.masses, *arrays, law.shear_rate)
 
 
 def spoilt(seen: jg.Tracks, velocity: float | None, position: float, missing: float, seed: int) -> jg.Tracks:

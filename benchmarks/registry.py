@@ -304,6 +304,12 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "fit_design",
+        "How well is the error of a restitution known before tracks are measured, and how far apart should frames be?",
+        (12, 1),
+        ("fit_design.json", "fit_design.png"),
+    ),
+    Benchmark(
         "load",
         "What do many points cost besides their flows, and does memory stay flat?",
         (4, 0.5),

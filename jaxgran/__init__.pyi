@@ -12,6 +12,7 @@ from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
 from .inference.closure import Closure, predict
 from .inference.closure_fit import fit_closure
+from .inference.experiment_design import FisherInformation, TrackNoise, fisher_information
 from .inference.friction_law import friction_law
 from .inference.restitution import RestitutionFit, fit_restitution
 from .inference.stress_inversion import restitution_from_stresses
@@ -48,6 +49,7 @@ __all__ = [
     "Cooling",
     "DelassusProblem",
     "Fields",
+    "FisherInformation",
     "Grains",
     "InputError",
     "Page",
@@ -58,6 +60,7 @@ __all__ = [
     "State",
     "Status",
     "Tally",
+    "TrackNoise",
     "Tracks",
     "Trajectory",
     "advance",
@@ -70,6 +73,7 @@ __all__ = [
     "enable_cache",
     "explore",
     "fields_at",
+    "fisher_information",
     "fit_closure",
     "fit_restitution",
     "flow_figure",

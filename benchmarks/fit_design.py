@@ -1,0 +1,211 @@
+"""How well does ``fisher_information`` know the error of a fit before tracks are measured?
+
+    python -m benchmarks fit_design           # 12 minutes
+    python -m benchmarks fit_design --quick   # one flow, fewer points: a minute
+
+Left: the error that is predicted beside that of fits to tracks of the event-driven reference, which shares no code with
+either: N = 64, 50 frames, 12 trajectories of each flow, noise and frame rate. The fits are not told the noise. The
+median of the errors that they state, and the root mean square of how far they are off.
+
+Middle: the predicted error over α and ν, 100 frames of 64 discs. Right: against the time between frames.
+
+Noise of velocities is 5 % of a component of a typical velocity, of positions 1e-3 σ with velocities and 1e-4 σ without.
+The time between frames is in collisions of a disc, by Enskog's theory. The last step of jaxgran before tracks begin is
+dt = 1e-3, and that of the tracks 1e-6 of the time in which a disc moves by its diameter.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import jaxgran as jg
+from benchmarks.fit_coverage import spoilt, trajectories
+from benchmarks.output import Output
+from jaxgran.model.checks import InputError
+from jaxgran.sampling.prediction import kinetic_theory
+
+GRAINS, FITTED_FRAMES, FRAMES = 64, 50, 100
+NOISES = {"with velocities": (0.05, 1e-3), "positions alone": (None, 1e-4)}
+MARKERS = {"with velocities": ("o", "black", "-"), "positions alone": ("s", "white", "--")}
+LINES = ("-", "--", "-.", ":")
+
+
+class Plan(NamedTuple):
+    """Flows (α, ν), collisions between frames and trajectories of the fits; then α, ν and collisions of the others."""
+
+    flows: tuple[tuple[float, float], ...]
+    intervals: tuple[float, ...]
+    runs: int
+    restitutions: tuple[float, ...]
+    fractions: tuple[float, ...]
+    far: tuple[float, ...]
+
+
+FULL = Plan(
+    ((0.6, 0.6), (0.3, 0.4), (0.9, 0.5)),
+    (0.06, 0.25),
+    12,
+    (0.2, 0.4, 0.6, 0.8, 0.95),
+    (0.2, 0.4, 0.6, 0.7),
+    (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6),
+)
+QUICK = Plan(((0.6, 0.5),), (0.1,), 3, (0.4, 0.8), (0.4,), (0.05, 0.2))
+
+
+def run(output: Output) -> None:
+    """Compare with fits, predict, print, and write ``fit_design`` as JSON and PNG."""
+    jax.config.update("jax_enable_x64", True)
+    plan = QUICK if output.quick else FULL
+    fits = []
+    for flow in plan.flows:
+        for interval in plan.intervals:
+            fits += fit_rows(*flow, interval, plan.runs)
+    over_flows = [
+        predicted(alpha, nu, 0.1, "with velocities", FRAMES) for nu in plan.fractions for alpha in plan.restitutions
+    ]
+    over_intervals = [predicted(0.6, 0.6, interval, noise, FRAMES) for noise in NOISES for interval in plan.far]
+    head = {"grains": GRAINS, "frames": {"fits": FITTED_FRAMES, "others": FRAMES}, "noises": NOISES}
+    output.write_json("fit_design", {**head, "fits": fits, "over_flows": over_flows, "over_intervals": over_intervals})
+    output.write_picture(picture(fits, over_flows, over_intervals), "fit_design")
+
+
+def theory(alpha: float, nu: float) -> tuple[float, float]:
+    """Collisions of a disc in a unit of strain, and a typical component of its velocity."""
+    found = kinetic_theory([alpha], [nu])
+    return float(found.collision_rate[0]), float(np.sqrt(found.granular_temperature[0]))
+
+
+def predicted(
+    alpha: float, nu: float, interval: float, noise: str, frames: int, velocity_noise: float | None = None
+) -> dict:
+    """What ``fisher_information`` says; no error where nothing will be learnt."""
+    rate, speed = theory(alpha, nu)
+    velocity, position = NOISES[noise]
+    if velocity is not None and velocity_noise is None:
+        velocity_noise = velocity * speed
+    row = {"restitution": alpha, "packing_fraction": nu, "interval": interval, "noise": noise}
+    try:
+        found = jg.fisher_information(
+            jg.ShearFlow(GRAINS, alpha, nu, 1e-3),
+            frames,
+            jg.TrackNoise(position, velocity_noise),
+            frame_strain=interval / rate,
+        )
+    except InputError as why:
+        row |= {"refused": str(why)}
+    else:
+        row |= vars(found)
+    print(sentence(row), flush=True)
+    return row
+
+
+def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
+    """Predictions, and fits to trajectories, with each noise."""
+    strain = interval / theory(alpha, nu)[0] * (FITTED_FRAMES - 1)
+    tracks = trajectories(alpha, runs, nu, FITTED_FRAMES, strain)
+    speed = np.sqrt(np.mean([(seen.velocities - shear(seen)) ** 2 for seen in tracks]))
+    rows = []
+    for noise, (velocity, position) in NOISES.items():
+        fits = []
+        for k, seen in enumerate(tracks):
+            try:
+                fits.append(jg.fit_restitution(spoilt(seen, velocity, position, 0.0, k)))
+            except (InputError, RuntimeError):
+                continue
+        row = predicted(alpha, nu, interval, noise, FITTED_FRAMES, None if velocity is None else velocity * speed)
+        stated, off = (np.array(x) for x in zip(*[(fit.stderr, fit.restitution - alpha) for fit in fits], strict=True))
+        row |= {
+            "fits": len(fits),
+            "fit_collisions": float(np.mean([fit.collisions for fit in fits])),
+            "stated": float(np.median(stated)),
+            "stated_error": float(1.25 * np.std(stated, ddof=1) / np.sqrt(len(fits))),
+            "off": float(np.sqrt(np.mean(off**2))),
+            "off_error": float(np.sqrt(np.mean(off**2) / (2 * len(fits)))),
+        }
+        print(
+            f"    {row['fits']} fits of {runs}: stated {row['stated']:.2e} ± {row['stated_error']:.0e}, off by "
+            f"{row['off']:.2e} ± {row['off_error']:.0e}, {row['fit_collisions']:.0f} collisions",
+            flush=True,
+        )
+        rows.append(row)
+    return rows
+
+
+def shear(seen: jg.Tracks) -> np.ndarray:
+    """The velocity of the shear at each disc."""
+    return np.stack([seen.positions[..., 1], 0 * seen.positions[..., 1]], axis=-1)
+
+
+def sentence(row: dict) -> str:
+    head = (
+        f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['noise']}, {row['interval']:g} between frames"
+    )
+    if "refused" in row:
+        return f"{head}: {row['refused']}"
+    return (
+        f"{head}: error {row['stderr']:.2e} ± {row['stderr_error']:.0e}, {row['collisions']:.0f} collisions, "
+        f"{100 * row['usable']:.0f} % of all"
+    )
+
+
+def picture(fits: list[dict], over_flows: list[dict], over_intervals: list[dict]) -> Figure:
+    """Errors of fits against the prediction, the prediction over flows, and against the time between frames."""
+    figure = Figure((13, 4.2), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    _draw_fits(left, fits)
+    known = [row for row in over_flows if "stderr" in row]
+    for k, nu in enumerate(sorted({row["packing_fraction"] for row in known})):
+        shade = str(0.15 * k)
+        _draw_line(middle, [row for row in known if row["packing_fraction"] == nu], "restitution",
+                   f"ν = {nu:g}", (("o", "s", "^", "D")[k % 4], shade, LINES[k % 4]))  # fmt: skip
+    middle.set(xlabel="restitution α", ylabel="predicted standard error of α", yscale="log")
+    middle.set_title("0.1 collisions of a disc between frames", fontsize=10)
+    for noise, style in MARKERS.items():
+        rows = [row for row in over_intervals if row["noise"] == noise and "stderr" in row]
+        _draw_line(right, rows, "interval", noise, style)
+    right.set(xlabel="collisions of a disc between frames", xscale="log", yscale="log")
+    right.set_title("α = 0.6, ν = 0.6", fontsize=10)
+    for axes in (middle, right):
+        axes.legend(fontsize=8)
+    return figure
+
+
+def _draw_fits(axes: Axes, rows: list[dict]) -> None:
+    rows = [row for row in rows if "stderr" in row]
+    for noise, (marker, fill, _) in MARKERS.items():
+        these = [row for row in rows if row["noise"] == noise]
+        for of, shape, shift, words in (("stated", marker, 0.97, "stated"), ("off", "x", 1.03, "true")):
+            axes.errorbar(
+                [shift * row["stderr"] for row in these],
+                [row[of] / row["stderr"] for row in these],
+                xerr=[row["stderr_error"] for row in these],
+                yerr=[row[f"{of}_error"] / row["stderr"] for row in these],
+                fmt=shape if of == "stated" else ("x" if noise == "with velocities" else "+"),
+                color="black" if of == "stated" else "0.5",
+                markerfacecolor=fill if of == "stated" else None,
+                markersize=6,
+                linewidth=1,
+                label=f"{words}, {noise}",
+            )
+    axes.axhline(1, color="black", linewidth=0.8)
+    axes.set(xlabel="predicted standard error of α", ylabel="error of fits / predicted", xscale="log")
+    axes.set_ylim(0, None)
+    axes.set_title(f"{FITTED_FRAMES} frames of {GRAINS} discs", fontsize=10)
+    axes.legend(fontsize=8)
+
+
+def _draw_line(axes: Axes, rows: list[dict], along: str, label: str, style: tuple[str, str, str]) -> None:
+    marker, fill, line = style
+    axes.errorbar(
+        [row[along] for row in rows],
+        [row["stderr"] for row in rows],
+        yerr=[row["stderr_error"] for row in rows],
+        fmt=marker,
+        linestyle=line,
+        color="black" if fill == "white" else fill,
+        markerfacecolor=fill,
+        label=label,
+    )
