@@ -25,6 +25,7 @@ import jaxgran as jg
 from benchmarks.fit_coverage import spoilt, trajectories
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
+from jaxgran.plotting.log_axis import number_log_axis
 from jaxgran.sampling.prediction import kinetic_theory
 
 GRAINS, FITTED_FRAMES, FRAMES = 64, 50, 100
@@ -168,7 +169,9 @@ def picture(fits: list[dict], over_flows: list[dict], over_intervals: list[dict]
         _draw_line(right, rows, "interval", noise, style)
     right.set(xlabel="collisions of a disc between frames", xscale="log", yscale="log")
     right.set_title("α = 0.6, ν = 0.6", fontsize=10)
-    for axes in (middle, right):
+    for axis in (left.xaxis, middle.yaxis, right.xaxis, right.yaxis):
+        number_log_axis(axis, *axis.get_view_interval())
+    for axes in (left, middle, right):
         axes.legend(fontsize=8)
     return figure
 
@@ -177,24 +180,23 @@ def _draw_fits(axes: Axes, rows: list[dict]) -> None:
     rows = [row for row in rows if "stderr" in row]
     for noise, (marker, fill, _) in MARKERS.items():
         these = [row for row in rows if row["noise"] == noise]
-        for of, shape, shift, words in (("stated", marker, 0.97, "stated"), ("off", "x", 1.03, "true")):
+        cross = "x" if noise == "with velocities" else "+"
+        for of, form, color, shift in (("stated", marker, "black", 0.98), ("off", cross, "0.5", 1.02)):
             axes.errorbar(
                 [shift * row["stderr"] for row in these],
                 [row[of] / row["stderr"] for row in these],
                 xerr=[row["stderr_error"] for row in these],
                 yerr=[row[f"{of}_error"] / row["stderr"] for row in these],
-                fmt=shape if of == "stated" else ("x" if noise == "with velocities" else "+"),
-                color="black" if of == "stated" else "0.5",
-                markerfacecolor=fill if of == "stated" else None,
-                markersize=6,
+                fmt=form,
+                color=color,
+                markerfacecolor=fill,
                 linewidth=1,
-                label=f"{words}, {noise}",
+                label=f"{'stated' if of == 'stated' else 'true'}, {noise}",
             )
     axes.axhline(1, color="black", linewidth=0.8)
     axes.set(xlabel="predicted standard error of α", ylabel="error of fits / predicted", xscale="log")
-    axes.set_ylim(0, None)
+    axes.set_ylim(0, 1.5 * max((row["off"] + row["off_error"]) / row["stderr"] for row in rows))
     axes.set_title(f"{FITTED_FRAMES} frames of {GRAINS} discs", fontsize=10)
-    axes.legend(fontsize=8)
 
 
 def _draw_line(axes: Axes, rows: list[dict], along: str, label: str, style: tuple[str, str, str]) -> None:
