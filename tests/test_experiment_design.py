@@ -60,9 +60,8 @@ def test_error_falls_as_one_over_the_root_of_frames_and_grains() -> None:
 
 
 def test_error_grows_with_noise_and_with_what_is_not_seen() -> None:
-    errors = [expected(larger=larger).stderr for larger in (0.5, 1.0, 2.0)]
-    assert errors[0] < errors[1] < errors[2]
-    assert errors[2] / errors[0] == pytest.approx(4, rel=0.3)  # some collisions are no longer told from noise
+    assert expected(larger=2.0).stderr == pytest.approx(2 * expected().stderr, rel=0.2)  # some are lost in the noise
+    assert expected(larger=2.0).stderr > expected().stderr
     assert expected(missing=0.2).stderr > expected().stderr
 
 
