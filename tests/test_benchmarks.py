@@ -6,13 +6,15 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from observed import RESTITUTION, noisy, tracks
 
+import jaxgran as jg
 from benchmarks import __main__ as door
-from benchmarks import fit_map, fit_methods, fit_rivals, output, run_chart, timestep_study
+from benchmarks import fit_design, fit_map, fit_methods, fit_rivals, output, run_chart, timestep_study
 from benchmarks.output import Output
 from benchmarks.registry import BENCHMARKS
 
@@ -230,3 +232,38 @@ def test_charts_of_fits_show_every_point_with_a_result_and_no_other() -> None:
     drawn = {each.get_label(): each.lines[0].get_xdata().tolist() for each in frames.containers}
     assert drawn[name] == [20, 50] and drawn[other] == []
     assert interval.containers[0].lines[0].get_xdata().tolist() == [0.005]
+
+
+def test_design_is_compared_with_the_errors_that_fits_state_and_with_how_far_they_are_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Four fits, off by 2 of the errors that they state; a fifth one is refused."""
+    fits = [SimpleNamespace(restitution=0.5 + sign * 2e-3, stderr=1e-3, collisions=30) for sign in (1, -1, 1, -1)]
+    tracks = jg.Tracks(np.arange(2.0), np.ones(1), np.ones(1), *np.zeros((2, 2, 1, 2)), np.ones((2, 3)), 1.0)
+    found = iter([*fits, None] * 2)
+
+    def fitted(seen: jg.Tracks) -> SimpleNamespace:
+        fit = next(found)
+        if fit is None:
+            raise jg.InputError("tracks must show more.")
+        return fit
+
+    def expected(flow: jg.ShearFlow, frames: int, noise: jg.TrackNoise, **options) -> jg.FisherInformation:
+        if noise.velocity is None:
+            raise jg.InputError("nothing will be learnt.")
+        return jg.FisherInformation(1e6, 1e-3, 1e-4, 40.0, 0.5, options["frame_strain"], 0.1, 0.5, 0.5, 0.0)
+
+    monkeypatch.setattr(fit_design, "trajectories", lambda *given: [tracks] * 5)
+    monkeypatch.setattr(jg, "fit_restitution", fitted)
+    monkeypatch.setattr(jg, "fisher_information", expected)
+    rows = fit_design.fit_rows(0.5, 0.4, 0.1, 5)
+    for row in rows:
+        assert row["fits"] == 4
+        assert row["stated"] == pytest.approx(1e-3)
+        assert row["off"] == pytest.approx(2e-3)
+        assert row["off_error"] == pytest.approx(2e-3 / np.sqrt(8))
+    assert rows[1]["refused"] == "nothing will be learnt."
+    left, _, right = fit_design.picture(rows, rows, rows).axes
+    drawn = [bars.lines[0].get_xydata() for bars in left.containers]
+    np.testing.assert_allclose([y for line in drawn for _, y in line], [1, 2])  # over the prediction; one is refused
+    assert [len(bars.lines[0].get_xydata()) for bars in right.containers] == [1, 0]

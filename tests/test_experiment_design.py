@@ -84,7 +84,7 @@ MISTAKES = {
     "frame_strain must be a positive number": {"frame_strain": 0.0},
     "missing must be at least 0 and below 1": {"missing": 1.0},
     "key must be a random key": {"key": 3},
-    "nothing will be learnt at a frame_strain of 1, .* take one of about 0.0": {"frame_strain": 1.0},
+    "nothing will be learnt at a frame_strain of 1, .* take about 0.0": {"frame_strain": 1.0},
     "nothing will be learnt from 0 collisions, .* more frames, or less noise": {"frames": 2},
 }
 

@@ -36,6 +36,7 @@ from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.steady_state import prepare
 
 DEFAULT_COLLISIONS = 0.1  # of a disc from frame to frame, by Enskog's theory, where no time between them is given
+DEFAULT_STEP = 0.2  # diameters by which a disc moves at most in that time
 _GRAINS, _FRAMES = 64, 50  # of a simulated trajectory, at most
 _FEWEST_TRAJECTORIES, _MOST_TRAJECTORIES = 6, 12
 _ENOUGH = 300  # collisions; their information varies by about its mean, so it is then known to about a tenth
@@ -123,7 +124,8 @@ def fisher_information(
       flow: the discs to be followed, all ``grains`` of them.
       frames: number of frames.
       noise: errors of what is seen. Below 1e-5 diameters, or 1e-5 of the speed, it counts as 1e-5.
-      frame_strain: strain from frame to frame; None for the one in which a disc collides 0.1 times, by Enskog's theory.
+      frame_strain: strain from frame to frame; None for a short one, in which kinetic theory expects 0.1
+        collisions of a disc, and no step above 0.2 diameters.
       missing: probability with which a disc is not seen in a frame.
       key: JAX random key of the simulation and its noise; None for that of the seed 0.
 
@@ -181,25 +183,28 @@ def _expected(
     missing: float,
     key: Array,
 ) -> FisherInformation:
+    theory = jax.tree.map(lambda x: float(x[0]), predicted(jax.tree.map(np.atleast_1d, flow)))
+    rate, shear_rate = theory.collision_rate, float(flow.shear_rate)  # of a disc, in a unit of strain
+    crossing = 1 / np.sqrt(2 * theory.granular_temperature)  # time in which a disc moves by its diameter
+    short = float(min(DEFAULT_COLLISIONS / rate, DEFAULT_STEP * crossing * shear_rate))
+    frame_strain = short if frame_strain is None else float(frame_strain)
+    if frame_strain * rate > _HOPELESS:
+        raise InputError(_too_long(frame_strain, f"a disc collides {frame_strain * rate:.2g} times", short))
     key, of_noise = jax.random.split(key)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_noise)).tolist())
     state = prepare(flow, key)
-    crossing = 1 / float(np.sqrt(np.sum(state.velocities**2, axis=1).mean()))  # time in which a disc moves by one
-    exact = replace(flow, timestep=min(flow.timestep, _FINE * crossing), tolerance=min(flow.tolerance, _TOLERANCE))
-    rate = float(predicted(jax.tree.map(np.atleast_1d, flow)).collision_rate[0])  # of a disc, in a unit of strain
-    frame_strain = DEFAULT_COLLISIONS / rate if frame_strain is None else float(frame_strain)
-    if frame_strain * rate > _HOPELESS:
-        raise InputError(_too_long(frame_strain, f"a disc collides {frame_strain * rate:.2g} times", rate))
-    steps = max(1, round(frame_strain / (exact.shear_rate * exact.timestep)))
+    timestep = min(float(flow.timestep), _FINE * crossing)
+    exact = replace(flow, timestep=timestep, tolerance=min(float(flow.tolerance), _TOLERANCE))
+    steps = max(1, round(frame_strain / (shear_rate * timestep)))
     seen_frames, found, used = min(frames, _FRAMES), [], 0
     while len(found) < _FEWEST_TRAJECTORIES or (used < _ENOUGH and len(found) < _MOST_TRAJECTORIES):
         state, tracks, collisions = _tracks(exact, state, steps, seen_frames)
         seen = _spoilt(tracks, noise, missing, rng)
-        found.append(_found(seen, exact.restitution, noise, collisions, _step(tracks)))
+        found.append(_found(seen, float(exact.restitution), noise, collisions, _step(tracks)))
         used += found[-1].information.shape[1]
     step = float(np.mean([part.step for part in found]))
     if not step <= LONGEST_STEP:
-        raise InputError(_too_long(frame_strain, f"neighbouring discs move apart by {step:.2g} diameters", rate))
+        raise InputError(_too_long(frame_strain, f"neighbouring discs move apart by {step:.2g} diameters", short))
     return _joined(found, frames, seen_frames, grains / flow.grains, frame_strain, step)
 
 
@@ -239,11 +244,10 @@ def _joined(
     )
 
 
-def _too_long(frame_strain: float, meaning: str, rate: float) -> str:
+def _too_long(frame_strain: float, meaning: str, short: float) -> str:
     """What would help where frames are too far apart."""
     return (
-        f"nothing will be learnt at a frame_strain of {frame_strain:.2g}, in which {meaning}: take one of about "
-        f"{DEFAULT_COLLISIONS / rate:.1g}."
+        f"nothing will be learnt at a frame_strain of {frame_strain:.2g}, in which {meaning}: take about {short:.1g}."
     )
 
 
@@ -298,7 +302,7 @@ def _found(tracks: Tracks, restitution: float, noise: TrackNoise, collisions: fl
         return _Found(np.zeros((7, 0)), np.zeros(0, int), collisions, step)
     factors = np.exp(_CHANGE * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]))
     information = [
-        Collisions(second.seen, Noise(*(x * np.array(of_fit)))).fitted(restitution, second.unknowns, steps=1).curvature
+        Collisions(second.seen, Noise(*(x * np.array(of_fit)))).fitted(restitution, second.unknowns).curvature
         for x in factors
     ]
     return _Found(np.array(information), second.seen.window, collisions, step)
