@@ -306,8 +306,7 @@ BENCHMARKS = (
     Benchmark(
         "fit_design",
         "How well is the error of a restitution known before tracks are measured, and how far apart should frames be?",
-        (12, 1),
-        ("fit_design.json", "fit_design.png"),
+        (15, 1),
     ),
     Benchmark(
         "load",
