@@ -127,6 +127,8 @@ def fit_restitution(
         max(DIAMETER_NOISE if known["diameter_noise"] is None else known["diameter_noise"], LEAST_NOISE),
     )
     step = relative_step(flights)
+    if np.isnan(step):
+        raise InputError("tracks must show two discs or more in two frames that follow each other, and they do not.")
     if not step <= LONGEST_STEP:
         raise InputError(
             f"tracks must show discs that move by {LONGEST_STEP} diameters at most between frames, and neighbours "

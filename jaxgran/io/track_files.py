@@ -10,10 +10,11 @@ file                                   what it must hold
 =====================================  ===============================================================================
 
 Columns, in any order and in small or capital letters: ``frame`` (or ``time``), ``id`` (or ``particle``), ``x``, ``y``,
-``diameter`` or ``radius``; ``vx`` and ``vy`` and ``mass`` if they are known.
+``diameter`` or ``radius``; ``vx`` and ``vy`` and ``mass`` if they are known. A unit in brackets may follow a name.
 """
 
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,9 @@ from jaxgran.model.checks import InputError, require_whole, shown
 _NAMES = {
     "frame": ("frame", "step", "timestep"),
     "time": ("time", "t"),
-    "id": ("id", "particle", "track", "label"),
-    "x": ("x",),
-    "y": ("y",),
+    "id": ("particle", "track_id", "track", "id", "label"),  # where a tracker numbers what it found too, that is "id"
+    "x": ("x", "position_x"),
+    "y": ("y", "position_y"),
     "z": ("z",),
     "vx": ("vx",),
     "vy": ("vy",),
@@ -107,10 +108,17 @@ def read_tracks(
 def _csv_table(path: Path) -> Table:
     import pandas as pd
 
-    for separator in (",", r"\s+", ";"):
-        rows = pd.read_csv(path, sep=separator, comment="#", skipinitialspace=True)
-        if len(rows.columns) > 1:
-            break
+    forms = ((",", "."), (r"\s+", "."), (";", "."), (";", ","))  # the last of spreadsheets with a decimal comma
+    rows = pd.DataFrame()
+    try:
+        if "\0" in path.read_text(encoding="utf-8"):
+            raise InputError("it is not text in UTF-8")
+        for separator, decimal in forms:
+            rows = pd.read_csv(path, sep=separator, decimal=decimal, comment="#", skipinitialspace=True)
+            if len(rows.columns) > 1 and not (separator == ";" and rows.select_dtypes(exclude="number").columns.size):
+                break
+    except UnicodeError:
+        raise InputError("it is not text in UTF-8") from None
     return Table(_named({str(name): column.to_numpy() for name, column in rows.items()}))
 
 
@@ -129,12 +137,19 @@ def _columns_of(group: Any) -> dict[str, np.ndarray]:
     import h5py
 
     arrays = {name: entry for name, entry in group.items() if isinstance(entry, h5py.Dataset)}
-    inner = [entry for entry in group.values() if isinstance(entry, h5py.Group)]
+    inner = [entry for name, entry in group.items() if isinstance(entry, h5py.Group) and not name.startswith("_i_")]
+    names = set(arrays)
     if len(arrays) == 1 and next(iter(arrays.values())).dtype.names:
         rows = next(iter(arrays.values()))[()]
-        return {name: rows[name] for name in rows.dtype.names}
+        names = set(rows.dtype.names)
+        if "values_block_0" not in names:
+            return {name: rows[name] for name in rows.dtype.names}
     if not arrays and len(inner) == 1:
         return _columns_of(inner[0])
+    if "values_block_0" in names or "block0_values" in names:
+        raise InputError(
+            'it is a table of pandas without names: write it by to_hdf(…, format="table", data_columns=True)'
+        )
     return {name: np.asarray(entry[()]) for name, entry in arrays.items()}
 
 
@@ -144,7 +159,13 @@ def _lammps_table(path: Path) -> Table:
     except ImportError:
         raise InputError("pymatgen must be installed to read a dump of LAMMPS, by pip install pymatgen") from None
     parts, cells = [], []
-    for dump in parse_lammps_dumps(_escaped(path)):
+    try:
+        dumps = list(parse_lammps_dumps(_escaped(path)))
+    except (ValueError, LookupError, AttributeError, TypeError):  # whichever line it is that the library cannot take
+        raise InputError(
+            "it is not a text dump of LAMMPS, as dump custom writes it without dump_modify units or time"
+        ) from None
+    for dump in dumps:
         if len(dump.data) != dump.natoms or dump.natoms == 0 or dump.data.iloc[-1].isna().any():
             raise InputError(f"in time step {dump.timestep} the discs are not as many as it says, or there are none")
         columns = {str(name): column.to_numpy() for name, column in dump.data.items()}
@@ -226,7 +247,7 @@ def recorded_restitution(path: str | os.PathLike) -> float | None:
 
 def _named(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns by our names; an InputError in a few words where one that is needed is missing or has no numbers."""
-    by_name = {name.strip().lower(): column for name, column in columns.items()}
+    by_name = {re.split(r"[\[(]", name)[0].strip().lower(): column for name, column in columns.items()}  # x [mm]
     found = {}
     for name, others in _NAMES.items():
         given = next((by_name[other] for other in others if other in by_name), None)
@@ -234,7 +255,8 @@ def _named(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             found[name] = _numbers(name, np.asarray(given))
     for name in ("id", "x", "y"):
         if name not in found:
-            raise InputError(f"there is no column {name} among {', '.join(by_name)[:100]}")
+            others = ", ".join(other for other in _NAMES[name] if other != name)
+            raise InputError(f"there is no column {name} (or {others}) among {', '.join(by_name)[:100] or 'none'}")
     if "frame" not in found and "time" not in found:
         raise InputError(f"there is no column frame or time among {', '.join(by_name)[:100]}")
     if len({len(column) for column in found.values()}) > 1:
@@ -256,10 +278,19 @@ def _numbers(name: str, column: np.ndarray) -> np.ndarray:
     try:
         numbers = np.asarray(column, float)
     except (TypeError, ValueError):
-        raise InputError(f"the column {name} has something that is not a number") from None
+        raise InputError(f"the column {name} has {_first_word(column)}, which is not a number") from None
     if numbers.ndim != 1:
         raise InputError(f"the column {name} is not a list of numbers")
     return numbers
+
+
+def _first_word(column: np.ndarray) -> str:
+    """The first entry that is not a number, for a sentence."""
+    import pandas as pd
+
+    words = pd.Series(column.ravel())
+    word = words[pd.to_numeric(words, errors="coerce").isna() & words.notna()].iloc[0]
+    return shown((word.decode(errors="replace") if isinstance(word, bytes) else str(word))[:30])
 
 
 _READERS: dict[str, Callable[[Path], Table]] = {

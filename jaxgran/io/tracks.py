@@ -17,6 +17,7 @@ from jaxgran.model.state import State
 
 _LARGEST = 50_000_000  # entries of discs × frames; more do not fit into the memory of a small machine
 _SAME_TIME = (0.7, 1.4)  # of displacement over velocity × time, where both are in one unit
+_ONE_MASS = 1e-3  # by which the mass of a disc may differ from frame to frame; at more, it is none
 _LEAP = 5.0  # median displacements, above which a displacement is none
 _SAME_FRAME = 0.2  # of the shear that displacements have and velocities lack, over their rms difference across the cell
 
@@ -140,6 +141,8 @@ def tracks_of_table(table: Table, said: Observation, name: str) -> Tracks:
 
     positions, velocities = spread("x", "y"), spread("vx", "vy")
     positions[~np.isfinite(positions).all(axis=-1)] = np.nan
+    if not np.any(np.isfinite(positions)):
+        raise InputError(f"{name} has no disc with both x and y.")
     velocities[~(np.isfinite(velocities).all(axis=-1) & np.isfinite(positions[..., 0]))] = np.nan
     if not np.any(velocities[np.isfinite(velocities)]):  # a program that does not store them writes zeros
         velocities[:] = np.nan
@@ -150,8 +153,10 @@ def tracks_of_table(table: Table, said: Observation, name: str) -> Tracks:
         raise InputError(f"{name} has no column diameter or radius: give --diameter.")
     if not np.all(diameters > 0):
         raise InputError(f"{name} has a disc whose diameter is not a positive number.")
-    masses = _of_grain(spread("mass")[..., 0])
-    masses = masses if np.all(masses > 0) else np.full(len(ids), np.nan)
+    each_mass = spread("mass")[..., 0]
+    masses = _of_grain(each_mass)
+    off = np.abs(each_mass - masses) > _ONE_MASS * masses  # trackers call the brightness of a disc its mass
+    masses = masses if np.all(masses > 0) and not off.any() else np.full(len(ids), np.nan)
     cell = table.cells if table.cells is not None else np.tile([np.inf, np.inf, 0.0], (len(instants), 1))
     if clock == "time":
         if said.interval is not None:
