@@ -491,7 +491,7 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
     assert (outcome.status, outcome.err) == (0, "")
     rows = rows_of(outcome.out)
     assert rows["restitution ± standard error"] == "0.712 ± 0.010"
-    assert rows["95 % interval"] == "0.69 to 0.7331"
+    assert rows["95 % interval"] == "0.690 to 0.733"
     assert rows["recorded restitution"] == "0.7"
     assert rows["collisions, rejected"] == "123, 4"
     assert rows["noise of the velocities"] == "none given"

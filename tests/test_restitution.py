@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from observed import FRAMES, RESTITUTION, noisy, tracks, without_velocities
+from observed import FRAMES, GRAINS, RESTITUTION, noisy, tracks, without_velocities
 from synthetic import one_sentence
 
 from jaxgran.inference.collisions import flights_of
 from jaxgran.inference.restitution import fit_restitution
-from jaxgran.io.tracks import Tracks
+from jaxgran.io.tracks import Tracks, displacements
 from jaxgran.model.checks import InputError
 
 SEEN = {
@@ -107,6 +107,23 @@ def test_frames_may_be_left_out() -> None:
     parts = {name: getattr(seen, name)[kept] for name in ("time", "positions", "velocities", "cell")}
     fit = fit_restitution(replace(seen, **parts))
     assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
+
+
+def lasting_contacts(seen: Tracks, frames: int) -> Tracks:
+    """The same with means over some frames: a collision then takes as long as these."""
+    unwrapped = seen.positions[0] + np.concatenate([np.zeros((1, GRAINS, 2)), np.cumsum(displacements(seen), axis=0)])
+    mean = [np.mean([x[k : len(x) - frames + k] for k in range(frames)], axis=0) for x in (unwrapped, seen.velocities)]
+    whole = np.full_like(seen.cell[frames:], np.inf)
+    return replace(seen, time=seen.time[frames:], positions=mean[0], velocities=mean[1], cell=whole)
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["velocities", "positions_alone"])
+def test_contacts_that_outlast_a_frame_are_refused(known: bool) -> None:
+    """They would be taken for collisions of a small restitution."""
+    seen = tracks()
+    lasting = lasting_contacts(seen, 4)
+    with pytest.raises(InputError, match=r"contacts that are shorter .* or --every [3-9]"):
+        fit_restitution(lasting if known else without_velocities(lasting))
 
 
 def test_mismatched_ids_change_little() -> None:

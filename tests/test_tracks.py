@@ -146,6 +146,45 @@ def test_tracks_are_the_same_from_every_file(name: str, tmp_path: Path) -> None:
     assert abs(fit.restitution - RESTITUTION) < max(4 * fit.stderr, 1e-4) and fit.collisions > 15
 
 
+def same_tracks(path: Path, rows: pd.DataFrame, **options) -> None:
+    rows[["frame", "id", "x", "y", "diameter"]].to_csv(path.with_name("plain.csv"), index=False)
+    plain, read = read_tracks(path.with_name("plain.csv")), read_tracks(path, **options)
+    for name in ("time", "diameters", "masses", "positions"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(plain, name))
+
+
+def test_a_spreadsheet_with_decimal_commas_is_read(tmp_path: Path) -> None:
+    rows = rows_of(tracks()).drop(columns=["vx", "vy"])
+    rows.to_csv(tmp_path / "discs.csv", index=False, sep=";", decimal=",")
+    same_tracks(tmp_path / "discs.csv", rows)
+
+
+def test_units_may_follow_the_names(tmp_path: Path) -> None:
+    rows = rows_of(tracks()).drop(columns=["vx", "vy"])
+    rows.rename(columns={"x": "x [mm]", "y": "Y (mm)"}).to_csv(tmp_path / "discs.csv", index=False)
+    same_tracks(tmp_path / "discs.csv", rows)
+
+
+def test_the_brightness_that_trackpy_calls_mass_is_no_mass(tmp_path: Path) -> None:
+    """Its columns, of which mass, size, ecc, signal, raw_mass and ep say how a disc looks."""
+    rows = rows_of(tracks()).rename(columns={"id": "particle"})
+    brightness = np.random.default_rng(0).uniform(100, 900, len(rows))
+    looks = {"mass": brightness, "size": 2.1, "ecc": 0.1, "signal": 9.0, "raw_mass": 2 * brightness, "ep": 0.01}
+    rows[["y", "x", "frame", "particle", "diameter"]].assign(**looks).to_csv(tmp_path / "discs.csv")
+    same_tracks(tmp_path / "discs.csv", rows.rename(columns={"particle": "id"}))
+    rows.assign(mass=rows.diameter**2).to_csv(tmp_path / "weighed.csv")
+    np.testing.assert_allclose(read_tracks(tmp_path / "weighed.csv").masses, tracks().diameters ** 2)
+
+
+def test_frames_are_left_out(tmp_path: Path) -> None:
+    write_dump(tmp_path / "flow.dump", tracks())
+    every, third = read_tracks(tmp_path / "flow.dump"), read_tracks(tmp_path / "flow.dump", every=3)
+    np.testing.assert_array_equal(third.positions, every.positions[::3])
+    np.testing.assert_array_equal(third.time, every.time[::3])
+    with pytest.raises(InputError, match="every must be less than the number of frames, 60 in 'flow.dump', not 60"):
+        read_tracks(tmp_path / "flow.dump", every=60)
+
+
 def test_time_between_frames_is_that_of_the_displacements(tmp_path: Path) -> None:
     """Those of discs that do not collide in between, so that the time of exact tracks is exact."""
     for seen, precision in ((tracks(), 1e-6), (noisy(tracks(), 1e-5, 0.01), 2e-3)):
@@ -371,6 +410,7 @@ def test_broken_or_foreign_file_is_one_sentence_and_status_2(name: str, tmp_path
         "--frame-strain 0.1 --frame-time 1": "--frame-strain goes without --frame-time",
         "--frame-strain 0.1 --shear-rate 0": "--shear-rate must be positive beside a strain",
         "--peculiar": "--peculiar goes with a shear rate",
+        "--every 0": "--every must be a whole number of at least 1, not 0",
         "--diameter -1": "--diameter must be a positive number",
         "--position-noise -1": "--position-noise must be a number of at least 0",
         "--pressure 3": "--pressure goes with a map, and 'discs.csv' is not one",

@@ -1,8 +1,8 @@
 """What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages of its root.
 
-Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders,
-``charts/architecture.svg``, is made from the imports of the code at every build. ``charts/paper.html``, the paper's map
-as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
+Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site, and the file of tracked discs
+from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
+``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
 the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{BENCHMARKS}`` for the table of
 ``benchmarks/registry.py``.
 """
@@ -39,6 +39,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, f"notebooks/{name}.md", content=markdown))
         for file, content in beside.items():
             files.append(File.generated(config, f"notebooks/{file}", content=content))
+    discs = ROOT / "notebooks" / "tracked_discs.csv"
+    files.append(File.generated(config, f"how-to/{discs.name}", abs_src_path=str(discs)))
     for page, source in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     return files

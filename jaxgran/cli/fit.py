@@ -114,9 +114,10 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
         stop(str(failure), BAD_STATUS)
     recorded = recorded_restitution(file)
     frames, grains = tracks.positions.shape[:2]
+    digits = 1 - math.floor(math.log10(found.stderr))  # those that an end of the interval is found to
     rows = [
         ["restitution ± standard error", with_error(found.restitution, found.stderr)],
-        ["95 % interval", f"{found.low:.5g} to {found.high:.5g}"],
+        ["95 % interval", f"{found.low:.{digits}f} to {found.high:.{digits}f}"],
         *([["recorded restitution", f"{recorded:g}"]] if recorded is not None else []),
         ["frames, discs", f"{frames}, {grains}"],
         ["collisions, rejected", f"{found.collisions}, {found.rejected}"],

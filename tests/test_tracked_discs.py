@@ -1,0 +1,78 @@
+"""The file of tracked discs is what its command makes, and the page about it shows what the fit prints."""
+
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from command_line import jaxgran
+
+from benchmarks.output import RESULTS
+from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
+
+ROOT = Path(__file__).parents[1]
+FILE = ROOT / "notebooks" / "tracked_discs.csv"
+PAGE = (ROOT / "docs" / "how-to" / "tracked-discs.md").read_text(encoding="utf-8")
+FITS = re.findall(r"^\| `jaxgran (fit \w+\.csv[^`]*)` \| ([^|]+) \| ([^|]+) \| (\d+) \|$", PAGE, re.MULTILINE)
+
+
+def differenced() -> pd.DataFrame:
+    """Velocities from the positions of the frames before and after, where the disc is seen in both."""
+    seen = pd.read_csv(FILE).sort_values(["id", "frame"])
+    of_disc = seen.groupby("id")
+    during = (of_disc.frame.shift(-1) - of_disc.frame.shift(1)) / RATE
+    for name in ("x", "y"):
+        seen[f"v{name}"] = (of_disc[name].shift(-1) - of_disc[name].shift(1)) / during
+    return seen.dropna()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tracked")
+    (folder / FILE.name).write_bytes(FILE.read_bytes())
+    pd.read_csv(FILE).drop(columns=["vx", "vy"]).to_csv(folder / "positions.csv", index=False)
+    differenced().to_csv(folder / "differenced.csv", index=False)
+    return folder
+
+
+@pytest.mark.kernels
+def test_the_command_makes_the_same_bytes() -> None:
+    assert FILE.stat().st_size < 300_000
+    assert FILE.read_bytes() == ("\n".join(rows(FRAMES)) + "\n").encode()
+
+
+def test_the_page_shows_the_file_and_what_the_fit_prints(folder: Path) -> None:
+    shown = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
+    printed = jaxgran(folder, "fit", FILE.name).out
+    assert [line.strip() for line in shown[0].splitlines()] == [x.strip() for x in printed.splitlines() if x.strip()]
+    assert FILE.read_text(encoding="utf-8").startswith(shown[1])
+
+
+@pytest.mark.parametrize("row", FITS, ids=lambda row: row[0])
+def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -> None:
+    command, *numbers = row
+    printed = jaxgran(folder, *command.split()).out
+    assert all(number in printed for number in numbers[:2]) and f" {numbers[2]}, " in printed
+    low, high = map(float, numbers[1].split(" to "))
+    assert low <= RESTITUTION <= high
+
+
+def test_all_fits_of_the_page_are_tested() -> None:
+    assert len(FITS) == 5
+
+
+def test_the_page_shows_the_fits_of_dumps_of_lammps() -> None:
+    result = json.loads((RESULTS / "fit_lammps.json").read_text(encoding="utf-8"))
+    for row in result["rows"]:
+        for name, of in row["fits"].items():
+            told = "refused" if "bias" not in of else f"{1e3 * of['bias']:.2f} ± {1e3 * of['bias_stderr']:.2f}"
+            held = "–" if "bias" not in of else f"{of['held']} of {of['fits']}"
+            assert f"| {row['contact_over_frame']:.2g} | {words(name)} | {told.replace('-', '−')} | " in PAGE
+            assert f" | {held} |" in PAGE
+
+
+def words(name: str) -> str:
+    options = name.removesuffix(", positions alone")
+    shown = f"`{options}`" if options else "none"
+    return shown + (", positions alone" if options != name else "")
