@@ -113,7 +113,7 @@ def lasting_contacts(seen: Tracks, frames: int) -> Tracks:
     """The same with means over some frames: a collision then takes as long as these."""
     unwrapped = seen.positions[0] + np.concatenate([np.zeros((1, GRAINS, 2)), np.cumsum(displacements(seen), axis=0)])
     mean = [np.mean([x[k : len(x) - frames + k] for k in range(frames)], axis=0) for x in (unwrapped, seen.velocities)]
-    whole = np.full_like(seen.cell[frames:], np.inf)
+    whole = np.tile([np.inf, np.inf, 0.0], (len(seen.time) - frames, 1))
     return replace(seen, time=seen.time[frames:], positions=mean[0], velocities=mean[1], cell=whole)
 
 

@@ -181,7 +181,7 @@ def test_frames_are_left_out(tmp_path: Path) -> None:
     every, third = read_tracks(tmp_path / "flow.dump"), read_tracks(tmp_path / "flow.dump", every=3)
     np.testing.assert_array_equal(third.positions, every.positions[::3])
     np.testing.assert_array_equal(third.time, every.time[::3])
-    with pytest.raises(InputError, match="every must be less than the number of frames, 60 in 'flow.dump', not 60"):
+    with pytest.raises(InputError, match=r"every must be less than .*, 60 in 'flow\.dump', not 60"):
         read_tracks(tmp_path / "flow.dump", every=60)
 
 

@@ -286,11 +286,13 @@ def _numbers(name: str, column: np.ndarray) -> np.ndarray:
 
 def _first_word(column: np.ndarray) -> str:
     """The first entry that is not a number, for a sentence."""
-    import pandas as pd
-
-    words = pd.Series(column.ravel())
-    word = words[pd.to_numeric(words, errors="coerce").isna() & words.notna()].iloc[0]
-    return shown((word.decode(errors="replace") if isinstance(word, bytes) else str(word))[:30])
+    for entry in column.ravel():
+        word = entry.decode(errors="replace") if isinstance(entry, bytes) else str(entry)
+        try:
+            float(word)
+        except ValueError:
+            return shown(word[:30])
+    return "something"
 
 
 _READERS: dict[str, Callable[[Path], Table]] = {
