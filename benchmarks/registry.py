@@ -287,7 +287,8 @@ BENCHMARKS = (
     Benchmark(
         "fit_lammps",
         "Is the restitution of soft discs that LAMMPS has moved found from its dump?",
-        (6, 1),
+        (10, 1),
+        ("fit_lammps.json",),
     ),
     Benchmark(
         "fit_map",

@@ -1,5 +1,6 @@
 """The file of tracked discs is what its command makes, and the page about it shows what the fit prints."""
 
+import json
 import re
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pandas as pd
 import pytest
 from command_line import jaxgran
 
+from benchmarks.output import RESULTS
 from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 
 ROOT = Path(__file__).parents[1]
@@ -58,3 +60,19 @@ def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -
 
 def test_all_fits_of_the_page_are_tested() -> None:
     assert len(FITS) == 5
+
+
+def test_the_page_shows_the_fits_of_dumps_of_lammps() -> None:
+    result = json.loads((RESULTS / "fit_lammps.json").read_text(encoding="utf-8"))
+    for row in result["rows"]:
+        for name, of in row["fits"].items():
+            told = "refused" if "bias" not in of else f"{1e3 * of['bias']:.2f} ± {1e3 * of['bias_stderr']:.2f}"
+            held = "–" if "bias" not in of else f"{of['held']} of {of['fits']}"
+            assert f"| {row['contact_over_frame']:.2g} | {words(name)} | {told.replace('-', '−')} | " in PAGE
+            assert f" | {held} |" in PAGE
+
+
+def words(name: str) -> str:
+    options = name.removesuffix(", positions alone")
+    shown = f"`{options}`" if options else "none"
+    return shown + (", positions alone" if options != name else "")
