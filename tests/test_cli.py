@@ -499,6 +499,10 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
     np.testing.assert_array_equal(tracks.time, recorded.strain)
     np.testing.assert_array_equal(tracks.positions, recorded.state.positions)
     assert noise == {"position_noise": None, "velocity_noise": 1e-3, "diameter_noise": None}
+    found.rejected = 123
+    outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
+    assert outcome.status == 0 and rows_of(outcome.out)["collisions, rejected"] == "123, 123"
+    assert outcome.err.startswith("caution: the interval may not hold, as 123 changes of velocity were left out")
 
 
 def test_fit_that_fails_has_a_status_of_its_own(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,6 +126,34 @@ def test_contacts_that_outlast_a_frame_are_refused(known: bool) -> None:
         fit_restitution(lasting if known else without_velocities(lasting))
 
 
+def test_collisions_outside_of_their_noise_are_refused() -> None:
+    """All discs have collided between two frames, so that no track is straight and no noise can be measured."""
+    seen = noisy(tracks(strain=59 * 0.3), 1e-4, 0.01)
+    parts = {name: getattr(seen, name)[:12] for name in ("time", "positions", "velocities", "cell")}
+    with pytest.raises(InputError, match="more frames in the same time") as refused:
+        fit_restitution(replace(seen, **parts))
+    assert one_sentence(str(refused.value))
+
+
+def test_discs_of_several_restitutions_are_told() -> None:
+    """Three flows side by side: whichever restitution is found, most collisions are of another one."""
+    flows = [noisy(tracks(alpha), 1e-4, 0.01) for alpha in (0.3, 0.6, 0.95)]
+    positions = [seen.positions + np.array([20.0 * k, 0]) for k, seen in enumerate(flows)]
+    together = Tracks(
+        flows[0].time,
+        np.concatenate([seen.diameters for seen in flows]),
+        np.concatenate([seen.masses for seen in flows]),
+        np.concatenate(positions, axis=1),
+        np.concatenate([seen.velocities for seen in flows], axis=1),
+        np.tile([np.inf, np.inf, 0.0], (FRAMES, 1)),
+        0.0,
+    )
+    with pytest.warns(UserWarning, match=r"the interval may not hold, as .* not all alike") as told:
+        fit = fit_restitution(together)
+    assert fit.rejected >= fit.collisions
+    assert one_sentence(str(told[0].message))
+
+
 def test_mismatched_ids_change_little() -> None:
     """In a tenth of the frames two near discs have each other's id."""
     seen = noisy(tracks(), 1e-4, 0.01)

@@ -1,6 +1,7 @@
 """The command ``fit``: the restitution of discs from their tracks, or a closure fitted to a map."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -8,7 +9,7 @@ import numpy as np
 import typer
 
 from jaxgran.cli.tables import Table, print_table
-from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, stop
+from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say, stop
 from jaxgran.model.checks import InputError, require_number, shown
 from jaxgran.model.display import with_error
 
@@ -104,12 +105,14 @@ def _observed(
 
 def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
     require_device()
-    from jaxgran.inference.restitution import fit_restitution
+    from jaxgran.inference.restitution import caution, fit_restitution
     from jaxgran.io.track_files import read_tracks, recorded_restitution
 
     tracks = read_tracks(file, **observed)
     try:
-        found = fit_restitution(tracks, **noise)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "the interval may not hold")  # it is said below
+            found = fit_restitution(tracks, **noise)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)
     recorded = recorded_restitution(file)
@@ -130,6 +133,8 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
         ["misfit over the noise", f"{found.misfit:.2g}"],
     ]
     print_table(Table("", ("of the tracks", "value"), rows, numbers=False))
+    if words := caution(found):
+        say(f"caution: {words}")
 
 
 def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:

@@ -17,6 +17,7 @@ Sources: W. A. Fuller, Measurement Error Models (1987), chapter 3; S. A. Murphy 
 Assoc. 95, 449 (2000), on profile likelihood.
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -44,6 +45,7 @@ TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the
 DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
 LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
 LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
+_LARGEST_MISFIT = 9.0  # above it, the noise that was measured or given is a third of what it would have to be
 _LASTING = (0.22, 0.4)  # share of lasting changes without and with velocities; hard discs in clusters have half of it
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
 _MOST_STEPS = 50
@@ -102,11 +104,12 @@ def fit_restitution(
       diameter_noise: standard error of the distance at contact, which two diameters share; None to estimate it.
 
     Returns:
-      The restitution with its standard error and its 95 % interval.
+      The restitution with its standard error and its 95 % interval. A warning says where the interval may not hold:
+      more changes of velocity were left out than used.
 
     Raises:
-      InputError: (a ValueError) too few collisions can be told from the noise, or contacts outlast the time between
-        frames; the message says what would help.
+      InputError: (a ValueError) too few collisions can be told from the noise, they are outside of it, or contacts
+        outlast the time between frames; the message says what would help.
       RuntimeError: the restitution does not settle.
     """
     if not isinstance(tracks, Tracks):
@@ -149,8 +152,13 @@ def fit_restitution(
             noise = noise._replace(diameter=_diameter_noise(best, noise.diameter))
         struck = struck_windows(best.collisions, best.fitted, best.used, *flights.positions.shape[:2])
         best = _found(flights, noise, struck)
+        if best.misfit > _LARGEST_MISFIT:
+            raise InputError(
+                f"tracks must show collisions within their noise, and misfit it by a factor of {best.misfit:.2g}: take "
+                "more frames in the same time, or give the noise if it is known."
+            )
         low, high = _interval(best)
-    return RestitutionFit(
+    fit = RestitutionFit(
         restitution=best.restitution,
         stderr=best.stderr,
         low=low,
@@ -161,6 +169,19 @@ def fit_restitution(
         velocity_noise=noise.velocity * length / duration if np.isfinite(noise.velocity) else np.nan,
         diameter_noise=noise.diameter * length,
         misfit=best.misfit,
+    )
+    if words := caution(fit):
+        warnings.warn(words, stacklevel=2)
+    return fit
+
+
+def caution(fit: RestitutionFit) -> str | None:
+    """What to know of an interval that may not hold; None where nothing speaks against it."""
+    if fit.rejected < fit.collisions:
+        return None
+    return (
+        f"the interval may not hold, as {fit.rejected} changes of velocity were left out and {fit.collisions} used: "
+        "discs collide in clusters, or not all alike. Take more frames in the same time, or give a larger noise."
     )
 
 
