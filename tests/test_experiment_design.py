@@ -48,6 +48,7 @@ def test_error_of_fits_is_predicted() -> None:
     assert 0.5 < predicted.usable <= 1
 
 
+@pytest.mark.slow
 def test_error_falls_as_one_over_the_root_of_frames_and_grains() -> None:
     """From 60 frames on, apart from the first and the last ones; a part of these is simulated."""
     few, many = expected(FRAMES), expected(100 * FRAMES)
@@ -65,14 +66,19 @@ def test_error_grows_with_noise_and_with_what_is_not_seen() -> None:
     assert expected(missing=0.2).stderr > expected().stderr
 
 
+@pytest.mark.slow
+def test_shares_are_the_derivatives_by_the_noise() -> None:
+    better = jg.fisher_information(FLOW, 24, jg.TrackNoise(POSITION, 0.9 * velocity_noise()), frame_strain=FRAME_STRAIN)
+    found = expected()
+    assert np.log(better.stderr / found.stderr) == pytest.approx(np.log(0.9) * found.velocity_share, abs=0.03)
+
+
 def test_shares_say_what_better_measurements_would_help() -> None:
     """The variance is of first degree in those of the noise, so that its logarithmic derivatives add up to one."""
     found = expected()
     assert found.position_share + found.velocity_share + found.diameter_share == pytest.approx(1, abs=1e-3)
     assert min(found.position_share, found.velocity_share) > 0
     assert found.diameter_share == pytest.approx(0, abs=1e-3)
-    better = jg.fisher_information(FLOW, 24, jg.TrackNoise(POSITION, 0.9 * velocity_noise()), frame_strain=FRAME_STRAIN)
-    assert np.log(better.stderr / found.stderr) == pytest.approx(np.log(0.9) * found.velocity_share, abs=0.03)
 
 
 NOISE = jg.TrackNoise(1e-3)
