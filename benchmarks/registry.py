@@ -307,7 +307,9 @@ BENCHMARKS = (
     Benchmark(
         "fit_design",
         "How well is the error of a restitution known before tracks are measured, and how far apart should frames be?",
-        (15, 1),
+        (6, 1),
+        ("fit_design.json", "fit_design.png"),
+        one_core=True,
     ),
     Benchmark(
         "load",
