@@ -70,7 +70,7 @@ def automatic_timestep(
 def automatic_tolerance(target_error: float) -> float:
     """Loosest tolerance for which the stress error of a contact solve is at most half the target.
 
-    In contact networks of flows the relative stress error of one solve is up to 60 times its relative residual. Over a
+    In contact networks of flows 98 % of the solves have a relative stress error of up to 34 times the residual. Over a
     run these errors mostly cancel, so this choice is on the safe side.
     """
     return float(np.clip(target_error / 70, 1e-10, 1e-2))
