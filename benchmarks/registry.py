@@ -277,7 +277,9 @@ BENCHMARKS = (
         "fit_coverage",
         "How often do 95 % intervals of a restitution fitted to tracks hold, at which noise?",
         (40, 1.5),
-        options=(Option("--runs", "number of trajectories", int),),
+        ("fit_coverage.json",),
+        (Option("--runs", "number of trajectories", int),),
+        one_core=True,
     ),
     Benchmark(
         "tracked_discs",

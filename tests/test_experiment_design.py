@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 
-import jax
 import numpy as np
 import pytest
 from observed import FRAMES, STRAIN, noisy, tracks
@@ -112,11 +111,3 @@ def test_noise_that_cannot_be_is_one_sentence(name: str) -> None:
     with pytest.raises(jg.InputError, match=f"^{name} must be a number of at least 0") as refused:
         jg.TrackNoise(**{"position": 1e-3, name: -1.0})
     assert one_sentence(str(refused.value))
-
-
-def test_traced_flow_is_refused() -> None:
-    def error(restitution: jax.Array) -> float:
-        return jg.fisher_information(jg.ShearFlow(64, restitution, 0.5, 1e-3), 24, NOISE).stderr
-
-    with pytest.raises(jg.InputError, match=r"^fisher_information is not transformed"):
-        jax.jit(error)(0.6)

@@ -66,6 +66,7 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
         np.arange(2.0), jax.tree.map(lambda y: y[None] * x, state)
     ),
     "fit_restitution": lambda x, _: jg.fit_restitution(jg.Tracks(*[x] * 7)),
+    "fisher_information": lambda x, _: jg.fisher_information(replace(FLOW, restitution=x), 20, jg.TrackNoise(1e-3)),
     "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
     "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].errors(),
     "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
@@ -73,7 +74,7 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 
 # Classes, and what takes datasets and files.
 WITHOUT_ARRAYS = {
-    *("ContactNetwork", "ContactResiduals", "ContactSolution", "DelassusProblem"),
+    *("ContactNetwork", "ContactResiduals", "ContactSolution", "DelassusProblem", "FisherInformation", "TrackNoise"),
     *("Closure", "Cooling", "Fields", "Grains", "InputError", "RestitutionFit", "ShearFlow", "Snapshot", "State"),
     *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
     *(
