@@ -295,7 +295,7 @@ BENCHMARKS = (
     Benchmark(
         "fit_map",
         "In which flows do the intervals of a fitted restitution hold, and where do clusters spoil them?",
-        (14, 1),
+        (12, 1),
         ("fit_map.json", "fit_map.png"),
         one_core=True,
     ),
