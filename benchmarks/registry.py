@@ -302,7 +302,7 @@ BENCHMARKS = (
     Benchmark(
         "fit_methods",
         "How well, and how fast, do other methods find a restitution from the same tracks?",
-        (9, 1),
+        (6, 1),
         ("fit_methods.json", "fit_methods.png"),
         one_core=True,
     ),
