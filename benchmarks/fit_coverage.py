@@ -1,6 +1,6 @@
 """How often do the intervals of a fitted restitution hold? 100 trajectories of tracked discs for each noise.
 
-    python -m benchmarks fit_coverage           # all noises at one restitution, some at two more; an hour
+    python -m benchmarks fit_coverage           # all noises at one restitution, some at two more; 40 minutes
     python -m benchmarks fit_coverage --quick   # one restitution, ten trajectories; --runs 40 for another number
 
 The trajectories are made by the event-driven reference, which shares no code with the fit: N = 64, ν = 0.6, 100 frames
@@ -62,11 +62,15 @@ def observed(discs: Discs, law: Law, frames: int = FRAMES, strain: float = STRAI
     return discs, jg.Tracks(times, 2 * discs.radii, discs.masses, *arrays, law.shear_rate)
 
 
+def peculiar(seen: jg.Tracks) -> np.ndarray:
+    """Velocities less those of the shear, at γ̇ = 1."""
+    return seen.velocities - np.stack([seen.positions[..., 1], 0 * seen.positions[..., 1]], axis=-1)
+
+
 def spoilt(seen: jg.Tracks, velocity: float | None, position: float, missing: float, seed: int) -> jg.Tracks:
     """Tracks with noise."""
     rng = np.random.default_rng([SEED, seed])
-    peculiar = seen.velocities - np.stack([seen.positions[..., 1], 0 * seen.positions[..., 1]], axis=-1)
-    error = np.nan if velocity is None else velocity * np.sqrt(np.mean(peculiar**2))
+    error = np.nan if velocity is None else velocity * np.sqrt(np.mean(peculiar(seen) ** 2))
     positions = seen.positions + position * rng.normal(size=seen.positions.shape)
     velocities = seen.velocities + error * rng.normal(size=seen.positions.shape)
     unseen = rng.random(seen.positions.shape[:2]) < missing

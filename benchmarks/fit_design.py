@@ -1,6 +1,6 @@
 """How well does ``fisher_information`` know the error of a fit before tracks are measured?
 
-    python -m benchmarks fit_design           # 15 minutes
+    python -m benchmarks fit_design           # 6 minutes
     python -m benchmarks fit_design --quick   # one flow, fewer points: a minute
 
 Left: the error that is predicted beside that of fits to tracks of the event-driven reference, which shares no code with
@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from benchmarks.fit_coverage import spoilt, trajectories
+from benchmarks.fit_coverage import peculiar, spoilt, trajectories
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.log_axis import number_log_axis
@@ -107,7 +107,7 @@ def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
     """Predictions, and fits to trajectories, with each noise."""
     strain = interval / theory(alpha, nu)[0] * (FITTED_FRAMES - 1)
     tracks = trajectories(alpha, runs, nu, FITTED_FRAMES, strain)
-    speed = np.sqrt(np.mean([(seen.velocities - shear(seen)) ** 2 for seen in tracks]))
+    speed = np.sqrt(np.mean([peculiar(seen) ** 2 for seen in tracks]))
     rows = []
     for noise, (velocity, position) in NOISES.items():
         fits = []
@@ -133,11 +133,6 @@ def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
         )
         rows.append(row)
     return rows
-
-
-def shear(seen: jg.Tracks) -> np.ndarray:
-    """The velocity of the shear at each disc."""
-    return np.stack([seen.positions[..., 1], 0 * seen.positions[..., 1]], axis=-1)
 
 
 def sentence(row: dict) -> str:

