@@ -10,10 +10,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import h5netcdf
 import h5py
 import jax
 import jax.numpy as jnp
+import netCDF4
 import numpy as np
 import pytest
 import xarray as xr
@@ -479,7 +479,7 @@ def test_a_dataset_that_is_no_map_is_refused_by_every_figure(kind: str, tmp_path
 
 @pytest.mark.parametrize("kind", NO_MAPS)
 def test_a_file_that_is_no_map_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
-    NO_MAPS[kind].to_netcdf(tmp_path / "no.nc", engine="h5netcdf")
+    NO_MAPS[kind].to_netcdf(tmp_path / "no.nc", engine="netcdf4")
     for words in (["plot", "no.nc"], ["map", "--like", "no.nc"]):
         outcome = jaxgran(tmp_path, *words)
         assert_one_sentence(outcome)
@@ -488,7 +488,7 @@ def test_a_file_that_is_no_map_is_refused_and_nothing_drawn(kind: str, tmp_path:
 
 
 def whole_map(folder: Path) -> bytes:
-    ratio_dataset(alphas=2, nus=2).to_netcdf(folder / "whole.nc", engine="h5netcdf")
+    ratio_dataset(alphas=2, nus=2).to_netcdf(folder / "whole.nc", engine="netcdf4")
     content = (folder / "whole.nc").read_bytes()
     (folder / "whole.nc").unlink()
     return content
@@ -501,10 +501,10 @@ def other_hdf5(path: Path) -> None:
 
 
 def other_netcdf(path: Path) -> None:
-    with h5netcdf.File(path, "w") as file:
-        file.dimensions = {"time": 3}
-        file.create_variable("time", ("time",), float)[:] = [1e300, np.nan, -1.0]
-        file.variables["time"].attrs["units"] = "days since never"
+    with netCDF4.Dataset(path, "w") as file:
+        file.createDimension("time", 3)
+        file.createVariable("time", float, ("time",))[:] = [1e300, np.nan, -1.0]
+        file.variables["time"].units = "days since never"
 
 
 GARBAGE: dict[str, Callable[[Path], Any]] = {
@@ -563,7 +563,7 @@ ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until 
 def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any, tmp_path: Path) -> None:
     data = ratio_dataset(alphas=2, nus=2)
     attrs = {"restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE}
-    data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="h5netcdf")
+    data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
     outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
     assert name in outcome.err
@@ -575,7 +575,7 @@ def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, t
     data = ratio_dataset(alphas=2, nus=2)
     attrs = {**data.attrs, **ALIKE}
     del attrs[missing]
-    data.drop_attrs(deep=False).assign_attrs(attrs).to_netcdf(tmp_path / "old.nc", engine="h5netcdf")
+    data.drop_attrs(deep=False).assign_attrs(attrs).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
     outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
     assert missing in outcome.err
@@ -642,7 +642,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
 
 @pytest.mark.parametrize("folder", ["file.txt", "file.txt/new", "n" * 300])
 def test_figures_need_a_folder(folder: str, tmp_path: Path) -> None:
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     (tmp_path / "file.txt").write_text("no folder")
     outcome = jaxgran(tmp_path, "plot", "map.nc", f"--output={folder}")
     assert_one_sentence(outcome)
@@ -651,7 +651,7 @@ def test_figures_need_a_folder(folder: str, tmp_path: Path) -> None:
 
 
 def test_a_picture_that_is_a_folder_stops_plot_in_one_sentence(tmp_path: Path) -> None:
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     (tmp_path / "map_curves.png").mkdir()
     assert_one_sentence(jaxgran(tmp_path, "plot", "map.nc"))
     assert files(tmp_path) == {"map.nc", "map_curves.png"}
@@ -659,7 +659,7 @@ def test_a_picture_that_is_a_folder_stops_plot_in_one_sentence(tmp_path: Path) -
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_path: Path) -> None:
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     tmp_path.chmod(0o500)
     try:
         for words in (["plot", "map.nc"], ["map", "--output", "new.nc"], [*RUN, "--output", "new.nc"]):
@@ -678,7 +678,7 @@ def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     monkeypatch.setattr(os, "replace", full)
     outcome = jaxgran(tmp_path, "plot", "map.nc")
     assert (outcome.status, outcome.err) == (1, "jaxgran: stopped by the file system, No space left on device.\n")

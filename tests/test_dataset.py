@@ -268,7 +268,7 @@ def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) 
         path.touch()
     elif kind == "truncated":
         write_dataset(few, path)
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        path.write_bytes(path.read_bytes()[:4000])  # HDF5 leaves room at the end
     elif kind == "flipped":
         write_dataset(few, path)
         content = bytearray(path.read_bytes())
@@ -276,7 +276,7 @@ def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) 
             content[place % len(content)] ^= 4
         path.write_bytes(content)
     elif kind == "other":
-        xr.Dataset({"temperature": ("x", np.arange(3.0))}).to_netcdf(path, engine="h5netcdf")
+        xr.Dataset({"temperature": ("x", np.arange(3.0))}).to_netcdf(path, engine="netcdf4")
     with pytest.raises(ValueError, match=r"file\.nc") as caught:
         read_dataset(path)
     assert one_sentence(str(caught.value))
@@ -284,7 +284,7 @@ def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) 
 
 def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(few, tmp_path: Path) -> None:
     path, rng = tmp_path / "map.nc", np.random.default_rng(0)
-    few.to_netcdf(path, engine="h5netcdf")
+    few.to_netcdf(path, engine="netcdf4")
     assert read_dataset(path).equals(few)
     write_dataset(few, path)
     whole = path.read_bytes()

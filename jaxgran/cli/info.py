@@ -10,7 +10,7 @@ from jaxgran.caches import obstacle, users_folder
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
-_PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "h5netcdf", "gsd", "matplotlib")
+_PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "netCDF4", "gsd", "matplotlib")
 _SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # first letters of environment variables that change runs
 
 

@@ -161,10 +161,10 @@ def plot_command(
 ) -> None:
     from jaxgran.maps.output import remove_pictures
     from jaxgran.maps.results import read_dataset
-    from jaxgran.plotting.map_figures import DRAWN, require_file, save_figures
+    from jaxgran.plotting.map_figures import require_file, save_figures
 
     require_file(format, dpi)
-    data = read_dataset(file, only=DRAWN)
+    data = read_dataset(file)
     folder = file.parent if output is None else output
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

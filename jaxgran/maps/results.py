@@ -6,14 +6,10 @@ first, as the HDF5 library can wait forever in a damaged file. Files of other pr
 
 import hashlib
 import os
-from collections.abc import Collection
 from dataclasses import fields
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5netcdf
-import h5py
 import numpy as np
 import xarray as xr
 
@@ -31,27 +27,21 @@ _DIGEST = hashlib.sha256().digest_size  # bytes
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
-    content = BytesIO()
     known = {name: {"_FillValue": None} for name in data.coords}  # CF: a coordinate has no missing values
-    data.to_netcdf(content, engine="h5netcdf", encoding=known)
+    content = bytes(data.to_netcdf(engine="netcdf4", encoding=known))
     with replaced(path) as temporary:
-        temporary.write_bytes(content.getvalue() + _MARK + hashlib.sha256(content.getbuffer()).digest())
+        temporary.write_bytes(content + _MARK + hashlib.sha256(content).digest())
 
 
-def read_dataset(
-    path: Path, only: Collection[str] | None = None, needed: tuple[str, ...] = (*RATIO, "status")
-) -> xr.Dataset:
-    """Read a dataset of ``write_dataset``, or some of its variables; InputError if the file is not one.
+def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr.Dataset:
+    """Read a dataset of ``write_dataset``; InputError if the file is not one.
 
-    A file is one if it has the axes of a map and the variables that are needed. To read some variables by their names
-    takes less time than to read all of them, of which there are hundreds.
+    A file is one if it has the axes of a map and the variables that are needed.
     """
     if not os.path.isfile(path):
         raise InputError(f"there is no file {shown(str(path))}.")
     try:
-        _require_whole(path)
-        h5py.File(path, "r").close()  # h5netcdf would print a second error for a file it cannot open
-        data = xr.load_dataset(path, engine="h5netcdf") if only is None else _read_some(path, only)
+        data = xr.load_dataset(_whole(path), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
@@ -61,20 +51,13 @@ def read_dataset(
     return data
 
 
-def _read_some(path: Path, names: Collection[str]) -> xr.Dataset:
-    """Some variables of a file; xarray would look at all of them before it leaves any out."""
-    with h5netcdf.File(path, "r") as file:
-        kept = {name: file.variables[name] for name in sorted(names) if name in file.variables}
-        variables = {name: (one.dimensions, one[...], dict(one.attrs)) for name, one in kept.items()}
-        return xr.decode_cf(xr.Dataset(variables, attrs=dict(file.attrs)))
-
-
-def _require_whole(path: Path) -> None:
-    """Raise a ValueError if a file has a checksum, and it is not that of its content."""
+def _whole(path: Path) -> bytes:
+    """The content of a file; a ValueError if it ends in a checksum that is not its own."""
     whole = path.read_bytes()
     content, end = whole[: -_DIGEST - len(_MARK)], whole[-_DIGEST - len(_MARK) :]
     if end.startswith(_MARK) and end.removeprefix(_MARK) != hashlib.sha256(content).digest():
         raise ValueError("it is damaged, and not what was written")
+    return whole
 
 
 def choices_of(data: xr.Dataset) -> dict[str, Any]:

@@ -16,7 +16,7 @@ _PANELS = {
     "pressure": r"pressure $p$",
     "granular_temperature": r"granular temperature $T$",
 }
-BUDGET = [*_PANELS, *(f"{name}_{ending}" for name in _PANELS for ending, _ in ERROR_PARTS.values())]
+_BUDGET = [*_PANELS, *(f"{name}_{ending}" for name in _PANELS for ending, _ in ERROR_PARTS.values())]
 """Averages that are drawn, and the parts of their errors."""
 
 _PARTS = {  # part: its name and mark
@@ -49,7 +49,7 @@ def dominating_errors(data: xr.Dataset) -> Figure:
     require_map(data, *RATIO)
     if not has_errors(data):
         raise InputError("this map has no error budget: it was made by an older version.")
-    data = finest(ordered(data, *BUDGET))
+    data = finest(ordered(data, *_BUDGET))
     alpha, nu = np.meshgrid(data.restitution.values, data.packing_fraction.values)
     figure = empty_figure(width=3.4 * len(_PANELS) + 0.6, height=4.6)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)

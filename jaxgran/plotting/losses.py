@@ -40,14 +40,14 @@ _NOTE = (
 )
 
 
-def losses_needed(stress: str) -> list[str]:
+def _needed(stress: str) -> list[str]:
     """Return the names of the variables that :func:`theory_losses` draws."""
     return [f"theory_loss_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
 
 
 def has_losses(data: xr.Dataset) -> bool:
     """Return whether a map has the variables that :func:`theory_losses` draws."""
-    return not what_lacks(data, *RATIO, *losses_needed("pressure"))
+    return not what_lacks(data, *RATIO, *_needed("pressure"))
 
 
 def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
@@ -65,9 +65,9 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *losses_needed(stress))
+    require_map(data, *RATIO, *_needed(stress))
     require_plane(data)
-    data = finest(ordered(data, *losses_needed(stress)))
+    data = finest(ordered(data, *_needed(stress)))
     figure = empty_figure(width=7.4, height=6.8)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
     measured = np.isfinite(data[f"theory_loss_{stress}_pairs"].values)

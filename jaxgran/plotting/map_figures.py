@@ -10,24 +10,17 @@ from typing import Any, get_args
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.inference.friction_law import CORRELATION, NEEDED
-from jaxgran.maps.schema import FINEST, RATIO, require_map
+from jaxgran.maps.schema import RATIO, require_map
 from jaxgran.model.checks import InputError, require_whole, shown
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
-from jaxgran.plotting.errors import BUDGET, dominating_errors, has_errors
+from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
-from jaxgran.plotting.losses import has_losses, losses_needed, theory_losses
+from jaxgran.plotting.losses import has_losses, theory_losses
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
-from jaxgran.plotting.size import QUANTITIES, averages_against_grains
-from jaxgran.plotting.theory import SHARES, STRESSES_NEEDED, cluster_shares, has_clusters, has_theory, theory_errors
+from jaxgran.plotting.size import averages_against_grains
+from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 from jaxgran.plotting.two_processes import do_all
-
-_AVERAGES = (*RATIO, *STRESSES_NEEDED, *SHARES, *losses_needed("pressure"), *BUDGET, *QUANTITIES, *NEEDED, CORRELATION)
-DRAWN = frozenset(("packing_fraction", "restitution", *FINEST, "status")).union(
-    name for average in _AVERAGES for name in (average, f"{average}_stderr")
-)
-"""Variables of a map that the figures show, and that a file must be read for; a map has many more."""
 
 _DEAREST = (theory_errors, theory_losses, cluster_shares, friction_figure)
 

@@ -29,7 +29,7 @@ from jaxgran.plotting.drawing import (
 from jaxgran.plotting.ratio import MOST_TOGETHER, point_panels
 
 _MOST_NUMBERS = 5  # at the axis of N, or one more
-QUANTITIES = {
+_QUANTITIES = {
     "pressure": r"pressure $p$",
     "shear_stress": r"shear stress $\tau$",
     "granular_temperature": "granular temperature $T$",
@@ -58,8 +58,8 @@ def averages_against_grains(data: xr.Dataset) -> Figure:
     sizes = data.sizes.get("grains", 1)
     if sizes < 2:
         raise InputError(f"this figure needs at least two numbers of grains, and this map has {sizes}.")
-    data, left_out = _with_few_restitutions(finest(ordered(data, *QUANTITIES), "timestep"))
-    names = [name for name in QUANTITIES if name in data and f"{name}_stderr" in data]
+    data, left_out = _with_few_restitutions(finest(ordered(data, *_QUANTITIES), "timestep"))
+    names = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
     panels, title = point_panels(data)
     figure = empty_figure(
         1.2 + 2.0 * len(names), (1.2 + 2.2 * len(panels)) if len(panels) == 1 else 1 + 1.7 * len(panels)
@@ -75,7 +75,7 @@ def averages_against_grains(data: xr.Dataset) -> Figure:
                 _draw_curve(axes, curve, name, style)
         row[0].set_ylabel(words, fontsize=LABEL_SIZE)
     for axes, name in zip(grid[0], names, strict=True):
-        axes.set_title(QUANTITIES[name], fontsize=TICK_SIZE)
+        axes.set_title(_QUANTITIES[name], fontsize=TICK_SIZE)
     for axes in grid[-1]:
         axes.set_xlabel("number of grains $N$", fontsize=LABEL_SIZE)
     _set_size_scale(grid[0, 0], data.grains.values)

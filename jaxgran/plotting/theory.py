@@ -72,7 +72,7 @@ SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
 _STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
-STRESSES_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
+_STRESSES_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
 SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
 _LEAST_SHARE = 0.02  # share of clusters above which the error of interpolation is quoted, below the lowest level
@@ -87,7 +87,7 @@ _THEORY_NOTE = (
 
 def has_theory(data: xr.Dataset) -> bool:
     """Return whether a map has the variables that :func:`theory_errors` draws."""
-    return not what_lacks(data, *RATIO, *STRESSES_NEEDED)
+    return not what_lacks(data, *RATIO, *_STRESSES_NEEDED)
 
 
 def has_clusters(data: xr.Dataset) -> bool:
@@ -145,7 +145,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *STRESSES_NEEDED)
+    require_map(data, *RATIO, *_STRESSES_NEEDED)
     require_plane(data)
     data = finest(ordered(data, *_STRESSES, "stress_ratio"))
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
