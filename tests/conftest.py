@@ -12,6 +12,7 @@ from functools import cache, partial
 import compiled_programs
 import hypothesis
 import pytest
+from _pytest.unraisableexception import gc_collect_iterations_key
 
 compiled_programs.set_up()
 os.environ.pop("COLUMNS", None)  # the processes of xdist are told a width, and tables would have it
@@ -44,9 +45,10 @@ ENGINES = ("machine_code", "thread_block", "jax")
 damaged = []  # reports of compiled programs that could not be read
 
 
-def pytest_configure():
+def pytest_configure(config: pytest.Config):
     """``pytest.GRAINS`` is the number of grains that the shared compiled functions are for."""
     pytest.GRAINS = GRAINS
+    config.stash[gc_collect_iterations_key] = 1  # to look for garbage five times at the end takes four seconds
 
 
 def pytest_collection_finish():
