@@ -71,6 +71,15 @@ def exact_order() -> dict[str, bool]:
     return {flag: True} if f"{flag}=false" in os.environ["XLA_FLAGS"] else {}
 
 
+def optimised(function):
+    """A compiled function as users have it, where it would run for longer than its optimisation takes."""
+    import jax
+
+    flag = "xla_backend_optimization_level"
+    options = {flag: 3} if f"{flag}=0" in os.environ["XLA_FLAGS"] else {}
+    return jax.jit(function.__wrapped__, compiler_options=options)
+
+
 def set_up() -> None:
     """Set the environment, before JAX is loaded; processes that share the tests find it set."""
     if FIRST_PROCESS:

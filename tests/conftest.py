@@ -6,6 +6,7 @@ The compiled functions of the engine are shared by all tests: one number of grai
 
 import gc
 import os
+import sys
 from dataclasses import replace
 from functools import cache, partial
 
@@ -53,6 +54,9 @@ def pytest_configure(config: pytest.Config):
 
 def pytest_collection_finish():
     """What is imported stays: to look through it again and again for garbage would take a fifth of a run."""
+    collision_model = sys.modules.get("jaxgran.inference.collision_model")
+    if collision_model is not None:  # tests of fits would take twice the time
+        collision_model._best_unknowns = compiled_programs.optimised(collision_model._best_unknowns)
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)

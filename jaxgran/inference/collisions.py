@@ -32,6 +32,7 @@ _QUICK = 0.9  # quantile of these steps
 _CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, over its error
 _ALONG = 0.95  # cosine of the angle between two changes of one contact
 _FEWEST_CHANGES = 20  # of which a share is taken
+_AT_ONCE = 20_000  # near pairs that are looked at in one go; each takes some kilobytes
 _BENT = np.append(np.inf, chi2.isf(_BEND, np.arange(1, 8 * (LONGEST + 1) + 1)))  # χ² of a bend, by degrees of freedom
 
 
@@ -208,11 +209,15 @@ def candidates(flights: Flights, noise: Noise, struck: np.ndarray | None = None)
       struck: (frames - 1, grains), in which windows a disc is known to collide: no flight goes past them.
     """
     margin = _REACH * relative_step(flights, _QUICK) + 0.1
-    found = [
-        part
-        for k in range(len(flights.time) - 1)
-        if (part := _of_window(flights, noise, struck, k, margin)) is not None
-    ]
+    found, near, pairs, last = [], [], 0, len(flights.time) - 2
+    for k in range(last + 1):
+        near.append((k, *_near(flights, k, margin)))
+        pairs += len(near[-1][1])
+        if pairs and (pairs > _AT_ONCE or k == last):
+            windows = np.repeat([k for k, *_ in near], [len(i) for _, i, *_ in near])
+            found.append(_of_windows(flights, noise, struck, windows, *map(np.concatenate, list(zip(*near))[1:])))
+            near, pairs = [], 0
+    found = [part for part in found if part is not None]
     return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
 
 
@@ -272,20 +277,26 @@ def _wrapped(places: np.ndarray, cell: np.ndarray) -> np.ndarray:
     return np.stack([x - width * np.floor(x / width), places[:, 1] - rows * height], axis=-1)
 
 
-def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int, margin: float) -> Candidates | None:
-    i, j, apart = _near(flights, k, margin)
-    if len(i) == 0:
-        return None
-    around = np.arange(k - LONGEST, k + 2 + LONGEST)
+def _of_windows(
+    flights: Flights,
+    noise: Noise,
+    struck: np.ndarray | None,
+    k: np.ndarray,
+    i: np.ndarray,
+    j: np.ndarray,
+    apart: np.ndarray,
+) -> Candidates | None:
+    """The candidates among pairs of windows k, (pairs,), whose discs i and j are ``apart`` at its beginning."""
+    around = k[:, None] + np.arange(-LONGEST, 2 + LONGEST)
     exists = (around >= 0) & (around < len(flights.time))
     frames = np.clip(around, 0, len(flights.time) - 1)
-    time = np.where(exists, flights.time[frames] - flights.time[k], 0.0)
+    time = np.where(exists, flights.time[frames] - flights.time[k, None], 0.0)
     # The image of j lies a lattice vector from its track; the image slides by the shear of its height
     shift = apart - (flights.positions[k, i] - flights.positions[k, j])
     slide = flights.shear_rate * np.stack([shift[:, 1], np.zeros(len(i))], axis=-1)
-    of_i, of_j = (flights.positions[frames][:, grain].transpose(1, 0, 2) for grain in (i, j))
-    image = of_j - shift[:, None] - time[:, None] * slide[:, None]
-    v_i, v_j = (flights.velocities[frames][:, grain].transpose(1, 0, 2) for grain in (i, j))
+    of_i, of_j = (flights.positions[frames, grain[:, None]] for grain in (i, j))
+    image = of_j - shift[:, None] - time[..., None] * slide[:, None]
+    v_i, v_j = (flights.velocities[frames, grain[:, None]] for grain in (i, j))
     v_image = v_j - slide[:, None]
     share = (flights.masses[i] / (flights.masses[i] + flights.masses[j]))[:, None, None]
     spread = np.sqrt(share**2 + (1 - share) ** 2)
@@ -305,9 +316,9 @@ def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int
         likely = (added < _BENT[freedom]) & (together < _BENT[np.maximum(total, 1)])
         straight = np.cumprod(~relative.settled | likely, axis=1).astype(bool)
         if struck is not None:  # in the window before each further frame, outwards
-            ends = np.minimum(np.minimum(frames[outwards][1:], frames[outwards][:-1]), len(struck) - 1)
-            passed = struck[ends][:, i] | struck[ends][:, j]
-            straight[:, 1:] &= np.cumsum(passed, axis=0).T == 0
+            ends = np.minimum(np.minimum(frames[:, outwards[1:]], frames[:, outwards[:-1]]), len(struck) - 1)
+            passed = struck[ends, i[:, None]] | struck[ends, j[:, None]]
+            straight[:, 1:] &= np.cumsum(passed, axis=1) == 0
         belongs = np.zeros(pair.seen.shape, bool)
         belongs[:, outwards] = straight & pair.seen[:, outwards]
         last = straight.sum(axis=1) - 1
@@ -320,26 +331,24 @@ def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int
     size = np.sum(change**2, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         clear = first & second & (size > _LEAST_CHANGE**2 * (var_u + var_w))
-        contact, until = -np.sum((b - a) * change, axis=-1) / size, time[np.argmax(after, axis=1)]
+        contact = -np.sum((b - a) * change, axis=-1) / size
+        until = time[np.arange(len(i)), np.argmax(after, axis=1)]
         late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # by which noise may move it out of the window
         clear &= (contact > -late) & (contact < until + late)
         contact = np.clip(contact, 0, until)
     if not clear.any():
         return None
     place = ((a + u * contact[:, None]) + (b + w * contact[:, None])) / 2
-    drift = _lines(
-        _Seen(time, centre.positions, centre.velocities, exists, before | after), np.arange(len(time)), noise
-    )
     both = before | after
+    drift = _lines(_Seen(time, centre.positions, centre.velocities, exists, both), np.arange(time.shape[1]), noise)
     freedom = 2.0 * (both * (1 + pair.known)).sum(axis=1) - 4
     guess = np.concatenate([place, contact[:, None], u], axis=1)
-    rows = len(i)
     return Candidates(
         *(x[clear] for x in (
-            np.full(rows, k),
+            k,
             np.stack([i, j], axis=-1),
             (flights.diameters[i] + flights.diameters[j]) / 2,
-            np.tile(time, (rows, 1)),
+            time,
             np.where(both[..., None], pair.positions, 0),
             np.where((both & pair.known)[..., None], pair.velocities, 0),
             pair.known,
@@ -354,7 +363,7 @@ def _of_window(flights: Flights, noise: Noise, struck: np.ndarray | None, k: int
 
 
 class _Seen:
-    """Positions (pairs, frames, 2) and velocities of points at times (frames,), and in which frames they are seen."""
+    """Positions (pairs, frames, 2) and velocities of points at times (pairs, frames), and where they are seen."""
 
     def __init__(self, time, positions, velocities, exists, chosen=None):
         self.time, self.positions, self.velocities = time, positions, velocities
@@ -375,7 +384,7 @@ class _Lines(NamedTuple):
 
 def _lines(seen: _Seen, order: np.ndarray, noise: Noise) -> _Lines:
     """Weighted least squares, by sums over frames that are added in this order."""
-    t = seen.time[order]
+    t = seen.time[:, order]
     wx = seen.seen[:, order] / noise.position**2
     wv = seen.known[:, order] / noise.velocity**2
     x = np.where(seen.seen[:, order, None], seen.positions[:, order], 0)
