@@ -209,14 +209,15 @@ def candidates(flights: Flights, noise: Noise, struck: np.ndarray | None = None)
       struck: (frames - 1, grains), in which windows a disc is known to collide: no flight goes past them.
     """
     margin = _REACH * relative_step(flights, _QUICK) + 0.1
-    found, near, pairs, last = [], [], 0, len(flights.time) - 2
+    found, windows, near, pairs, last = [], [], [], 0, len(flights.time) - 2
     for k in range(last + 1):
-        near.append((k, *_near(flights, k, margin)))
-        pairs += len(near[-1][1])
-        if pairs and (pairs > _AT_ONCE or k == last):
-            windows = np.repeat([k for k, *_ in near], [len(i) for _, i, *_ in near])
-            found.append(_of_windows(flights, noise, struck, windows, *map(np.concatenate, list(zip(*near))[1:])))
-            near, pairs = [], 0
+        near.append(_near(flights, k, margin))
+        windows.append(np.full(len(near[-1][0]), k))
+        pairs += len(windows[-1])
+        if pairs > _AT_ONCE or (pairs and k == last):
+            i, j, apart = (np.concatenate(x) for x in zip(*near, strict=True))
+            found.append(_of_windows(flights, noise, struck, np.concatenate(windows), i, j, apart))
+            windows, near, pairs = [], [], 0
     found = [part for part in found if part is not None]
     return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
 
