@@ -14,6 +14,7 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -71,13 +72,13 @@ def exact_order() -> dict[str, bool]:
     return {flag: True} if f"{flag}=false" in os.environ["XLA_FLAGS"] else {}
 
 
-def optimised(function):
-    """A compiled function as users have it, where it would run for longer than its optimisation takes."""
+def optimised(function: Callable, **options) -> Callable:
+    """``jax.jit`` of a function that is optimised, where the tests would run it for longer than that takes."""
     import jax
 
     flag = "xla_backend_optimization_level"
-    options = {flag: 3} if f"{flag}=0" in os.environ["XLA_FLAGS"] else {}
-    return jax.jit(function.__wrapped__, compiler_options=options)
+    how = {flag: 1} if f"{flag}=0" in os.environ["XLA_FLAGS"] else {}
+    return jax.jit(getattr(function, "__wrapped__", function), compiler_options=how, **options)
 
 
 def set_up() -> None:

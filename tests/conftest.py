@@ -104,12 +104,16 @@ def run():
 def engines(run):
     """``engines[name](flow, state, steps)``: the advance by an engine, compiled; the thread block is interpreted."""
 
-    def compiled(advance):
-        call = jax.jit(advance)
+    def compiled(advance, jit=jax.jit):
+        call = jit(advance)
         return lambda flow, state, steps: jax.block_until_ready(call(flow, state, jnp.int32(steps)))
 
     interpreted = partial(kernel.advance, interpret=True)
-    return {"machine_code": compiled(public.advance), "thread_block": compiled(interpreted), "jax": run}
+    return {
+        "machine_code": compiled(public.advance),
+        "thread_block": compiled(interpreted, compiled_programs.optimised),
+        "jax": run,
+    }
 
 
 @pytest.fixture(scope="session", params=ENGINES)
