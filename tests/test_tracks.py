@@ -127,6 +127,9 @@ WRITERS = {
 }
 
 
+FITTED = {"discs.csv", "hoomd.gsd"}  # with missing discs, and in single precision; the others have the same numbers
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_tracks_are_the_same_from_every_file(name: str, tmp_path: Path) -> None:
     seen = tracks() if name.endswith("gsd") else noisy(tracks(), 0.0, 0.0, missing=0.1)
@@ -142,8 +145,9 @@ def test_tracks_are_the_same_from_every_file(name: str, tmp_path: Path) -> None:
     if np.isfinite(read.cell).all():
         np.testing.assert_allclose(read.cell, seen.cell, rtol=0, atol=rounding)
         assert read.shear_rate == pytest.approx(1.0, rel=1e-4)
-    fit = fit_restitution(read)  # which finds out how masses go with diameters
-    assert abs(fit.restitution - RESTITUTION) < max(4 * fit.stderr, 1e-4) and fit.collisions > 15
+    if name in FITTED:
+        fit = fit_restitution(read)  # which finds out how masses go with diameters
+        assert abs(fit.restitution - RESTITUTION) < max(4 * fit.stderr, 1e-4) and fit.collisions > 15
 
 
 def same_tracks(path: Path, rows: pd.DataFrame, **options) -> None:
