@@ -348,9 +348,9 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     for draw in ("ratio_contours", "theory_errors", "theory_losses", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, ratio_curves)
     leave_out_layout(monkeypatch)
-    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "pdf", "--no-caption")
+    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
     assert jaxgran(folder, *words).status == 0
-    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".pdf") for name in PICTURES}
+    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
     assert files(folder) >= PICTURES
 
 
@@ -438,7 +438,10 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
         assert Path(folder).is_dir() and state == "works", name
 
 
-@pytest.mark.parametrize(("command", "platform"), [("info", "cuda"), ("map", "cuda"), ("fit text.gsd", "banana")])
+@pytest.mark.parametrize(
+    ("command", "platform"),
+    [("info", "cuda"), ("map", "cuda"), pytest.param("fit text.gsd", "banana", marks=pytest.mark.slow)],
+)
 def test_a_platform_that_is_not_there_is_one_sentence(command: str, platform: str, folder: Path, monkeypatch) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", platform)
     outcome = in_a_process(folder, *command.split())

@@ -25,7 +25,7 @@ def test_law_without_noise_is_found() -> None:
 
 @pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9, -0.9])
 def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(correlation: float) -> None:
-    seeds = 60
+    seeds = 40
     pulls, squares = [], []
     for seed in range(seeds):
         law = fit(dense_map(seed, alphas=(0.2, 0.5, 0.8), correlation=correlation))
