@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import netCDF4  # noqa: F401 before h5py: where both bring the same HDF5, netCDF4 fails after it
 import numpy as np
 
 from jaxgran.files import replaced
