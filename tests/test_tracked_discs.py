@@ -15,6 +15,7 @@ from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "notebooks" / "tracked_discs.csv"
 PAGE = (ROOT / "docs" / "how-to" / "tracked-discs.md").read_text(encoding="utf-8")
+QUICK = {"fit positions.csv", "fit tracked_discs.csv --every 4"}
 FITS = re.findall(r"^\| `jaxgran (fit \w+\.csv[^`]*)` \| ([^|]+) \| ([^|]+) \| (\d+) \|$", PAGE, re.MULTILINE)
 
 
@@ -71,7 +72,9 @@ def test_the_page_shows_the_file_and_what_the_fit_prints(folder: Path) -> None:
     assert FILE.read_text(encoding="utf-8").startswith(shown[1])
 
 
-@pytest.mark.parametrize("row", FITS, ids=lambda row: row[0])
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, id=row[0], marks=() if row[0] in QUICK else pytest.mark.slow) for row in FITS]
+)
 def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -> None:
     command, *shown = row
     printed = rows_of(jaxgran(folder, *command.split()).out)
