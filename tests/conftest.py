@@ -3,10 +3,10 @@
 import gc
 import os
 import sys
+from contextlib import suppress
 
 import compiled_programs
 import pytest
-from _pytest.unraisableexception import gc_collect_iterations_key
 
 compiled_programs.set_up()
 os.environ.pop("COLUMNS", None)  # the processes of xdist are told a width, and tables would have it
@@ -16,7 +16,10 @@ damaged = []  # reports of compiled programs that could not be read
 
 def pytest_configure(config: pytest.Config):
     """Load what tests share, but not in a process that leaves the tests to others: it takes two seconds."""
-    config.stash[gc_collect_iterations_key] = 1  # to look for garbage five times at the end takes four seconds
+    with suppress(ImportError):  # a name of pytest's own; to look for garbage five times at the end takes four seconds
+        from _pytest.unraisableexception import gc_collect_iterations_key
+
+        config.stash[gc_collect_iterations_key] = 1
     left_to_others = config.getoption("dist", "no") != "no" and not config.option.collectonly
     if hasattr(config, "workerinput") or not left_to_others:
         config.pluginmanager.import_plugin("shared_flows")
