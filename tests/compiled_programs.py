@@ -72,13 +72,13 @@ def exact_order() -> dict[str, bool]:
     return {flag: True} if f"{flag}=false" in os.environ["XLA_FLAGS"] else {}
 
 
-def optimised(function: Callable, **options) -> Callable:
+def optimised(function: Callable) -> Callable:
     """``jax.jit`` of a function that is optimised, where the tests would run it for longer than that takes."""
     import jax
 
     flag = "xla_backend_optimization_level"
     how = {flag: 1} if f"{flag}=0" in os.environ["XLA_FLAGS"] else {}
-    return jax.jit(getattr(function, "__wrapped__", function), compiler_options=how, **options)
+    return jax.jit(getattr(function, "__wrapped__", function), compiler_options=how)
 
 
 def set_up() -> None:

@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config):
 
 
 def pytest_collection_finish():
-    """What is imported stays: to look through it again and again for garbage would take a fifth of a run."""
+    """Fits are optimised. What is imported stays: to look through it for garbage would take a fifth of a run."""
     collision_model = sys.modules.get("jaxgran.inference.collision_model")
     if collision_model is not None:  # tests of fits would take twice the time
         collision_model._best_unknowns = compiled_programs.optimised(collision_model._best_unknowns)

@@ -16,8 +16,6 @@ from matplotlib.image import imread
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
 
-PAPER = Path(__file__).parents[1] / "benchmarks" / "results" / "paper.nc"
-
 pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
 
 

@@ -32,7 +32,7 @@ _QUICK = 0.9  # quantile of these steps
 _CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, over its error
 _ALONG = 0.95  # cosine of the angle between two changes of one contact
 _FEWEST_CHANGES = 20  # of which a share is taken
-_AT_ONCE = 20_000  # near pairs that are looked at in one go; each takes some kilobytes
+_MOST_PAIRS = 20_000  # near pairs that are looked at in one go; each takes some kilobytes
 _BENT = np.append(np.inf, chi2.isf(_BEND, np.arange(1, 8 * (LONGEST + 1) + 1)))  # χ² of a bend, by degrees of freedom
 
 
@@ -209,16 +209,15 @@ def candidates(flights: Flights, noise: Noise, struck: np.ndarray | None = None)
       struck: (frames - 1, grains), in which windows a disc is known to collide: no flight goes past them.
     """
     margin = _REACH * relative_step(flights, _QUICK) + 0.1
-    found, windows, near, pairs, last = [], [], [], 0, len(flights.time) - 2
+    found, near, pairs, last = [], [], 0, len(flights.time) - 2
     for k in range(last + 1):
-        near.append(_near(flights, k, margin))
-        windows.append(np.full(len(near[-1][0]), k))
-        pairs += len(windows[-1])
-        if pairs > _AT_ONCE or (pairs and k == last):
-            i, j, apart = (np.concatenate(x) for x in zip(*near, strict=True))
-            found.append(_of_windows(flights, noise, struck, np.concatenate(windows), i, j, apart))
-            windows, near, pairs = [], [], 0
-    found = [part for part in found if part is not None]
+        i, j, apart = _near(flights, k, margin)
+        near.append((np.full(len(i), k), i, j, apart))
+        pairs += len(i)
+        if pairs > _MOST_PAIRS or k == last:
+            part = _of_windows(flights, noise, struck, *(np.concatenate(x) for x in zip(*near, strict=True)))
+            found += [] if part is None else [part]
+            near, pairs = [], 0
     return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
 
 
