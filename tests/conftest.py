@@ -11,7 +11,26 @@ import pytest
 compiled_programs.set_up()
 os.environ.pop("COLUMNS", None)  # the processes of xdist are told a width, and tables would have it
 
+CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # of the whole run; on Linux
 damaged = []  # reports of compiled programs that could not be read
+
+
+def keep_to_one_core():
+    """Give each process of xdist one core, where each core has one: what XLA hands from core to core costs a tenth."""
+    number, count = (int(os.environ[f"PYTEST_XDIST_WORKER{end}"].removeprefix("gw")) for end in ("", "_COUNT"))
+    if len(CORES) <= count:
+        os.sched_setaffinity(0, {CORES[number % len(CORES)]})
+
+
+@pytest.fixture
+def all_cores():
+    """Processes that are started here may use every core."""
+    if CORES:
+        before = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, CORES)
+    yield
+    if CORES:
+        os.sched_setaffinity(0, before)
 
 
 def pytest_configure(config: pytest.Config):
@@ -20,6 +39,8 @@ def pytest_configure(config: pytest.Config):
         from _pytest.unraisableexception import gc_collect_iterations_key
 
         config.stash[gc_collect_iterations_key] = 1
+    if CORES and hasattr(config, "workerinput"):
+        keep_to_one_core()
     left_to_others = config.getoption("dist", "no") != "no" and not config.option.collectonly
     if hasattr(config, "workerinput") or not left_to_others:
         config.pluginmanager.import_plugin("shared_flows")

@@ -33,7 +33,11 @@ def task(number):
 do_all([partial(task, number) for number in range(4)])
 """
 
-needs_a_copy = pytest.mark.skipif(sys.platform != "linux" or usable_cores() < 2, reason="the process is not copied")
+
+@pytest.fixture
+def copied(all_cores: None) -> None:
+    if sys.platform != "linux" or usable_cores() < 2:
+        pytest.skip("the process is not copied")
 
 
 def done(folder: Path, fails: str) -> tuple[subprocess.CompletedProcess, list[list[str]]]:
@@ -44,7 +48,7 @@ def done(folder: Path, fails: str) -> tuple[subprocess.CompletedProcess, list[li
     return ended, [path.read_text().split() for path in sorted(folder.glob("task*"))]
 
 
-@needs_a_copy
+@pytest.mark.usefixtures("copied")
 def test_every_task_is_done_once_and_both_processes_take_some(tmp_path: Path) -> None:
     ended, processes = done(tmp_path, "none")
     assert (ended.returncode, ended.stderr) == (0, "")
@@ -52,14 +56,14 @@ def test_every_task_is_done_once_and_both_processes_take_some(tmp_path: Path) ->
     assert len({one[0] for one in processes}) == 2
 
 
-@needs_a_copy
+@pytest.mark.usefixtures("copied")
 def test_tasks_of_a_copy_that_fails_are_done_by_the_process_itself(tmp_path: Path) -> None:
     ended, processes = done(tmp_path, "copy")
     assert ended.returncode == 0
     assert len(processes) == 4 and len({process for one in processes for process in one}) == 1
 
 
-@needs_a_copy
+@pytest.mark.usefixtures("copied")
 def test_what_goes_wrong_in_both_is_raised(tmp_path: Path) -> None:
     ended, processes = done(tmp_path, "both")
     assert ended.returncode == 1 and "No space left on device" in ended.stderr.splitlines()[-1]
