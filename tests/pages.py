@@ -21,9 +21,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.page.film import Film
 
-SETTINGS = MapSettings(
-    (0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True
-)
+POINTS = (0.5, 0.7, 0.9), (0.5, 0.6)
 MARKUP = '<script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">&amp; <b>bold</b>'
 """An attribute that would run as a script, if it were markup."""
 
@@ -36,15 +34,16 @@ _OPTIONS = (
 @cache
 def page_map() -> xr.Dataset:
     """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes hold markup."""
-    rng, flows = np.random.default_rng(0), SETTINGS.flows()
+    settings = MapSettings(*POINTS, grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True)
+    rng, flows = np.random.default_rng(0), settings.flows()
     results = {}
     for point in range(len(flows)):
         status = Status.deep_overlap if point == 7 else Status.ok
         if point != 8:
             instant = random_instant(point, 64, 12)._replace(force=np.geomspace(1, 100, 12))
-            results[point, 0] = random_replica(rng, SETTINGS, status)._replace(instant=instant)
-            results[point, 1] = random_replica(rng, SETTINGS, status)
-    data = map_dataset(SETTINGS, results, {"title": MARKUP})
+            results[point, 0] = random_replica(rng, settings, status)._replace(instant=instant)
+            results[point, 1] = random_replica(rng, settings, status)
+    data = map_dataset(settings, results, {"title": MARKUP})
     own = data.force_ratio.assign_attrs(long_name=MARKUP, units="<i>σ</i>") ** 2
     return data.assign({"own <u>name</u>": own.assign_attrs(long_name=MARKUP, units="<i>σ</i>")})
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import optimised
 
 from benchmarks import stability
 from benchmarks.output import Output
@@ -20,6 +21,7 @@ from jaxgran.sampling.observables import averages
 from jaxgran.sampling.sample import sample
 
 PAIRS = stability.GRAINS // 2
+pack = optimised(stability.pack)  # close to jamming it takes long
 
 
 @pytest.mark.slow
@@ -87,6 +89,7 @@ def test_sample_refuses_float32_positions_at_a_short_timestep() -> None:
 def warm(restitution: float, packing_fraction: float) -> tuple[State, float]:
     """``stability.prepared`` of less strain, shared by the tests."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stability, "pack", pack)
         patch.setattr(stability, "PREPARATION", [(0.05, 1e-3)] * 8)
         return stability.prepared(restitution, packing_fraction)
 
