@@ -21,7 +21,6 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.page.film import Film
 
-POINTS = (0.5, 0.7, 0.9), (0.5, 0.6)
 MARKUP = '<script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">&amp; <b>bold</b>'
 """An attribute that would run as a script, if it were markup."""
 
@@ -34,7 +33,9 @@ _OPTIONS = (
 @cache
 def page_map() -> xr.Dataset:
     """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes hold markup."""
-    settings = MapSettings(*POINTS, grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True)
+    settings = MapSettings(
+        (0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True
+    )
     rng, flows = np.random.default_rng(0), settings.flows()
     results = {}
     for point in range(len(flows)):
