@@ -1,8 +1,13 @@
 """What a figure shows, as text."""
 
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import same_color
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from jaxgran.plotting import drawing, losses, map_figures, ratio, theory
@@ -25,3 +30,26 @@ def caption(figure: Figure) -> str:
 def write_without_drawing(patch: pytest.MonkeyPatch) -> None:
     """Pictures are files of a few bytes, for tests of which files are written."""
     patch.setattr(map_figures, "_draw", lambda draw, data, path, *_: Path(path).write_bytes(b"a picture"))
+
+
+class ContourLine(NamedTuple):
+    """A contour as drawn: its vertices (points, 2), its style and its labels."""
+
+    vertices: np.ndarray
+    dashed: bool
+    width: float
+    labels: list[str]
+
+
+def contour_lines(axes: Axes, colour: str) -> dict[float, ContourLine]:
+    """Return the contours of a colour, by their level; a short one may be all under its label."""
+    lines = {}
+    sets = [artist for artist in axes.collections if isinstance(artist, QuadContourSet) and not artist.filled]
+    for drawn in (one for one in sets if same_color(one.get_edgecolor()[0][:3], colour)):
+        labels = list(zip(drawn.labelCValues, (text.get_text() for text in drawn.labelTexts), strict=True))
+        styles = zip(drawn.levels, drawn.get_paths(), drawn.get_linestyle(), drawn.get_linewidth(), strict=True)
+        for number, (level, path, (_, dashes), width) in enumerate(styles):
+            own = [text for of, text in labels if of == number]
+            if len(path) or own:
+                lines[float(level)] = ContourLine(np.asarray(path.vertices), dashes is not None, width, own)
+    return lines

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, legend_texts, write_without_drawing
+from drawn import caption, contour_lines, legend_texts, write_without_drawing
 from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
 from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
@@ -20,9 +20,9 @@ pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
 
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
-    """Return the vertices (1 − α, ν) of every labelled contour, by the text of its label."""
-    sets = [artist for artist in figure.axes[0].collections if isinstance(artist, QuadContourSet)]
-    return {float(s.labelTexts[0].get_text()): s.get_paths()[0].vertices for s in sets if not s.filled}
+    """Return the vertices (1 − α, ν) of every contour, by the text of its one label."""
+    lines = contour_lines(figure.axes[0], "black").values()
+    return {float(text): line.vertices for line in lines for (text,) in [line.labels]}
 
 
 def bands_of_contours(figure: Figure) -> list[np.ndarray]:

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, legend_texts, write_without_drawing
+from drawn import caption, contour_lines, legend_texts, write_without_drawing
 from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
-from matplotlib.colors import same_color
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
@@ -70,20 +69,9 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
     return data.assign(added)
 
 
-def contours(axes: Axes, colour: str) -> dict[float, QuadContourSet]:
-    """Return the contour lines of a colour, by their level."""
-    sets = [artist for artist in axes.collections if isinstance(artist, QuadContourSet) and not artist.filled]
-    return {float(s.levels[0]): s for s in sets if same_color(s.get_edgecolor()[0][:3], colour)}
-
-
 def panel(figure: Figure, name: str) -> Axes:
     """Return the axes of the shares of pressure "p" or shear stress "s", or those of the map "m"."""
     return {axes.get_label(): axes for axes in figure.axes}[name]
-
-
-def vertices(line: QuadContourSet) -> tuple[np.ndarray, np.ndarray]:
-    x, nu = line.get_paths()[0].vertices.T
-    return x, nu
 
 
 def noise(axes: Axes) -> list[np.ndarray]:
@@ -148,16 +136,15 @@ def test_errors_lie_on_their_isolines_with_their_labels() -> None:
     labelled = 0
     for row in grid:
         for axes, law in zip(row, laws, strict=True):
-            lines = contours(axes, "black")
+            lines = contour_lines(axes, "black")
             corners = law(*np.meshgrid([0.1, 0.9], [0.3, 0.8]))
             reached = {level for level in texts if corners.min() < level < corners.max()}
             assert set(lines) == reached and len(reached) >= 4
             for level, line in lines.items():
-                np.testing.assert_allclose(law(*vertices(line)), level, atol=1e-9)
-                dashed = line.get_linestyle()[0][1] is not None
-                assert dashed == (level < 0.0)
-                assert [t.get_text() for t in line.labelTexts] in ([], [texts[level]])
-                labelled += len(line.labelTexts)
+                np.testing.assert_allclose(law(*line.vertices.T), level, atol=1e-9)
+                assert line.dashed == (level < 0.0)
+                assert line.labels in ([], [texts[level]])
+                labelled += len(line.labels)
     assert labelled >= 24
 
 
@@ -172,11 +159,11 @@ def test_percentages_and_factors_name_quotients() -> None:
 def test_contours_of_the_excess_lie_on_top_of_every_panel() -> None:
     figure = theory_errors(theory_dataset(10, 12))
     for axes in figure.axes:
-        lines = list(contours(axes, "#00803c").values())
-        widths = [line.get_linewidth()[0] for line in lines]
+        lines = list(contour_lines(axes, "#00803c").values())
+        widths = [line.width for line in lines]
         assert len(lines) == len(EXCESS_LEVELS) and widths == sorted(set(widths))
         for level, line in zip(EXCESS_LEVELS, lines, strict=True):
-            x, nu = vertices(line)
+            x, nu = line.vertices.T
             np.testing.assert_allclose(excess_of(1.0 - x, nu), level, rtol=0.15)
     assert [text for text in legend_texts(figure) if text[-4:].replace(".", "").isdigit()] == [
         "excess 0.05",
@@ -207,7 +194,7 @@ def test_points_without_a_prediction_are_hatched_but_keep_the_collisions(page) -
     figure = theory_errors(data)
     edge = 1.0 - data.restitution.values[-2]
     for axes, bounded in zip(figure.axes, [True, False, True] * 2, strict=True):
-        least = min(vertices(line)[0].min() for line in contours(axes, "black").values())
+        least = min(line.vertices[:, 0].min() for line in contour_lines(axes, "black").values())
         assert (least >= edge - 1e-9) == bounded
     assert "6 of 30 points without a value (hatched)" in caption(figure)
     assert "no value" in legend_texts(figure)
@@ -246,12 +233,12 @@ def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(stress)
     assert [axes.get_title() for axes in figure.axes] == list(PANELS.values())
     for k, axes in enumerate(figure.axes):
         corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
-        lines = contours(axes, "black")
+        lines = contour_lines(axes, "black")
         assert set(lines) == {level for level in ERROR_LEVELS.values() if corners.min() < level < corners.max()}
         for level, line in lines.items():
-            np.testing.assert_allclose(factor_of(k, *vertices(line)), level, atol=1e-9)
-            assert (line.get_linestyle()[0][1] is not None) == (level < 0.0)
-        assert len(contours(axes, "#00803c")) == len(EXCESS_LEVELS)
+            np.testing.assert_allclose(factor_of(k, *line.vertices.T), level, atol=1e-9)
+            assert line.dashed == (level < 0.0)
+        assert len(contour_lines(axes, "#00803c")) == len(EXCESS_LEVELS)
         for dotted in noise(axes):
             assert abs(factor_of(k, *dotted.T)).max() < 1.001 * STDERR
     assert noise(figure.axes[0]) and "within ± std. error" in legend_texts(figure)
@@ -295,12 +282,12 @@ def test_restitutions_have_lines_and_packing_fractions_symbols() -> None:
 
 def test_share_of_the_pressure_lies_on_its_isolines() -> None:
     figure = cluster_shares(theory_dataset())
-    lines = contours(panel(figure, "m"), "black")
+    lines = contour_lines(panel(figure, "m"), "black")
     assert set(lines) == set(SHARE_LEVELS[1:-1])  # the corners are 0.08 and 0.86
     for level, line in lines.items():
-        np.testing.assert_allclose(share_of(*vertices(line)), level, atol=1e-9)
-        assert [text.get_text() for text in line.labelTexts] == [f"{level:.2f}"]
-    assert len(contours(panel(figure, "m"), "#00803c")) == len(EXCESS_LEVELS)
+        np.testing.assert_allclose(share_of(*line.vertices.T), level, atol=1e-9)
+        assert line.labels == [f"{level:.2f}"]
+    assert len(contour_lines(panel(figure, "m"), "#00803c")) == len(EXCESS_LEVELS)
 
 
 def test_excess_too_small_for_the_axis_is_counted() -> None:

@@ -6,8 +6,8 @@ A quantity is interpolated between the grid points of a map. A cell is hatched i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -20,17 +20,35 @@ from matplotlib.patches import Rectangle
 from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from matplotlib.ticker import StrMethodFormatter
 
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
 from jaxgran.plotting.encoding import EXCESS_LEVELS
 from jaxgran.plotting.interpolation import interpolated, refined_axes
 
 _EXCESS_COLOUR = "#00803c"
+_EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
+_LABEL_SPACE = 1.44  # points between a label and its contour
 _LABEL_DISTANCE = 28.0  # points between the middles of two labels, slightly more than the length of a label
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
+
+Key = TypeVar("Key", str, float)
+
+
+class Line(NamedTuple):
+    """The contour of one value, drawn together with others."""
+
+    drawn: QuadContourSet
+    number: int
+
+    @property
+    def path(self) -> MplPath:
+        return self.drawn.get_paths()[self.number]
+
+    @property
+    def value(self) -> float:
+        return float(self.drawn.levels[self.number])
 
 
 # ----------------------------------------------------------------------------------------------- plane
@@ -51,14 +69,17 @@ def excess_value(level: float) -> float:
     return float(contour_variable(np.array(level)))
 
 
-def draw_level(
-    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, value: float, **style: Any
-) -> QuadContourSet | None:
-    """Draw the contour of a field at a value and return it; None if the field does not cross the value."""
-    if not (field.count() and field.min() < value < field.max()):
-        return None
-    drawn = axes.contour(x, y, field, [value], **style)
-    return drawn if len(drawn.get_paths()[0]) else None
+def draw_levels(
+    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, levels: Mapping[Key, float], **styles: Any
+) -> dict[Key, Line]:
+    """Draw the contours of a field at increasing values, in one style or one for each; return those that there are."""
+    low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
+    crossed = [low < value < high for value in levels.values()]
+    if not any(crossed):
+        return {}
+    drawn = axes.contour(x, y, field, list(levels.values()), **styles)
+    lines = {key: Line(drawn, number) for number, key in enumerate(levels) if crossed[number]}
+    return {key: line for key, line in lines.items() if len(line.path)}
 
 
 def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:
@@ -101,8 +122,8 @@ def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, ent
 
 def label_contours(
     axes: Axes,
-    lines: Sequence[tuple[str, QuadContourSet]],
-    obstacles: Iterable[QuadContourSet] = (),
+    lines: Mapping[str, Line],
+    obstacles: Iterable[Line] = (),
     room: float = 0.0,
 ) -> None:
     """Write a label on each contour, where it is farthest from other lines, labels, ends of lines and the frame.
@@ -111,10 +132,10 @@ def label_contours(
     at its best place gets no label.
     """
     to_page, pixels = axes.transData, axes.figure.dpi / 72.0  # pixels of a typographic point
-    paths = [to_page.transform_path(drawn.get_paths()[0]) for _, drawn in lines]
-    blocked = [_thinned(to_page.transform_path(path)) for drawn in obstacles for path in drawn.get_paths()]
+    paths = [to_page.transform_path(line.path) for line in lines.values()]
+    blocked = [_thinned(to_page.transform_path(line.path)) for line in obstacles]
     labelled: list[np.ndarray] = []
-    for k, (text, drawn) in enumerate(lines):
+    for k, (text, line) in enumerate(lines.items()):
         others = [_thinned(path) for path in paths[:k] + paths[k + 1 :]] + [path for path in blocked if len(path)]
         frame = np.array(axes.bbox.extents)
         place, clearance = _label_place(paths[k], others, labelled, _LABEL_DISTANCE * pixels, frame)
@@ -122,16 +143,16 @@ def label_contours(
             continue
         labelled.append(place)
         x, y = to_page.inverted().transform(place)
-        labels = drawn.clabel(
+        label = line.drawn.clabel(
+            [line.value],
             fontsize=SMALL_SIZE + 0.5,
-            fmt=StrMethodFormatter(text),
-            inline_spacing=2,
+            fmt={line.value: text},
+            inline_spacing=_LABEL_SPACE * pixels,
             manual=[(float(x), float(y))],
             zorder=6,
-        )
-        for label in labels:
-            label.set_path_effects([withStroke(linewidth=2, foreground="white")])
-            _move_inside(label, axes)
+        )[-1]
+        label.set_path_effects([withStroke(linewidth=2, foreground="white")])
+        _move_inside(label, axes)
 
 
 def _move_inside(label: Text, axes: Axes) -> None:
@@ -178,23 +199,28 @@ def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------- excess
 
 
-def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, QuadContourSet]:
+def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, Line]:
     """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
     x, y = refined_axes(data)
-    field = excess_field(data)
-    styles = {level: excess_style("colors", "linewidths", level) for level in EXCESS_LEVELS}
-    lines = {level: draw_level(axes, x, y, field, excess_value(level), **style) for level, style in styles.items()}
-    return {level: line for level, line in lines.items() if line is not None}
+    levels = {level: excess_value(level) for level in EXCESS_LEVELS}
+    widths = [_excess_width(level) for level in EXCESS_LEVELS]
+    style = {"colors": _EXCESS_COLOUR, "linewidths": widths, **_EXCESS_STYLE}
+    return draw_levels(axes, x, y, excess_field(data), levels, **style)
 
 
-def excess_style(colour: str, width: str, level: float) -> dict[str, Any]:
-    """Return the style of the contour of an excess; `colour` and `width` are the names that an artist gives to them."""
-    return {colour: _EXCESS_COLOUR, width: 0.8 + 0.5 * EXCESS_LEVELS.index(level), "alpha": 0.75, "zorder": 2.5}
+def excess_style(level: float) -> dict[str, Any]:
+    """Return the style of a line that stands for the contour of an excess."""
+    return {"color": _EXCESS_COLOUR, "linewidth": _excess_width(level), **_EXCESS_STYLE}
 
 
 def excess_keys(levels: Iterable[float]) -> list[Artist]:
     """Return the legend entries of the contours of the excess."""
     return [
-        Line2D([], [], label=f"{'excess ' * (k == 0)}{level:.2f}", **excess_style("color", "linewidth", level))
+        Line2D([], [], label=f"{'excess ' * (k == 0)}{level:.2f}", **excess_style(level))
         for k, level in enumerate(levels)
     ]
+
+
+def _excess_width(level: float) -> float:
+    """Return the width of the contour of an excess, in points."""
+    return 0.8 + 0.5 * EXCESS_LEVELS.index(level)

@@ -9,7 +9,16 @@ from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import ERROR_PARTS, RATIO, finest, relative_parts, require_map
 from jaxgran.model.checks import InputError
-from jaxgran.plotting.drawing import LABEL_SIZE, NU_LABEL, RATIO_LABEL, TICK_SIZE, empty_figure, finish, ordered
+from jaxgran.plotting.drawing import (
+    LABEL_SIZE,
+    NU_LABEL,
+    PANEL_TITLE,
+    RATIO_LABEL,
+    TICK_SIZE,
+    empty_figure,
+    finish,
+    ordered,
+)
 
 _PANELS = {
     "force_ratio": RATIO_LABEL,
@@ -70,7 +79,7 @@ def dominating_errors(data: xr.Dataset) -> Figure:
         if known.any():
             median, worst = np.median(whole[known]), whole[known].max()
             title += f"\n{100 * median:.2g} % (median), {100 * worst:.2g} % (largest)"
-        axes.set_title(title, fontsize=LABEL_SIZE)
+        axes.set_title(title, **PANEL_TITLE)
         axes.set_xlabel(r"restitution $\alpha$", fontsize=LABEL_SIZE)
         axes.margins(0.12, 0.14)
     panels[0].set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)

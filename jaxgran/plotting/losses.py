@@ -14,6 +14,7 @@ from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
     LABEL_SIZE,
     NU_LABEL,
+    PANEL_TITLE,
     empty_figure,
     finish,
     fix_layout,
@@ -81,7 +82,7 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
         over = draw_excess(axes, data)
         panels.append((axes, lines, over.values()))
         noisy |= hidden
-        axes.set_title(title, fontsize=LABEL_SIZE)
+        axes.set_title(title, **PANEL_TITLE)
     for axes in grid[1]:
         axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     for axes in grid[:, 0]:
@@ -92,5 +93,5 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
     finish(figure, data, measured, [note, found, status_note(data), missing_note(measured, " (hatched)")])
     fix_layout(figure)
     for axes, lines, others in panels:
-        label_contours(axes, list(lines.items()), others, room=4.0)
+        label_contours(axes, lines, others, room=4.0)
     return figure

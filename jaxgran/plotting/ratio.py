@@ -29,7 +29,7 @@ from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
     add_plane_legend,
     contour_variable,
-    draw_level,
+    draw_levels,
     draw_plane,
     excess_field,
     excess_value,
@@ -136,9 +136,8 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     figure = empty_figure(width=4.5, height=4.1)
     axes = figure.add_subplot()
     _shade(axes, x, y, field)
-    style = {"colors": "black", "linewidths": 1.1, "zorder": 3}
-    drawn = {level: draw_level(axes, x, y, field, excess_value(level), **style) for level in EXCESS_LEVELS}
-    lines = {level: line for level, line in drawn.items() if line is not None}
+    levels = {level: excess_value(level) for level in EXCESS_LEVELS}
+    lines = draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.1, zorder=3)
     widths = interpolation_error(data, contour_variable(excess))
     between = _draw_interpolation(axes, x, y, field, widths, lines)
     banded = _draw_bands(axes, x, y, excess, stderr, lines)
@@ -153,7 +152,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     notes = [_contour_note(absent), found, status_note(data), missing_note(measured, " (hatched)")]
     finish(figure, data, measured, notes)
     fix_layout(figure)
-    label_contours(axes, [(f"{level:.2f}", line) for level, line in lines.items()])
+    label_contours(axes, {f"{level:.2f}": line for level, line in lines.items()})
     return figure
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -19,9 +18,10 @@ from matplotlib.patches import Patch
 from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
+    Line,
     add_plane_legend,
     draw_excess,
-    draw_level,
+    draw_levels,
     draw_plane,
     excess_keys,
     excess_style,
@@ -32,6 +32,7 @@ from jaxgran.plotting.drawing import (
     ALPHA_TITLE,
     LABEL_SIZE,
     NU_LABEL,
+    PANEL_TITLE,
     SMALL_SIZE,
     add_ring_legend,
     curve_key,
@@ -154,7 +155,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
     panels, fields, noisy, over = [], [], False, {}
     measured = np.ones(data.force_ratio.shape, bool)
     for axes, title in zip(grid[0], titles, strict=True):
-        axes.set_title(title, fontsize=LABEL_SIZE)
+        axes.set_title(title, **PANEL_TITLE)
     for axes in grid[1]:
         axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     for row, quantity in zip(grid, _QUANTITIES, strict=True):
@@ -172,7 +173,7 @@ def theory_errors(data: xr.Dataset) -> Figure:
     finish(figure, data, measured, [_THEORY_NOTE, found, status_note(data), missing_note(measured, " (hatched)")])
     fix_layout(figure)
     for axes, lines, over in panels:
-        label_contours(axes, list(lines.items()), over, room=4.0)
+        label_contours(axes, lines, over, room=4.0)
     return figure
 
 
@@ -181,9 +182,7 @@ def noise_keys() -> list[Patch]:
     return [Patch(facecolor="white", edgecolor="0.5", hatch="....", linewidth=0, label="within ± std. error")]
 
 
-def draw_errors(
-    axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray
-) -> tuple[dict[str, QuadContourSet], bool]:
+def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray) -> tuple[dict[str, Line], bool]:
     """Draw contours and faint shades of an error, the logarithm of a quotient.
 
     Return the lines by their labels, and whether the error is anywhere smaller than its standard error.
@@ -199,14 +198,11 @@ def draw_errors(
         dots = axes.contourf(x, y, in_errors, [-1.0, 1.0], colors="none", hatches=["...."], zorder=2)
         dots.set_edgecolor("0.5")
         dots.set_linewidth(0.0)
-    drawn = {}
-    for label, level in ERROR_LEVELS.items():
-        style = {"colors": "black", "linewidths": 0.9, "linestyles": "-" if level > 0.0 else "--", "zorder": 3}
-        line = draw_level(axes, x, y, field, level, **style)
-        if line is not None:
-            drawn[label] = line
+    dashes = ["-" if level > 0.0 else "--" for level in ERROR_LEVELS.values()]
+    style = {"colors": "black", "linewidths": 0.9, "linestyles": dashes, "zorder": 3}
+    lines = draw_levels(axes, x, y, field, ERROR_LEVELS, **style)
     draw_plane(axes, data, field, np.isfinite(value))
-    return drawn, hidden
+    return lines, hidden
 
 
 # -------------------------------------------------------------------------------------------- clusters
@@ -252,7 +248,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     finish(figure, data, measured, [_CLUSTER_NOTE, beyond, found, status_note(data), missing_note(measured)])
     fix_layout(figure)
     if plane:
-        label_contours(axes["m"], [(f"{level:.2f}", line) for level, line in lines.items()], over.values())
+        label_contours(axes["m"], {f"{level:.2f}": line for level, line in lines.items()}, over.values())
     return figure
 
 
@@ -273,7 +269,7 @@ def _draw_shares(axes: Axes, data: xr.Dataset, name: str) -> None:
         axes.scatter(excess[k], share[k], **mark, zorder=4)
     mark_bad(axes, excess[bad], share[bad])
     for level in EXCESS_LEVELS:
-        axes.axvline(level, **(excess_style("color", "linewidth", level) | {"zorder": 0.5, "alpha": 0.3}))
+        axes.axvline(level, **(excess_style(level) | {"zorder": 0.5, "alpha": 0.3}))
     axes.set_ylim(-0.03, 1.03)
     axes.set_yticks((0.0, 0.25, 0.5, 0.75, 1.0))
     axes.grid(axis="y", color="0.9", linewidth=0.6, zorder=0)
@@ -292,20 +288,20 @@ def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
 
 def _draw_share_plane(
     axes: Axes, data: xr.Dataset, measured: np.ndarray
-) -> tuple[dict[float, QuadContourSet], dict[float, QuadContourSet]]:
+) -> tuple[dict[float, Line], dict[float, Line]]:
     """Draw the share of the pressure in the plane; return its contours and those of the excess."""
     x, y = refined_axes(data)
     field = interpolated(data.cluster_pressure_share.values)
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
     axes.contourf(x, y, field, [-1e9, *SHARE_LEVELS, 1e9], colors=greys, zorder=1)
-    style = {"colors": "black", "linewidths": 1.0, "zorder": 3}
-    lines = {level: draw_level(axes, x, y, field, level, **style) for level in SHARE_LEVELS}
+    levels = {level: level for level in SHARE_LEVELS}
+    lines = draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.0, zorder=3)
     over = draw_excess(axes, data)
     draw_plane(axes, data, field, measured)
     axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
-    axes.set_title("share of pressure", fontsize=LABEL_SIZE)
-    return {level: line for level, line in lines.items() if line is not None}, over
+    axes.set_title("share of pressure", **PANEL_TITLE)
+    return lines, over
 
 
 def _add_share_legend(figure: Figure, data: xr.Dataset) -> None:
