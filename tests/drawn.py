@@ -44,12 +44,19 @@ class ContourLine(NamedTuple):
 def contour_lines(axes: Axes, colour: str) -> dict[float, ContourLine]:
     """Return the contours of a colour, by their level; a short one may be all under its label."""
     lines = {}
-    sets = [artist for artist in axes.collections if isinstance(artist, QuadContourSet) and not artist.filled]
-    for drawn in (one for one in sets if same_color(one.get_edgecolor()[0][:3], colour)):
+    for drawn in axes.collections:
+        if not isinstance(drawn, QuadContourSet) or drawn.filled or not same_color(colour_of(drawn), colour):
+            continue
         labels = list(zip(drawn.labelCValues, (text.get_text() for text in drawn.labelTexts), strict=True))
-        styles = zip(drawn.levels, drawn.get_paths(), drawn.get_linestyle(), drawn.get_linewidth(), strict=True)
-        for number, (level, path, (_, dashes), width) in enumerate(styles):
+        widths, dashes = np.atleast_1d(drawn.get_linewidth()), drawn.get_linestyle()
+        for number, (level, path) in enumerate(zip(drawn.levels, drawn.get_paths(), strict=True)):
             own = [text for of, text in labels if of == number]
             if len(path) or own:
-                lines[float(level)] = ContourLine(np.asarray(path.vertices), dashes is not None, width, own)
+                dashed = dashes[number][1] is not None
+                lines[float(level)] = ContourLine(np.asarray(path.vertices), dashed, widths[number], own)
     return lines
+
+
+def colour_of(drawn: QuadContourSet) -> np.ndarray:
+    """Return the colour of the first of several contours, without its transparency."""
+    return np.atleast_2d(drawn.get_edgecolor())[0, :3]

@@ -41,14 +41,11 @@ class Line(NamedTuple):
 
     drawn: QuadContourSet
     number: int
+    value: float
 
     @property
     def path(self) -> MplPath:
         return self.drawn.get_paths()[self.number]
-
-    @property
-    def value(self) -> float:
-        return float(self.drawn.levels[self.number])
 
 
 # ----------------------------------------------------------------------------------------------- plane
@@ -78,7 +75,7 @@ def draw_levels(
     if not any(crossed):
         return {}
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
-    lines = {key: Line(drawn, number) for number, key in enumerate(levels) if crossed[number]}
+    lines = {key: Line(drawn, number, value) for number, (key, value) in enumerate(levels.items()) if crossed[number]}
     return {key: line for key, line in lines.items() if len(line.path)}
 
 
