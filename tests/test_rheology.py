@@ -6,6 +6,7 @@ import xarray as xr
 from made_up_maps import FRACTION, FRICTION, dense_map, power
 from synthetic import one_sentence
 
+from jaxgran.inference import friction_law as module
 from jaxgran.inference.friction_law import FrictionLaw, dense_points, friction_law
 
 
@@ -24,7 +25,11 @@ def test_law_without_noise_is_found() -> None:
 
 
 @pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9, -0.9])
-def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(correlation: float) -> None:
+def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(
+    correlation: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of all points; laws of each restitution are left out, as they take three times as long."""
+    monkeypatch.setattr(module, "enough", lambda points: len(np.unique(points.restitution)) > 1)
     seeds = 40
     pulls, squares = [], []
     for seed in range(seeds):
