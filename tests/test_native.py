@@ -6,23 +6,27 @@ The thread block is interpreted here. That Pallas can lower it for a GPU needs n
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
+import compiled_programs
 import jax
 import jax.numpy as jnp
+import numba
 import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from jaxgran.dynamics import advance as advance_module
+from jaxgran.dynamics import collision
 from jaxgran.dynamics import engine as engine_module
 from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
 from jaxgran.dynamics.machine_code import cluster_solver, layout
+from jaxgran.dynamics.machine_code.ffi import object_file
 from jaxgran.dynamics.machine_code.near_pairs import LIFE, find_near_pairs, skin_loss
 from jaxgran.dynamics.tally import empty_tally
-from jaxgran.dynamics.thread_block import kernel, solver
+from jaxgran.dynamics.thread_block import kernel
 from jaxgran.model.checks import InputError
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
@@ -156,8 +160,8 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
 
 
 @pytest.fixture
-def gpu(monkeypatch):
-    """Processors that pass for GPUs, with a kernel that is interpreted."""
+def gpu(monkeypatch, engines):
+    """Processors that pass for GPUs, with the kernel that is interpreted, and compiled for other tests already."""
     _forget()
 
     class Device:
@@ -166,7 +170,8 @@ def gpu(monkeypatch):
     device = Device()
     monkeypatch.setattr(jax, "devices", lambda *_: [device])
     monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
-    monkeypatch.setattr(kernel, "advance", partial(kernel.advance, interpret=True))
+    monkeypatch.setattr(kernel, "advance", engines["thread_block"])
+    monkeypatch.setattr(kernel, "jax", SimpleNamespace(jit=lambda compiled: compiled))
     yield monkeypatch
     _forget()
 
@@ -189,24 +194,29 @@ def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
         select_engine(replace(flow, engine="machine_code"), state)
 
 
-def unsolved(thread, contacts, most, width, target):
-    return solver.Solve(3 + thread.flow.ok, 0 * target, thread.flow.ok)
-
-
 def broken(*_):
     raise RuntimeError("no such\ninstruction")
 
 
+def unsolved(advance, flow, state, steps):
+    return advance(replace(flow, max_iterations=1), state, steps)
+
+
+def late(advance, flow, state, steps):
+    return advance(replace(flow, timestep=0.1), state, steps)
+
+
 @pytest.mark.parametrize(
-    ("place", "failure", "said"),
+    ("failure", "said"),
     [
-        (kernel, broken, "no such instruction"),
-        (solver, unsolved, "it fails in overlaps"),
+        (broken, "no such instruction"),
+        (unsolved, "it fails in the contact law, clusters"),
+        (late, "it fails in overlaps"),
     ],
 )
-def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, place, failure, said) -> None:
-    gpu.setattr(place, "advance" if place is kernel else "_descend", failure)
-    flow, state = replace(of(0.6), grains=40 if place is solver else GRAINS), flowing(0.6)  # traced for no other
+def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, failure, said) -> None:
+    gpu.setattr(kernel, "advance", partial(failure, kernel.advance))
+    flow, state = of(0.6), flowing(0.6)
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
         assert select_engine(flow, state) == "jax"
     assert select_engine(flow, state) == "jax"  # and says so once
@@ -225,8 +235,9 @@ def without_a_gpu() -> AbstractContextManager:
 @pytest.mark.parametrize(
     ("count", "dtype"), [(16, jnp.float64), pytest.param(300, jnp.float32, marks=pytest.mark.slow), (1024, jnp.float32)]
 )
-def test_the_kernel_lowers_for_a_gpu(count, dtype) -> None:
+def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
     """To a Triton module in which a thread is a grain, so that what a thread has written is its own."""
+    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (1, 3 * grains))  # of the plain advance
     replicas = 3
 
     def some(*shape: int) -> jax.ShapeDtypeStruct:
@@ -246,15 +257,27 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype) -> None:
         assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
 
 
-def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing) -> None:
-    flow, state = of(0.78), flowing(0.78)
-    lost = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan))
-    advance = jax.jit(jax.vmap(partial(kernel.advance, flow, interpret=True), axis_name=AXIS))
-    states, steps = (state, lost, state), jnp.asarray([40, 40, 0], jnp.int32)
-    after, tally = advance(jax.tree.map(lambda *x: jnp.stack(x), *states), steps)
+@pytest.fixture(scope="module")
+def grid_run():
+    """``grid_run(flow, states, steps)``: three replicas in a grid, in single precision."""
+    interpreted = jax.vmap(partial(kernel.advance, interpret=True), (None, 0, 0), axis_name=AXIS)
+    advance = jax.jit(interpreted)
+
+    def run(flow, states, steps):
+        stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *states)
+        return jax.tree.map(np.asarray, advance(flow, stacked, np.asarray(steps, np.int32)))
+
+    return run
+
+
+def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing, grid_run) -> None:
+    flow, state = of(0.78, tolerance=1e-6), flowing(0.78)
+    lost, steps = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan)), [40, 40, 0]
+    after, tally = grid_run(flow, (state, lost, state), steps)
     assert tally.status.tolist() == [Status.ok, Status.nonfinite, Status.ok]
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[2], after), state)
-    other = advance(jax.tree.map(lambda *x: jnp.stack(x), state, flowing(0.78, 1), lost), steps)  # other neighbours
+    before = jax.tree.map(np.float32, state)
+    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[2], after), before)
+    other = grid_run(flow, (state, flowing(0.78, 1), lost), steps)  # other neighbours
     jax.tree.map(np.testing.assert_array_equal, *(jax.tree.map(lambda x: x[0], of) for of in ((after, tally), other)))
 
 
@@ -279,12 +302,10 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
         assert np.sum(tally.residual_counts) == tally.solves
 
 
-def test_single_precision_is_double_precision_to_its_rounding(flowing, engines) -> None:
+def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run, engines) -> None:
     flow, state = of(0.7, tolerance=1e-6), flowing(0.7)
-    run = engines["thread_block"]
-    (after, tally), (expected, sums) = (
-        run(flow, jax.tree.map(lambda x, d=d: x.astype(d), state), 100) for d in (jnp.float32, jnp.float64)
-    )
+    after, tally = jax.tree.map(lambda x: x[0], grid_run(flow, (state, state, state), [100, 0, 0]))
+    expected, sums = engines["thread_block"](flow, state, 100)
     assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
     np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
@@ -308,6 +329,7 @@ def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) 
 
     monkeypatch.setattr(plain_module, "advance", plain)
 
+    @jax.jit
     def velocities(alpha):
         flow = replace(of(0.6, engine=engine), restitution=alpha)
         return advance_module.advance(flow, state, jnp.int32(30))[0].velocities
@@ -366,7 +388,12 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distanc
     assert closed <= skin_loss.py_func(fastest, shear_rate, distance) * time * (1 + 1e-12)
 
 
-near_pairs_found = njit(find_near_pairs.py_func)  # with a way in from Python
+@pytest.fixture(scope="module")
+def near_pairs_found():
+    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the machine code is the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numba.config, "CACHE_DIR", str(compiled_programs.compiled_programs() / object_file().stem))
+        return numba.njit(cache=True)(find_near_pairs.py_func)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -377,7 +404,7 @@ near_pairs_found = njit(find_near_pairs.py_func)  # with a way in from Python
     skin=st.floats(0.01, 1.0),
     seed=st.integers(0, 10**6),
 )
-def test_near_pairs_are_those_of_all_images(count, packing_fraction, tilt, skin, seed) -> None:
+def test_near_pairs_are_those_of_all_images(near_pairs_found, count, packing_fraction, tilt, skin, seed) -> None:
     rng = np.random.default_rng(seed)
     radii = rng.uniform(0.37, 0.63, count)
     side = np.sqrt(np.pi * np.sum(radii**2) / packing_fraction)
