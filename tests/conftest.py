@@ -51,6 +51,7 @@ def pytest_collection_finish():
     collision_model = sys.modules.get("jaxgran.inference.collision_model")
     if collision_model is not None:  # tests of fits would take twice the time
         collision_model._best_unknowns = compiled_programs.optimised(collision_model._best_unknowns)
+        collision_model._CHUNK = 64  # most fits have few collisions, and a part of a chunk takes as long as a whole one
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
