@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled_programs import optimised
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from jax import lax
@@ -367,7 +368,7 @@ def planes_in_time(flowing, run):
     state = flowing(0.78)
     heights = (jnp.arange(8.0) + 0.5) / 8 * state.side
 
-    @jax.jit
+    @optimised
     def block(flow, state):
         def step(now, _):
             seen = snapshot(flow, now)
