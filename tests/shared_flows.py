@@ -37,12 +37,12 @@ pytest.GRAINS = GRAINS
 
 
 class Compiled:
-    """A function compiled once per shape, that counts how often it is traced."""
+    """A function compiled once per shape, and optimised, that counts how often it is traced."""
 
     def __init__(self, function):
         self.traces = 0
         self._function = function
-        self._call = jax.jit(self._traced)
+        self._call = compiled_programs.optimised(self._traced)
 
     def _traced(self, *arguments):
         self.traces += 1
@@ -95,7 +95,7 @@ def engine_run(engine, engines):
 @pytest.fixture(scope="session")
 def packed():
     """``packed(packing_fraction, seed=0)``: a packing at rest."""
-    compiled = jax.jit(pack)
+    compiled = compiled_programs.optimised(pack)
 
     @cache
     def packing(packing_fraction: float, seed: int = 0) -> State:
