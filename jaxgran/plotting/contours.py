@@ -33,11 +33,11 @@ _LABEL_DISTANCE = 28.0  # points between the middles of two labels, slightly mor
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
 
-Key = TypeVar("Key", str, float)
+_Key = TypeVar("_Key", str, float)
 
 
 class Line(NamedTuple):
-    """The contour of one value, drawn together with others."""
+    """The contour of one value, which is drawn together with those of others and counted among them."""
 
     drawn: QuadContourSet
     number: int
@@ -67,8 +67,8 @@ def excess_value(level: float) -> float:
 
 
 def draw_levels(
-    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, levels: Mapping[Key, float], **styles: Any
-) -> dict[Key, Line]:
+    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, levels: Mapping[_Key, float], **styles: Any
+) -> dict[_Key, Line]:
     """Draw the contours of a field at increasing values, in one style or one for each; return those that there are."""
     low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
     crossed = [low < value < high for value in levels.values()]
