@@ -65,7 +65,7 @@ SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "ac
 SAME += ("solver", "engine", "solver_asked", "engine_asked")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "losses", "clusters", "errors")}
 FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
-SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "64", "--timestep", "auto"]
+SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
 STRESSES = ["--packing-fraction", "0.7", "--pressure", "3", "--shear-stress", "1"]
 
@@ -384,7 +384,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     data = read_dataset(folder / "flow.nc")
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
     words = " ".join(outcome.out.split())
-    assert words.startswith(f"64 grains, dt = {data.attrs['timestep']:g} / shear rate, midpoint activation ")
+    assert words.startswith(f"32 grains, dt = {data.attrs['timestep']:g} / shear rate, midpoint activation ")
     assert f" engine machine_code, solver {data.attrs['solver']} " in words
     groups = [line.strip() for line in outcome.out.splitlines()]
     places = [groups.index(name) for name in ("Forces", "Stresses", "Motion and structure", "Quality of the run")]
