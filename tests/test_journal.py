@@ -21,7 +21,7 @@ from jaxgran.sampling.batch import advance_batch, stack
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 
 KEYS = [(0, 0), (1, 0)]
-GRAINS = 32  # as in the tests of the protocol: compiled once
+GRAINS = 32  # as in the tests of the protocol and of maps, whose keys are numbers too: compiled once
 
 
 class CutOff(Exception):
@@ -43,7 +43,7 @@ def cut_after(drive, calls: int):
 
 def measured(drive) -> Any:
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-2) for alpha in (0.5, 0.9)])
-    batch = prepare_batch(flow, jax.random.split(jax.random.key(0), 2), 0.5, drive)
+    batch = prepare_batch(flow, jax.random.key_data(jax.random.split(jax.random.key(0), 2)), 0.5, drive)
     return sample_batch(batch, 0.64, drive)
 
 

@@ -130,7 +130,11 @@ def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
     assert np.sum(masses * velocities**2) / (2 * GRAINS) == pytest.approx(0.25, rel=1e-12)
     np.testing.assert_allclose(np.sum(masses * velocities, axis=0), 0, atol=1e-12)
     prepared = prepare(flow, jax.random.key(1), equilibrate=0.05, grains=grains)
-    for one in (state, prepared):
+    keys = jax.random.split(jax.random.key(1), 2)
+    both = prepare(flow, keys, equilibrate=0.05, grains=grains)
+    alone = prepare(flow, keys[1], equilibrate=0.05, grains=grains)
+    jax.tree.map(np.testing.assert_array_equal, both[1], alone)
+    for one in (state, prepared, alone):
         np.testing.assert_array_equal(one.grains.radii, grains.radii)
         np.testing.assert_array_equal(one.grains.masses, grains.masses)
     assert prepared.tilt != 0 and np.all(np.isfinite(prepared.velocities))
