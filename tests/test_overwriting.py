@@ -5,23 +5,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas
+from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from drawn import write_without_drawing
 
 from jaxgran.maps import sweep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import is_finished, read_dataset
+from jaxgran.maps.schema import ERROR_PARTS
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
+from jaxgran.plotting.theory import SHARES
+from jaxgran.sampling.budget import BUDGET
 
 MAP = ("map", *POINTS, "--seeds", "1")
 BOTH = {(0, 0): Status.ok, (1, 0): Status.ok}
 
 
 def made_up_maps(patch: pytest.MonkeyPatch) -> None:
-    """Maps of made-up replicas, whose pictures are files of a few bytes."""
+    """Maps of made-up replicas, whose pictures are files of a few bytes.
+
+    Their own files have what is printed and what decides which pictures there are.
+    """
     write_without_drawing(patch)
+    errors = {f"{name}_{ending}" for name in BUDGET for ending, _ in ERROR_PARTS.values()}
+    write_few_variables(patch, "timestep_by_seed", *BUDGET, *errors, *SHARES)
     patch.setattr(sweep, "replicas", made_up_replicas(BOTH))
 
 
