@@ -45,6 +45,7 @@ TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the
 DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
 LEAST_NOISE = 1e-5  # of positions and velocities, in the units of the fit; rounding and time steps make as much
 LONGEST_STEP = 0.5  # diameters by which neighbours move apart between frames; at more, a disc meets several others
+_BETTER_TRACKS = "take more frames in the same time, or give the noise if it is known."
 _LARGEST_MISFIT = 9.0  # above it, the noise that was measured or given is a third of what it would have to be
 _LASTING = (0.22, 0.4)  # share of lasting changes without and with velocities; hard discs in clusters have half of it
 _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
@@ -154,8 +155,8 @@ def fit_restitution(
         best = _found(flights, noise, struck)
         if best.misfit > _LARGEST_MISFIT:
             raise InputError(
-                f"tracks must show collisions within their noise, and misfit it by a factor of {best.misfit:.2g}: take "
-                "more frames in the same time, or give the noise if it is known."
+                "tracks must show collisions within their noise, and misfit it by a factor of "
+                f"{best.misfit:.2g}: {_BETTER_TRACKS}"
             )
         low, high = _interval(best)
     fit = RestitutionFit(
@@ -268,7 +269,7 @@ def _settled(collisions: Collisions) -> _Best:
         if moved <= _SETTLED * error and k > 1:
             rejected = int(without_repeats(collisions, fitted, alone).sum() - used.sum())
             return _Best(collisions, fitted, used, alpha, error, scale, max(rejected, 0))
-    raise RuntimeError(f"the restitution did not settle: it was last {alpha:.3g}.")
+    raise RuntimeError(f"the restitution did not settle, and was {alpha:.3g} last: {_BETTER_TRACKS}")
 
 
 def _interval(best: _Best) -> tuple[float, float]:
