@@ -1,4 +1,4 @@
-"""What a figure shows, as text."""
+"""What a figure shows: its texts, and its contours as numbers."""
 
 from pathlib import Path
 from typing import NamedTuple

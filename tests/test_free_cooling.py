@@ -30,7 +30,7 @@ def gases() -> list[State]:
 
     Their keys are numbers, as in a map: what packs them is compiled once for both.
     """
-    elastic, keys = replace(FLOW, restitution=1.0), [jax.random.key_data(jax.random.key(k)) for k in range(SEEDS)]
+    elastic, keys = replace(FLOW, restitution=1.0), [jax.random.PRNGKey(k) for k in range(SEEDS)]
     return [cooling(elastic, heated(FLOW, key), TIMES / 2)[0] for key in keys]
 
 

@@ -43,7 +43,7 @@ def cut_after(drive, calls: int):
 
 def measured(drive) -> Any:
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-2) for alpha in (0.5, 0.9)])
-    batch = prepare_batch(flow, jax.random.key_data(jax.random.split(jax.random.key(0), 2)), 0.5, drive)
+    batch = prepare_batch(flow, jax.random.split(jax.random.PRNGKey(0), 2), 0.5, drive)
     return sample_batch(batch, 0.64, drive)
 
 

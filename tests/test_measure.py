@@ -43,7 +43,7 @@ def assert_agree(measured: Sample, expected: Sample) -> None:
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    keys = jax.random.key_data(jax.random.split(jax.random.key(0), 2))  # numbers, as in a map: compiled once for both
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)  # numbers, as in a map: compiled once for both
     return prepare_batch(stack(FLOWS), keys, equilibrate=0.5)
 
 

@@ -39,7 +39,7 @@ def replica(tree: Any, k: int) -> Any:
 
 @pytest.fixture(scope="module")
 def keys() -> jax.Array:
-    return jax.random.key_data(jax.random.split(jax.random.key(0), 2))
+    return jax.random.split(jax.random.PRNGKey(0), 2)
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
     monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
     flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3, 2e-4, 1e-5)]
-    keys = jax.random.key_data(jax.random.split(jax.random.key(5), len(flows)))
+    keys = jax.random.split(jax.random.PRNGKey(5), len(flows))
     together = prepare_batch(stack(flows), keys, equilibrate=0.1)
     for k, flow in enumerate(flows):
         alone = prepare_batch(stack([flow]), keys[k : k + 1], equilibrate=0.1)

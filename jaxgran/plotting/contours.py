@@ -61,9 +61,8 @@ def excess_field(data: xr.Dataset) -> np.ma.MaskedArray:
     return interpolated(contour_variable(data.force_ratio.values - 1.0))
 
 
-def excess_value(level: float) -> float:
-    """Return the contour variable at an excess."""
-    return float(contour_variable(np.array(level)))
+EXCESS_VALUES = {level: float(contour_variable(np.array(level))) for level in EXCESS_LEVELS}
+"""The contour variable at the levels of the excess."""
 
 
 def draw_levels(
@@ -199,10 +198,9 @@ def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
 def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, Line]:
     """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
     x, y = refined_axes(data)
-    levels = {level: excess_value(level) for level in EXCESS_LEVELS}
     widths = [_excess_width(level) for level in EXCESS_LEVELS]
     style = {"colors": _EXCESS_COLOUR, "linewidths": widths, **_EXCESS_STYLE}
-    return draw_levels(axes, x, y, excess_field(data), levels, **style)
+    return draw_levels(axes, x, y, excess_field(data), EXCESS_VALUES, **style)
 
 
 def excess_style(level: float) -> dict[str, Any]:

@@ -27,12 +27,12 @@ from jaxgran.maps.schema import RATIO, finest, require_map, shear_stress_ratio, 
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
+    EXCESS_VALUES,
     add_plane_legend,
     contour_variable,
     draw_levels,
     draw_plane,
     excess_field,
-    excess_value,
     label_contours,
 )
 from jaxgran.plotting.drawing import (
@@ -136,11 +136,11 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     figure = empty_figure(width=4.5, height=4.1)
     axes = figure.add_subplot()
     _shade(axes, x, y, field)
-    levels = {level: excess_value(level) for level in EXCESS_LEVELS}
-    lines = draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.1, zorder=3)
+    lines = draw_levels(axes, x, y, field, EXCESS_VALUES, colors="black", linewidths=1.1, zorder=3)
+    values = [line.value for line in lines.values()]
     widths = interpolation_error(data, contour_variable(excess))
-    between = _draw_interpolation(axes, x, y, field, widths, lines)
-    banded = _draw_bands(axes, x, y, excess, stderr, lines)
+    between = _draw_interpolation(axes, x, y, field, widths, values)
+    banded = _draw_bands(axes, x, y, excess, stderr, values)
     draw_plane(axes, data, field, measured)
     axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
@@ -272,7 +272,7 @@ def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
 def _shade(axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray) -> None:
     """Fill the intervals between the levels with faint greys, darker for a larger excess."""
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(EXCESS_LEVELS) + 1)]
-    axes.contourf(x, y, field, [-1e9, *map(excess_value, EXCESS_LEVELS), 1e9], colors=greys, zorder=1)
+    axes.contourf(x, y, field, [-1e9, *EXCESS_VALUES.values(), 1e9], colors=greys, zorder=1)
 
 
 def _draw_bands(
@@ -281,14 +281,14 @@ def _draw_bands(
     y: np.ndarray,
     excess: np.ndarray,
     stderr: np.ndarray,
-    levels: Iterable[float],
+    values: Iterable[float],
 ) -> bool:
-    """Shade where the excess agrees with a level within one standard error; return whether any was drawn."""
+    """Shade where the contour variable agrees with a value within one standard error; return whether any was drawn."""
     low, middle, high = (interpolated(contour_variable(excess + k * stderr)) for k in (-1.0, 0.0, 1.0))
     below, above = np.ma.maximum(middle - low, 1e-9), np.ma.maximum(high - middle, 1e-9)
     drawn = False
-    for level in map(excess_value, levels):
-        difference = level - middle
+    for value in values:
+        difference = value - middle
         in_errors = np.ma.where(difference > 0.0, difference / above, difference / below)
         if np.ma.min(abs(in_errors), fill_value=np.inf) < 1.0:
             axes.contourf(x, y, in_errors, [-1.0, 1.0], colors=[_BAND], alpha=0.45, zorder=2)
@@ -297,10 +297,10 @@ def _draw_bands(
 
 
 def _draw_interpolation(
-    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, widths: np.ndarray, levels: Iterable[float]
+    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, widths: np.ndarray, values: Iterable[float]
 ) -> bool:
-    """Shade where the contour variable agrees with a level within the error of interpolation; return if anywhere."""
-    distances = [abs(field - excess_value(level)) for level in levels]
+    """Shade where the contour variable agrees with a value within the error of interpolation; return if anywhere."""
+    distances = [abs(field - value) for value in values]
     if not distances or not widths.any():
         return False
     inside = widths - np.ma.min(np.ma.stack(distances), axis=0)

@@ -248,7 +248,7 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     finish(figure, data, measured, [_CLUSTER_NOTE, beyond, found, status_note(data), missing_note(measured)])
     fix_layout(figure)
     if plane:
-        label_contours(axes["m"], {f"{level:.2f}": line for level, line in lines.items()}, over.values())
+        label_contours(axes["m"], lines, over.values())
     return figure
 
 
@@ -286,15 +286,13 @@ def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
     return shown
 
 
-def _draw_share_plane(
-    axes: Axes, data: xr.Dataset, measured: np.ndarray
-) -> tuple[dict[float, Line], dict[float, Line]]:
-    """Draw the share of the pressure in the plane; return its contours and those of the excess."""
+def _draw_share_plane(axes: Axes, data: xr.Dataset, measured: np.ndarray) -> tuple[dict[str, Line], dict[float, Line]]:
+    """Draw the share of the pressure in the plane; return its contours by their labels, and those of the excess."""
     x, y = refined_axes(data)
     field = interpolated(data.cluster_pressure_share.values)
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
     axes.contourf(x, y, field, [-1e9, *SHARE_LEVELS, 1e9], colors=greys, zorder=1)
-    levels = {level: level for level in SHARE_LEVELS}
+    levels = {f"{level:.2f}": level for level in SHARE_LEVELS}
     lines = draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.0, zorder=3)
     over = draw_excess(axes, data)
     draw_plane(axes, data, field, measured)
