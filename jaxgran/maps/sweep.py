@@ -408,7 +408,7 @@ def _measured(
     """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
-    keys = jnp.asarray(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
+    keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)

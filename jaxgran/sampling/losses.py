@@ -27,7 +27,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -94,10 +93,10 @@ def _parts(stress: Array | np.ndarray) -> dict[str, Any]:
 
 def _transfer(flow: ShearFlow, tensors: Array | np.ndarray) -> list[dict[str, Any]]:
     """Pressure and shear stress of ``momentum_transfer``, and the same times the speed, at tensors (rows, 2, 2)."""
-    tensors, count = np.asarray(tensors), len(tensors)
+    tensors, count = np.asarray(tensors, float), len(tensors)
     numbers = [np.asarray(x) for x in (flow.restitution, flow.packing_fraction, flow.shear_rate, flow.polydispersity)]
     filled = tensors[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(-1, _TOGETHER, 2, 2)
-    found = [_momentum_transfer(jnp.asarray(part, float), *map(jnp.asarray, numbers)) for part in filled]
+    found = [_momentum_transfer(part, *numbers) for part in filled]
     return [_parts(np.concatenate([np.asarray(one[k], np.float64) for one in found])[:count]) for k in range(2)]
 
 

@@ -254,7 +254,7 @@ def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally
     """Advance every replica by its own strain; a replica with a number that is not finite is not advanced."""
     finite = batch.status < Status.nonfinite
     steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
-    state, tally = drive(batch.flow, batch.state, jnp.asarray(np.where(finite, steps, 0), jnp.int32))
+    state, tally = drive(batch.flow, batch.state, jax.device_put(np.where(finite, steps, 0).astype(np.int32)))
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
@@ -346,7 +346,7 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
     ladders = [timestep_ladder(*ends) for ends in zip(coarse[:, None], final[:, None], strict=True)]
     for timesteps in zip_longest(*ladders, fillvalue=np.nan):
         active = np.isfinite(timesteps)
-        current = jnp.asarray(np.where(active, timesteps, final), batch.state.side.dtype)
+        current = jax.device_put(np.where(active, timesteps, final).astype(batch.state.side.dtype))
         batch = batch._replace(flow=replace(flow, timestep=current))
         batch = _sheared(batch, np.where(active, _SHORTENING_STRAIN, 0.0), drive)
     batch = batch._replace(flow=flow)
