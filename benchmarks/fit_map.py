@@ -17,8 +17,8 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from matplotlib.figure import Figure
-from scipy.stats import binomtest
 
 import jaxgran as jg
 from benchmarks.event_driven import Law, averages, discs_of, sheared
@@ -79,7 +79,7 @@ def fitted(found: list[jg.Tracks], alpha: float) -> dict:
         return row
     off, errors = np.array([(fit.restitution - alpha, fit.stderr) for fit in fits]).T
     held = sum(fit.low <= alpha <= fit.high for fit in fits)
-    wilson = binomtest(held, len(fits)).proportion_ci(method="wilson")
+    wilson = scipy.stats.binomtest(held, len(fits)).proportion_ci(method="wilson")
     return row | {
         "held": held,
         "coverage": (wilson.low, wilson.high),

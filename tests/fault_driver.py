@@ -16,7 +16,9 @@ from jaxgran.maps import journal, sweep
 PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
 journal.SECONDS = 0.1  # so that its batches have journals
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
-sys.modules["jaxgran.plotting.map_figures"] = figures
+modules: dict[str, Any] = sys.modules
+modules["jaxgran.plotting.map_figures"] = figures
+modules["dask"] = None  # as for a user without a cluster: xarray would load it, which takes half a second
 advance_batch = sweep.advance_batch
 FAULT = os.environ.get("FAULT", "")
 

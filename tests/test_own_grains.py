@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from listed import build, listed_pairs, move, pairs_within
 from oracles import gaps_of
-from scipy.stats import norm
+from scipy.special import ndtri
 from synthetic import one_sentence
 
 from jaxgran.contact.near_pairs import widest_skin
@@ -32,7 +32,7 @@ LAWS = {
     "1 to 3": np.where(EVEN, 1.0, 3.0),
     "1 to 5": np.where(EVEN, 1.0, 5.0),
     "one of 2.5": np.where(np.arange(GRAINS) == 7, 2.5, 1.0),
-    "lognormal": np.exp(0.5 * norm.ppf((np.arange(GRAINS) + 0.5) / GRAINS)),
+    "lognormal": np.exp(0.5 * ndtri((np.arange(GRAINS) + 0.5) / GRAINS)),
 }
 
 

@@ -6,10 +6,9 @@ A contact is *loaded* when it carries an impulse. A *cluster* is a set of grains
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy  # its parts are loaded when they are used
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxgran.analysis.series import Curve, Measured, Sums, by_time, centres, histograms, ratio, series, with_errors
 from jaxgran.dynamics.snapshots import Snapshot
@@ -150,8 +149,8 @@ def clusters(seen: Snapshot) -> Clusters:
     times, grains = series(seen).state.positions.shape[:2]
     load = loaded_contacts(seen)
     edges = load.time * grains + load.i, load.time * grains + load.j
-    graph = coo_array((np.ones(load.time.size), edges), shape=(times * grains, times * grains))
-    labels = connected_components(graph, directed=False)[1]
+    graph = scipy.sparse.coo_array((np.ones(load.time.size), edges), shape=(times * grains, times * grains))
+    labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
     sizes = np.bincount(labels)[labels]
     return Clusters(labels.reshape(times, grains), sizes.reshape(times, grains))
 
@@ -209,7 +208,7 @@ def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence
     labels, load = clusters(seen).labels, loaded_contacts(seen)
     times, grains = labels.shape
     bond = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
-    bonds = coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
+    bonds = scipy.sparse.coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
 
     def joined(lag: int) -> tuple[np.ndarray, np.ndarray]:
         """Number of pairs joined both at t and at t + lag, for each t: by a contact, and by a cluster."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jaxgran.io.tracks import Tracks, displacements, nearest_image
 
@@ -33,7 +33,7 @@ _CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, over its error
 _ALONG = 0.95  # cosine of the angle between two changes of one contact
 _FEWEST_CHANGES = 20  # of which a share is taken
 _MOST_PAIRS = 20_000  # near pairs that are looked at in one go; each takes some kilobytes
-_BENT = np.append(np.inf, chi2.isf(_BEND, np.arange(1, 8 * (LONGEST + 1) + 1)))  # χ² of a bend, by degrees of freedom
+_BENT = np.append(np.inf, chdtri(np.arange(1, 8 * (LONGEST + 1) + 1), _BEND))  # χ² of a bend, by degrees of freedom
 
 
 class Noise(NamedTuple):
@@ -242,7 +242,7 @@ def weighed(flights: Flights, noise: Noise) -> Flights:
 
 def straight_drift(seen: Candidates) -> Bool[np.ndarray, " pairs"]:
     """Whether the centre of mass of each candidate flies straight, within the noise."""
-    return seen.drift < chi2.isf(_RARE, np.maximum(seen.drift_freedom, 1))
+    return seen.drift < chdtri(np.maximum(seen.drift_freedom, 1), _RARE)
 
 
 def _near(flights: Flights, k: int, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jaxgran.inference.collision_model import Collisions, Fitted
 from jaxgran.inference.collisions import (
@@ -52,7 +52,7 @@ _LARGEST_STEP = 0.2  # of α in one Gauss-Newton step
 _MOST_STEPS = 50
 _CHOOSING = 10  # steps, after which the collisions that are used stay the same
 _SETTLED = 1e-3  # step in standard errors, at which the iteration ends
-_LEVEL = chi2.ppf(0.95, 1)
+_LEVEL = chdtri(1, 0.05)  # the value of χ² that a share of 0.05 exceeds
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def _diameter_noise(best: _Best, assumed: float) -> float:
     free = gap[told] * (1 + variance / assumed**2)
 
     def excess(error: float) -> float:
-        return float(np.median(free**2 / (error**2 + variance)) - chi2.ppf(0.5, 1))
+        return float(np.median(free**2 / (error**2 + variance)) - chdtri(1, 0.5))
 
     if excess(LEAST_NOISE) <= 0:
         return LEAST_NOISE
@@ -240,7 +240,7 @@ def _settled(collisions: Collisions) -> _Best:
 
     Errors begin as large as the misfit of the best trial says, and shrink with it, at most to the noise.
     """
-    cut, middle = largest_misfit(collisions), chi2.ppf(0.5, collisions.freedom)
+    cut, middle = largest_misfit(collisions), chdtri(collisions.freedom, 0.5)
     trials = [(alpha, collisions.fitted(alpha)) for alpha in TRIALS]
 
     def loss(fitted: Fitted) -> float:

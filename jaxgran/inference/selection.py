@@ -5,7 +5,7 @@ The fit and the design of an experiment choose by the same rules, so that one pr
 
 import numpy as np
 from jaxtyping import Bool
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jaxgran.inference.collision_model import Collisions, Fitted
 from jaxgran.inference.collisions import straight_drift
@@ -19,7 +19,7 @@ _AT_ONCE = 1.0  # windows within which a disc does not collide twice, where it c
 
 def largest_misfit(collisions: Collisions) -> np.ndarray:
     """χ² of each candidate, above which it is no collision of these two discs alone: (collisions,)."""
-    return chi2.isf(_UNLIKELY, collisions.freedom)
+    return chdtri(collisions.freedom, _UNLIKELY)
 
 
 def of_two_discs(collisions: Collisions, fitted: Fitted) -> Bool[np.ndarray, " collisions"]:
