@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -103,10 +102,6 @@ def configure_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     programs._folder = lambda: None  # tests replace functions, of which the key of a kept program knows nothing
-    with suppress(ImportError, AttributeError):  # names of JAX's own; one context for each program takes 4 ms
-        from jax._src.interpreters import mlir
-
-        mlir.make_ir_context = cache(mlir.make_ir_context)
 
 
 def compiled_programs() -> Path:
