@@ -17,7 +17,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
+import scipy  # its parts are loaded when they are used
 from matplotlib.figure import Figure
 
 import jaxgran as jg

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts are loaded when they are used
 
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, DelassusProblem, entries, is_sparse
 from jaxgran.model.checks import InputError, known, require, shown
@@ -127,9 +128,8 @@ def _is_definite(scaled: Any, slack: float) -> bool:
 
 
 def _scaled(matrix: Any, factors: np.ndarray) -> Any:
-    from scipy.sparse import diags_array
-
-    return (diags_array(factors) @ matrix @ diags_array(factors)).tocsr()
+    diagonal = scipy.sparse.diags_array(factors)
+    return (diagonal @ matrix @ diagonal).tocsr()
 
 
 def _known_matrix(matrix: Any) -> Any:
@@ -139,10 +139,8 @@ def _known_matrix(matrix: Any) -> Any:
     rows, columns, values = (known(x) for x in entries(matrix))
     if rows is None or columns is None or values is None:
         return None
-    from scipy.sparse import coo_array
-
     inside = (rows < matrix.shape[0]) & (columns < matrix.shape[1])  # a BCOO is padded with indices outside of it
-    return coo_array((values[inside], (rows[inside], columns[inside])), shape=matrix.shape).tocsr()
+    return scipy.sparse.coo_array((values[inside], (rows[inside], columns[inside])), shape=matrix.shape).tocsr()
 
 
 def _contacts(problem: ContactProblem) -> int:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
-from scipy.special import chdtri
+from scipy.special import chdtri  # χ² of a probability to be exceeded; as in scipy.stats, which loads slowly
 
 from jaxgran.io.tracks import Tracks, displacements, nearest_image
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy  # its parts are loaded when they are used: that for fits takes longer than a figure
 import xarray as xr
 
 from jaxgran.maps.schema import finest, require_map
@@ -179,8 +180,6 @@ def _fit(
     x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, covariance_xy: np.ndarray, sign: float
 ) -> PowerLaw:
     """Return the law through points with errors in both coordinates; its coefficient has the given sign."""
-    from scipy.optimize import curve_fit  # here, as loading it takes longer than a figure
-
     low, high = ([-np.inf, 0.0, _EXPONENTS[0]], [np.inf, np.inf, _EXPONENTS[1]])
     scale = x.max()  # unit of the inertial number in the fit, so that coefficient and offset are of similar size
     parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error
@@ -198,7 +197,7 @@ def _fit(
         slope = sign * coefficient * exponent * (x / scale) ** (exponent - 1) / scale
         deviation = np.sqrt(np.maximum(y_error**2 + (slope * x_error) ** 2 - 2 * slope * covariance_xy, 1e-18))
         try:
-            parameters, covariance = curve_fit(
+            parameters, covariance = scipy.optimize.curve_fit(
                 law, x / scale, y, previous, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes
             )
         except RuntimeError:  # no convergence, because the points do not determine the exponent

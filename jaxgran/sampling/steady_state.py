@@ -254,7 +254,8 @@ def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally
     """Advance every replica by its own strain; a replica with a number that is not finite is not advanced."""
     finite = batch.status < Status.nonfinite
     steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
-    state, tally = drive(batch.flow, batch.state, jax.device_put(np.where(finite, steps, 0).astype(np.int32)))
+    counts = jax.device_put(np.where(finite, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
+    state, tally = drive(batch.flow, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
