@@ -30,7 +30,7 @@ from matplotlib.lines import Line2D
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.dynamics.tally import Tally
-from jaxgran.sampling.memory import memory_strain
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.statistics import jackknife, standard_errors
@@ -146,7 +146,7 @@ def repeats(plan: Plan, alpha: float, nu: float) -> tuple[float, jg.Sample]:
     flow = jg.ShearFlow(plan.grains, alpha, nu, plan.timestep)
     state, pilot = jg.sample(flow, jg.prepare(flow, jax.random.key(plan.repeats), equilibrate=10.0), PILOT)
     mass = float(np.sum(state.grains.masses))
-    memory = float(memory_strain(pilot.averages, plan.grains, mass, pilot.area, flow.shear_rate))
+    memory = float(flow_correlation_strain(pilot.averages, plan.grains, mass, pilot.area, flow.shear_rate))
     samples = []
     for seed in range(plan.repeats):
         state = jg.prepare(flow, jax.random.key(seed), equilibrate=PREPARED * memory)

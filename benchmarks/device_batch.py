@@ -19,8 +19,7 @@ import jaxgran as jg
 from benchmarks import rival_numba
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics import advance
-from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics import advance, jax_engine
 from jaxgran.dynamics.engine import select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
@@ -86,7 +85,7 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
     return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
 
 
-plain = jax.jit(lambda flows, states, steps: replicated(plain_module.advance)(flows, states, steps))
+plain = jax.jit(lambda flows, states, steps: replicated(jax_engine.advance)(flows, states, steps))
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

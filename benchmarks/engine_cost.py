@@ -1,7 +1,7 @@
-"""What an engine costs: replica-steps per second of the machine code and of JAX, replica by replica and in lockstep.
+"""What an engine costs: replica-steps per second of the numba engine and of JAX, replica by replica and in lockstep.
 
 The original design is the last way: JAX alone, all replicas of a batch in lockstep by ``vmap``, contacts by Jacobi
-iterations. The replicas of a batch are packings of one flow, prepared by the machine code; every way takes the same
+iterations. The replicas of a batch are packings of one flow, prepared by the numba engine; every way takes the same
 states through the same steps. Seconds are those that the processor spends, on one core, with compilation apart, so that
 other programs on the machine hardly matter.
 
@@ -78,7 +78,7 @@ def _in_lockstep(flow: jg.ShearFlow, states: jg.State, steps: jax.Array) -> tupl
 
 
 WAYS: dict[str, tuple[dict[str, str], Callable]] = {
-    "machine code": ({"engine": "machine_code"}, _in_turn),
+    "numba engine": ({"engine": "numba"}, _in_turn),
     "jax, lax.map": ({"engine": "jax"}, _in_turn),
     "jax, vmap": ({"engine": "jax"}, _in_lockstep),
     "jax, Jacobi, vmap": ({"engine": "jax", "solver": "jacobi"}, _in_lockstep),

@@ -222,13 +222,13 @@ def _collide(discs, law, near, life, limit, most, sums):
         nx, ny = sx / distance, sy / distance
         approach = ux * nx + uy * ny
         soft = now - last[i] < tc or now - last[j] < tc
-        bounce = 1.0 if soft else law.restitution
+        one_plus_alpha = 1.0 if soft else law.restitution
         reduced = masses[i] * masses[j] / (masses[i] + masses[j])
-        impulse = -(1 + bounce) * reduced * approach
+        impulse = -(1 + one_plus_alpha) * reduced * approach
         sums[CONTACT] += impulse * nx * sx
         sums[CONTACT + 1] += impulse * nx * sy
         sums[CONTACT + 2] += impulse * ny * sy
-        sums[DISSIPATION] += (1 - bounce * bounce) / 2 * reduced * approach * approach
+        sums[DISSIPATION] += (1 - one_plus_alpha * one_plus_alpha) / 2 * reduced * approach * approach
         sums[COLLISIONS] += 1
         if soft:
             sums[ELASTIC] += 1

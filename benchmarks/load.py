@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.output import Output
-from jaxgran.maps import sweep
+from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import write_dataset
@@ -55,7 +55,7 @@ def settings(restitutions: int, packing_fractions: int, seeds: int) -> MapSettin
 
 def timed(chosen: MapSettings) -> dict[str, float]:
     """Time of a sweep, of its batches, and of all else by point."""
-    inside, measured = 0.0, sweep._measured
+    inside, measured = 0.0, ratio_map_module._measured
 
     def counted(*arguments):
         nonlocal inside
@@ -65,11 +65,11 @@ def timed(chosen: MapSettings) -> dict[str, float]:
         return done
 
     swept(settings(2, 1, 2))  # compiles
-    sweep._measured, start = counted, time.perf_counter()
+    ratio_map_module._measured, start = counted, time.perf_counter()
     try:
         points, replicas = swept(chosen)
     finally:
-        sweep._measured = measured
+        ratio_map_module._measured = measured
     seconds = time.perf_counter() - start
     return {
         "points": points,
@@ -86,7 +86,7 @@ def swept(chosen: MapSettings) -> tuple[int, int]:
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "map.nc"
         checkpoint = Checkpoint(output, chosen, resume=False)
-        results = dict(sweep.replicas(chosen, "auto", 1, None, checkpoint))
+        results = dict(ratio_map_module.replicas(chosen, "auto", 1, None, checkpoint))
         data = map_dataset(chosen, results, {})
         write_dataset(data, output)
         checkpoint.close(finished=True)

@@ -33,7 +33,7 @@ _ENGINES = ("test_dynamics.py", "test_physics.py", "test_native.py")
 MISTAKES = (
     Mistake(
         "tolerance not squared",
-        "jaxgran/dynamics/machine_code/loop.py",
+        "jaxgran/dynamics/numba_engine/loop.py",
         "iterations, squared, spare, outcome = 1, 0.0, target * target, OK",
         "iterations, squared, spare, outcome = 1, 0.0, target * scale, OK",
         "a solve ends when its residual is below the tolerance; here, below the root of it",
@@ -41,7 +41,7 @@ MISTAKES = (
     ),
     Mistake(
         "skin of one grain",
-        "jaxgran/dynamics/machine_code/near_pairs.py",
+        "jaxgran/dynamics/numba_engine/near_pairs.py",
         "return 2 * fastest * (1 + LIFE) + rate * distance / 2",
         "return 1 * fastest * (1 + LIFE) + rate * distance / 2",
         "a list of near pairs holds until two of the fastest grains could have crossed its skin",
@@ -49,7 +49,7 @@ MISTAKES = (
     ),
     Mistake(
         "half of a closing gap",
-        "jaxgran/dynamics/machine_code/calendar.py",
+        "jaxgran/dynamics/numba_engine/calendar.py",
         "late = (excess > 0.0) & (excess + 2 * closing * horizon > 0.0)",
         "late = (excess > 0.0) & (excess + 1 * closing * horizon > 0.0)",
         "every contact that begins while a list is valid is in the calendar",
@@ -57,7 +57,7 @@ MISTAKES = (
     ),
     Mistake(
         "mass of the other grain",
-        "jaxgran/dynamics/machine_code/cluster_solver.py",
+        "jaxgran/dynamics/numba_engine/cluster_solver.py",
         "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mj, 0.0",
         "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mi, 0.0",
         "an impulse changes the velocity of a grain by its own mass",
@@ -65,7 +65,7 @@ MISTAKES = (
     ),
     Mistake(
         "ends of a chain",
-        "jaxgran/dynamics/machine_code/sums.py",
+        "jaxgran/dynamics/numba_engine/sums.py",
         "impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,",
         "impulse if loaded[i] > 1 and loaded[j] > 1 else 0.0,",
         "the moment of clusters counts a contact of which either grain feels another one",
@@ -81,7 +81,7 @@ MISTAKES = (
     ),
     Mistake(
         "skin given back",
-        "jaxgran/dynamics/plain.py",
+        "jaxgran/dynamics/jax_engine.py",
         "lists, slack = replace(lists, frame=frame), slack - loss * flight",
         "lists, slack = replace(lists, frame=frame), slack + loss * flight",
         "flight uses up the skin of a list, which is then renewed",
@@ -165,7 +165,7 @@ MISTAKES = (
         "late = np.stack(record[chunks // 3 :])",
         "late = np.stack(record[chunks // 2 :])",
         "a flow is steady by the last two thirds of its record",
-        ("test_protocol.py", "test_sweep.py"),
+        ("test_protocol.py", "test_ratio_map.py"),
     ),
     Mistake(
         "unit of a time step",
@@ -173,7 +173,7 @@ MISTAKES = (
         '"units": "1 / shear rate",',
         '"units": "1",',
         "an attribute has the unit of its variable",
-        ("test_dataset.py", "test_sweep.py", "test_engine.py"),
+        ("test_dataset.py", "test_ratio_map.py", "test_engine.py"),
     ),
     Mistake(
         "strain of a kept replica",

@@ -42,7 +42,7 @@ def sampled(flow: jg.ShearFlow, state: jg.State, observe=None) -> float:
 
 
 def run(output: Output) -> None:
-    """Time samples with and without an observable beside the machine code and in JAX, print them, and write JSON."""
+    """Time samples with and without an observable beside the numba engine and in JAX, print them, and write JSON."""
     rows = []
     print("engine          ν     dt   compilation (s)   with (s)   without (s)   ratio")
     for nu, dt in POINTS[: 1 if output.quick else None]:
@@ -50,7 +50,7 @@ def run(output: Output) -> None:
         state = jg.prepare(flow, jax.random.key(0))
         sampled(flow, state)
         without = median(sampled(flow, state) for _ in range(REPEATS))
-        for engine in ("machine_code", "jax"):
+        for engine in ("numba", "jax"):
             way = replace(flow, engine=engine)
             observe = observables(1.0 + len(rows))
             first = sampled(way, state, observe)

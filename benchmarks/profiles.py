@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 LARGEST_FACTOR = 1e3
 Style = tuple  # colour, marker, line style
 STYLES: dict[str, Style] = {  # of the solvers that are known; full lines are those of this program
-    "machine code": ("black", "o", "-"),
+    "numba engine": ("black", "o", "-"),
     "barzilai-borwein": ("tab:red", "s", "-"),
     "nesterov": ("tab:orange", "^", "-"),
     "jacobi": ("tab:brown", "v", "-"),

@@ -53,10 +53,10 @@ BENCHMARKS = (
         ("theory_check.json", "theory_check.png"),
     ),
     Benchmark(
-        "theory_losses",
+        "enskog_factors",
         "Which assumption of kinetic theory fails, and what of it survives dt → 0 and N → ∞?",
         (3, 0.5),
-        ("theory_losses.json", "theory_losses.png"),
+        ("enskog_factors.json", "enskog_factors.png"),
     ),
     Benchmark(
         "paper",
@@ -64,7 +64,7 @@ BENCHMARKS = (
         (20, 0.5),
         (
             "paper.nc",
-            *("paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_losses.png"),
+            *("paper_curves.png", "paper_contours.png", "paper_theory.png", "paper_factors.png"),
             *("paper_clusters.png", "paper_errors.png", "paper_rheology.png"),
         ),
     ),

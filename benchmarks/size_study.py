@@ -31,7 +31,7 @@ from benchmarks.size_figures import draw_profiles, draw_sizes, draw_waves
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES, boxes_across
 from jaxgran.environment import usable_cores
-from jaxgran.sampling.memory import memory_strain
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.sample import Sample, correlation_strains, estimates
 
 BLOCKS = 64
@@ -177,7 +177,7 @@ def expected_memory(plan: Plan, flow: int, grains: int, folder: Path) -> float:
 
 def memory_of(averages: Mapping[str, np.ndarray], nu: float, grains: int, area: float) -> float:
     """Strain that a flow of discs of mass d² remembers; their mass is 4/π of the area that they fill."""
-    return float(memory_strain(averages, grains, 4 / np.pi * nu * area, area, 1.0))
+    return float(flow_correlation_strain(averages, grains, 4 / np.pi * nu * area, area, 1.0))
 
 
 def kept_file(folder: Path, alpha: float, nu: float, grains: int) -> Path:
@@ -231,7 +231,7 @@ RESULTS = (
     "shear_stress",
     "granular_temperature",
     "local_granular_temperature",
-    "wave_share",
+    "longwave_energy_ratio",
     "force_ratio",
     "collision_rate",
     "macroscopic_friction",

@@ -47,11 +47,11 @@ def put_timers(command: str) -> None:
         from jax import monitoring
 
         from jaxgran import programs
-        from jaxgran.maps import sweep
+        from jaxgran.maps import ratio_map as ratio_map_module
 
         monitoring.register_event_duration_secs_listener(listen)
         programs._loaded = timed("loading programs", programs._loaded)
-        sweep.advance_batch = timed("flows", sweep.advance_batch)
+        ratio_map_module.advance_batch = timed("flows", ratio_map_module.advance_batch)
     if command in ("map", "plot"):
         from jaxgran.plotting import map_figures
 

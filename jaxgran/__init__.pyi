@@ -7,7 +7,7 @@ from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.residuals import ContactResiduals, contact_residuals
 from .contact.solve_contacts import ContactSolution, solve_contacts
 from .dynamics.advance import advance
-from .dynamics.plain import count_events
+from .dynamics.jax_engine import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
 from .inference.closure import Closure, predict
@@ -19,7 +19,7 @@ from .inference.stress_inversion import restitution_from_stresses
 from .io.track_files import read_tracks
 from .io.tracks import Tracks, tracks_of_states
 from .io.trajectory import Trajectory, read_trajectory, write_trajectory
-from .maps.sweep import ratio_map
+from .maps.ratio_map import ratio_map
 from .model.checks import InputError
 from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
@@ -27,10 +27,10 @@ from .model.state import State
 from .model.status import Status
 from .page.document import Page
 from .page.explore import explore
+from .plotting.enskog_factors import enskog_factors
 from .plotting.errors import dominating_errors
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
-from .plotting.losses import theory_losses
 from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
@@ -71,6 +71,7 @@ __all__ = [
     "count_events",
     "dominating_errors",
     "enable_cache",
+    "enskog_factors",
     "explore",
     "fields_at",
     "fisher_information",
@@ -101,7 +102,6 @@ __all__ = [
     "snapshot_series",
     "solve_contacts",
     "theory_errors",
-    "theory_losses",
     "tracks_of_states",
     "write_trajectory",
 ]

@@ -27,8 +27,8 @@ def enable_cache() -> Path | None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # or XLA logs a long error about tuning hints of kept programs
     import jax
 
-    if elsewhere():
-        warnings.warn(elsewhere(), stacklevel=2)
+    if fallback_message():
+        warnings.warn(fallback_message(), stacklevel=2)
     folder = cache_folder()
     programs = None if folder is None else folder / processor_kind()
     jax.config.update("jax_compilation_cache_dir", None if programs is None else str(programs))
@@ -36,14 +36,14 @@ def enable_cache() -> Path | None:
     return programs
 
 
-def elsewhere() -> str:
+def fallback_message() -> str:
     """Why programs are not kept in the user's cache folder, and where they are, in a sentence; "" if they are there."""
     folder = cache_folder()
     if folder == users_folder():
         return ""
     instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
     return (
-        f"the cache folder {str(users_folder())!r} cannot be written ({obstacle(users_folder())}), so {instead}; "
+        f"the cache folder {str(users_folder())!r} cannot be written ({why_unwritable(users_folder())}), so {instead}; "
         "XDG_CACHE_HOME may name another."
     )
 
@@ -55,10 +55,10 @@ def users_folder() -> Path:
 
 def cache_folder() -> Path | None:
     """The user's folder, or else the temporary one; None if neither can be written."""
-    return _temporary_folder() if obstacle(users_folder()) else users_folder()
+    return _temporary_folder() if why_unwritable(users_folder()) else users_folder()
 
 
-def obstacle(folder: Path) -> str:
+def why_unwritable(folder: Path) -> str:
     """Why no file can be written into a folder, which is made if it is missing; "" if one can."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -83,4 +83,4 @@ def _temporary_folder() -> Path | None:
         return None
     shared = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not shared
-    return folder if own and not obstacle(folder) else None
+    return folder if own and not why_unwritable(folder) else None

@@ -23,7 +23,7 @@ _DIGEST = 32  # bytes at the beginning of a file: the hash of what follows
 
 
 @contextmanager
-def replaced(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """The name of a temporary file to write beside ``path``; after success it replaces ``path``."""
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
     try:
@@ -38,7 +38,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def one_at_a_time(path: Path) -> Iterator[None]:
+def file_lock(path: Path) -> Iterator[None]:
     """Wait until no other process is in this block for the same file; it leaves when it ends, however it ends."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,7 @@ def one_at_a_time(path: Path) -> Iterator[None]:
                 path.with_suffix(".lock").unlink()
 
 
-def read_kept(path: Path) -> bytes | None:
+def read_cached(path: Path) -> bytes | None:
     """The content of a file of a cache; None if there is none, or if it is damaged."""
     with suppress(OSError):
         text = path.read_bytes()
@@ -66,14 +66,14 @@ def read_kept(path: Path) -> bytes | None:
     return None
 
 
-def keep(path: Path, content: bytes, most: int) -> None:
+def write_cached(path: Path, content: bytes, most: int) -> None:
     """Write a file of a cache, and remove the oldest of its kind beside it if they are more than ``most``.
 
     Raises:
       OSError: the folder cannot be made, or not be written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
     with suppress(OSError):
         kept = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda one: one.stat().st_mtime, reverse=True)

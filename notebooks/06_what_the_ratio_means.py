@@ -54,7 +54,7 @@ table.round(4).to_dataframe().reset_index().drop(columns="packing_fraction")
 
 # %%
 factors = ["anisotropy", "chaos", "pairs", "binary"]
-loss = {name: flows[f"theory_loss_pressure_{name}"].sel(packing_fraction=0.6) for name in factors}
+loss = {name: flows[f"enskog_factor_pressure_{name}"].sel(packing_fraction=0.6) for name in factors}
 whole = flows.contact_pressure.sel(packing_fraction=0.6) / flows.enskog_pressure.sel(packing_fraction=0.6)
 split = xr.Dataset(loss).assign(product=whole)
 split.round(3).to_dataframe().reset_index().drop(columns="packing_fraction")
@@ -77,9 +77,9 @@ print((whole.isel(timestep=-1) / whole.isel(timestep=0)).values.round(3))
 sizes = [64, 128] if quick else [100, 400, 1600]
 grown = jg.ratio_map([0.5], [0.6], grains=sizes, seeds=1, **chosen).isel(packing_fraction=0, restitution=0)
 share = grown.local_granular_temperature / grown.granular_temperature
-xr.Dataset({"chaos": grown.theory_loss_pressure_chaos, "local over granular temperature": share}).to_dataframe().round(
-    3
-)
+xr.Dataset(
+    {"chaos": grown.enskog_factor_pressure_chaos, "local over granular temperature": share}
+).to_dataframe().round(3)
 
 # %% [markdown]
 # ## Where which assumption fails
@@ -91,4 +91,4 @@ xr.Dataset({"chaos": grown.theory_loss_pressure_chaos, "local over granular temp
 alphas = [0.2, 0.5, 0.8] if quick else [0.1, 0.3, 0.5, 0.7, 0.9]
 fractions = [0.5, 0.65, 0.75] if quick else [0.3, 0.5, 0.6, 0.7, 0.75, 0.79]
 plane = jg.ratio_map(alphas, fractions, timestep=5e-4, grains=grains, seeds=1, **chosen)
-jg.theory_losses(plane)
+jg.enskog_factors(plane)

@@ -97,11 +97,11 @@ def configure_jax() -> None:
     """Keep whatever is compiled."""
     import jax
 
-    from jaxgran import programs
+    from jaxgran import persistent_jit
 
     jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    programs._folder = lambda: None  # tests replace functions, of which the key of a kept program knows nothing
+    persistent_jit._folder = lambda: None  # tests replace functions, of which the key of a kept program knows nothing
 
 
 def compiled_programs() -> Path:

@@ -16,8 +16,8 @@ import pytest
 
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics import advance as public
-from jaxgran.dynamics.plain import advance
-from jaxgran.dynamics.thread_block import kernel
+from jaxgran.dynamics.jax_engine import advance
+from jaxgran.dynamics.pallas_engine import kernel
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -32,7 +32,7 @@ hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  
 hypothesis.settings.load_profile("tests")
 
 GRAINS = 32
-ENGINES = ("machine_code", "thread_block", "jax")
+ENGINES = ("numba", "pallas", "jax")
 pytest.GRAINS = GRAINS
 
 
@@ -74,8 +74,8 @@ def engines(run):
 
     interpreted = partial(kernel.advance, interpret=True)
     return {
-        "machine_code": compiled(public.advance),
-        "thread_block": compiled(interpreted, compiled_programs.optimised),
+        "numba": compiled(public.advance),
+        "pallas": compiled(interpreted, compiled_programs.optimised),
         "jax": run,
     }
 

@@ -27,8 +27,8 @@ from synthetic import one_sentence, snapshot_of
 import jaxgran as jg
 from jaxgran.analysis import fields
 from jaxgran.dynamics import snapshots
+from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import settings as map_settings
-from jaxgran.maps import sweep
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import map_figures, theory
@@ -66,7 +66,7 @@ def nothing_runs() -> Iterator[None]:
             (steady_state, "prepare_batch"),
             (steady_state, "_heated"),
             (free_cooling, "_cooling"),
-            (sweep, "replicas"),
+            (ratio_map_module, "replicas"),
         ):
             patch.setattr(module, name, would_run)
         patch.setattr(map_settings, "_temperature", cold)
@@ -110,7 +110,7 @@ def make_map(name: str, value: Any) -> xr.Dataset:
 
 NUMBERS: dict[str, Callable[[Any], Any]] = {
     **{f"ShearFlow {name}": partial(make_flow, name) for name in jg.ShearFlow.__dataclass_fields__},
-    **{f"ratio_map {name}": partial(make_map, name) for name in sweep.ratio_map.__kwdefaults__},
+    **{f"ratio_map {name}": partial(make_map, name) for name in ratio_map_module.ratio_map.__kwdefaults__},
     "ratio_map restitution": partial(make_map, "restitution"),
     "ratio_map packing_fraction": partial(make_map, "packing_fraction"),
     "polydisperse count": lambda x: jg.polydisperse(x, 0.2, "no key"),
@@ -249,7 +249,7 @@ def test_any_flow_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]
 
 
 @few(max_examples=50)
-@given(st.dictionaries(st.sampled_from([*MAP, *sweep.ratio_map.__kwdefaults__]), anything, min_size=2))
+@given(st.dictionaries(st.sampled_from([*MAP, *ratio_map_module.ratio_map.__kwdefaults__]), anything, min_size=2))
 def test_any_map_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]) -> None:
     verdict(lambda _: jg.ratio_map(**{**MAP, **changes}), None)
 
@@ -330,7 +330,7 @@ def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, m
 def accepts_or_refuses(*arguments: str) -> Outcome:
     """Give a command that does not run; nothing is left, and it is accepted or refused in one sentence."""
     with TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep, "replicas", ends)
+        patch.setattr(ratio_map_module, "replicas", ends)
         outcome = jaxgran(Path(name), *arguments)
         assert not os.listdir(name)
     if outcome.status != WOULD_RUN:
@@ -592,7 +592,7 @@ PLAIN = pytest.param("my first map.nc", marks=pytest.mark.slow)
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     write_few_variables(monkeypatch, *theory.SHARES)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
     for drawing in ("ratio_curves", "cluster_shares"):

@@ -45,7 +45,7 @@ from jaxgran.cli.tables import print_table
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
-from jaxgran.maps import sweep
+from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.schema import shear_stress_ratio
@@ -55,15 +55,15 @@ from jaxgran.model.status import Status
 from jaxgran.plotting import map_figures, movie
 from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
-from jaxgran.sampling.memory import LEAST_SAMPLE
+from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "
     "--equilibrate 0.5 --strain 2 --workers 1 --output small.nc"
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
-SAME += ("solver", "engine", "solver_asked", "engine_asked")
-PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "losses", "clusters", "errors")}
+SAME += ("solver", "engine", "solver_requested", "engine_requested")
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters", "errors")}
 FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
@@ -154,10 +154,10 @@ MISTAKES = {
     "map --timestep auto --target-error 1": "--target-error must be between 1e-4 and 0.1",
     "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
-    "map --engine numba": "--engine must be one of 'auto', 'machine_code', 'jax', 'thread_block', not 'numba'",
-    "map --engine thread_block": "--engine must be auto or jax on a CPU, not thread_block",
-    "map --engine machine_code --solver jacobi": "--engine must be auto or jax with the solver jacobi",
-    "run --restitution 0.5 --packing-fraction 0.6 --engine thread_block": "--engine must be auto or jax on a CPU",
+    "map --engine numba": "--engine must be one of 'auto', 'numba', 'jax', 'pallas', not 'numba'",
+    "map --engine pallas": "--engine must be auto or jax on a CPU, not pallas",
+    "map --engine numba --solver jacobi": "--engine must be auto or jax with the solver jacobi",
+    "run --restitution 0.5 --packing-fraction 0.6 --engine pallas": "--engine must be auto or jax on a CPU",
     "map --activation always": "'midpoint', 'touching'",
     "map --preset slow": "'quick', 'paper', 'dense'",
     "map --batch 0": "batch must be auto or a whole number of at least 1",
@@ -333,7 +333,7 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
 def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is compared; of the others, which take longer, that there is a file."""
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "theory_losses", "cluster_shares", "dominating_errors"):
+    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, lambda _: Figure())
     outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
     assert (outcome.status, outcome.out) == (0, "")
@@ -345,7 +345,7 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "theory_losses", "cluster_shares", "dominating_errors"):
+    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, ratio_curves)
     leave_out_layout(monkeypatch)
     words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
@@ -385,7 +385,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
     words = " ".join(outcome.out.split())
     assert words.startswith(f"32 grains, dt = {data.attrs['timestep']:g} / shear rate, midpoint activation ")
-    assert f" engine machine_code, solver {data.attrs['solver']} " in words
+    assert f" engine numba, solver {data.attrs['solver']} " in words
     groups = [line.strip() for line in outcome.out.splitlines()]
     places = [groups.index(name) for name in ("Forces", "Stresses", "Motion and structure", "Quality of the run")]
     assert places == sorted(places)
@@ -429,11 +429,11 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
     assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
     assert lines["precision"] == "float64"
-    assert lines["engine"] == "auto takes machine_code" and lines["solver"].startswith("gauss-seidel")
+    assert lines["engine"] == "auto takes numba" and lines["solver"].startswith("gauss-seidel")
     assert lines["jaxgran"].startswith(version("jaxgran"))
     assert float(lines["memory"].removesuffix(" GiB")) > 0.1
     assert str(usable_cores()) in lines["cores"]
-    for name in ("cache folder", "compiled programs", "machine code", "figures"):
+    for name in ("cache folder", "compiled programs", "numba engine", "figures"):
         folder, _, state = lines[name].partition(", ")
         assert Path(folder).is_dir() and state == "works", name
 
@@ -642,7 +642,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
 
     leave_out_layout(monkeypatch)
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(sweep, "replicas", every)
+    monkeypatch.setattr(ratio_map_module, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
     monkeypatch.setattr("jaxgran.maps.settings._temperature", lambda flows: np.full(np.shape(flows.restitution), 0.1))
     plane, (_, *again) = list(map_module.MAP_EXAMPLES.values())[1], map_module.PLOT_EXAMPLES.values()
@@ -768,7 +768,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
             ((0, seed), random_replica(np.random.default_rng(seed), settings)) for seed in range(settings.seeds)
         )
 
-    monkeypatch.setattr(sweep, "replicas", notes)
+    monkeypatch.setattr(ratio_map_module, "replicas", notes)
     flow = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--strain", "20", "--quiet")
     words = ("--seeds", "2", "--seed", "7", "--tolerance", "1e-6", "--solver", "jacobi", "--activation", "touching")
     assert jaxgran(tmp_path, *flow, *words).status == 0
@@ -781,7 +781,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
 
 def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--quiet")
     assert outcome.status == 0
     assert "points" not in outcome.err
@@ -791,7 +791,9 @@ def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.M
 def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = dict(enumerate(Status))
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda *_: None)
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(k, 0): status for k, status in points.items()}))
+    monkeypatch.setattr(
+        ratio_map_module, "replicas", made_up_replicas({(k, 0): status for k, status in points.items()})
+    )
     words = ("--restitution", f"0:0.9:{len(points)}", "--packing-fraction", "0.6", "--seeds", "1")
     outcome = jaxgran(tmp_path, "map", *words)
     assert outcome.status == 3
@@ -810,7 +812,7 @@ def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> 
     write_without_drawing(monkeypatch)
     write_few_variables(monkeypatch, "pressure_large_system", "pressure_large_system_error")
     statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas(statuses))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(statuses))
 
 
 def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_theirs(
@@ -864,7 +866,7 @@ def test_single_time_step_is_a_number_and_no_dimension(
 ) -> None:
     written = []
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda data, _: written.append(data))
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     for words in ([], ["--timestep", "1e-3"]):
         assert jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", *words).status == 0
         data = written.pop()
@@ -874,7 +876,7 @@ def test_single_time_step_is_a_number_and_no_dimension(
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130
     assert files(tmp_path) == {"half.nc", "half.nc.unfinished"}
@@ -893,7 +895,7 @@ def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch
     class Inside(SystemError):
         __cause__ = KeyboardInterrupt()
 
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130 and outcome.err.rstrip().endswith("--output half.nc --resume")
     monkeypatch.setattr("jaxgran.maps.results.read_dataset", Mock(side_effect=Inside))
@@ -908,7 +910,7 @@ def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "old.nc").write_bytes(b"old")
-    monkeypatch.setattr(sweep, "replicas", made_up_replicas({}, KeyboardInterrupt))
+    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc", "--overwrite")
     assert outcome.status == 130
     assert (tmp_path / "old.nc").read_bytes() == b"old"

@@ -15,7 +15,7 @@ GAPS = GAP * np.geomspace(0.5, 2, 96)
 @pytest.fixture(scope="module")
 def measured(engines):
     """``measured(restitution, timestep, states)``: steps with contacts and excess of the force ratio of each start."""
-    return partial(collapse.measured, advance=engines["machine_code"])
+    return partial(collapse.measured, advance=engines["numba"])
 
 
 @pytest.mark.parametrize(("discs", "angle"), [(3, np.pi / 12), (4, np.pi / 8)])
@@ -41,7 +41,7 @@ def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(measur
 @pytest.mark.parametrize(("discs", "restitution"), [(3, 0.02), (3, 0.04), (4, 0.05), (4, 0.1)])
 def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(engines, discs, restitution) -> None:
     exact = roots(discs, restitution)
-    found = slopes(exact, restitution, [row(discs, gap) for gap in GAPS], engines["machine_code"])
+    found = slopes(exact, restitution, [row(discs, gap) for gap in GAPS], engines["numba"])
     for values, expected in zip(found, (exact.steps_per_decade, exact.exponent), strict=True):
         error = values.std(ddof=1) / np.sqrt(len(values))
         assert error < 0.1 * expected

@@ -16,7 +16,7 @@ from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_da
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
-from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
+from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
@@ -96,11 +96,11 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
 
 def test_losses_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
-    value, error = stress_losses(settings.flows()[0], samples)
+    value, error = stress_factors(settings.flows()[0], samples)
     here = data.sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
     for stress in STRESSES:
         for stored, name in [(f"enskog_{stress}", f"enskog_{stress}")] + [
-            (f"theory_loss_{stress}_{factor}", f"{stress}_{factor}") for factor in FACTORS
+            (f"enskog_factor_{stress}_{factor}", f"{stress}_{factor}") for factor in FACTORS
         ]:
             assert data[stored].dims == data[f"{stored}_stderr"].dims == ("packing_fraction", "restitution")
             np.testing.assert_array_equal([here[stored], here[f"{stored}_stderr"]], [value[name], error[name]])
@@ -208,7 +208,7 @@ def test_attributes_tell_every_parameter_of_the_run(settings, data) -> None:
     attributes = data.attrs
     for name in ("grains", "seeds", "timestep", "strain", "tolerance", "activation"):
         assert attributes[name] == getattr(settings, name)
-    assert (attributes["engine_asked"], attributes["solver_asked"]) == (settings.engine, settings.solver)
+    assert (attributes["engine_requested"], attributes["solver_requested"]) == (settings.engine, settings.solver)
     assert (attributes["restitution"], attributes["packing_fraction"]) == (list(ALPHAS), list(NUS))
     assert attributes["equilibrate"] == "until steady"
     assert attributes["timestep_unit"] == "1 / shear rate"

@@ -14,14 +14,14 @@ from oracles import gaps_of
 
 from jaxgran.dynamics import collision
 from jaxgran.dynamics.collision import contact_capacities, contacts_now
-from jaxgran.dynamics.plain import advance
+from jaxgran.dynamics.jax_engine import advance
 from jaxgran.model.cell import displacement, remap_tilt
 from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
 # The same steps in one advance and in two, where contacts are listed and solved in another order
-JOINED = {"machine_code": 1e-7, "thread_block": 1e-7, "jax": 1e-10}
-UNCHANGED = {"machine_code": 0, "thread_block": 0, "jax": 4 * EPS}
+JOINED = {"numba": 1e-7, "pallas": 1e-7, "jax": 1e-10}
+UNCHANGED = {"numba": 0, "pallas": 0, "jax": 4 * EPS}
 
 
 def assert_identical(one, two):
@@ -183,7 +183,7 @@ def replica(tree, index: int):
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-# One after the other, replicas do not meet; the quick tests of the machine code state that they are single runs
+# One after the other, replicas do not meet; the quick tests of the numba engine state that they are single runs
 ways = pytest.mark.parametrize("way", ["vmap", pytest.param("map", marks=pytest.mark.slow)])
 
 

@@ -11,7 +11,7 @@ import xarray as xr
 from synthetic import one_sentence
 
 import jaxgran as jg
-from jaxgran.dynamics import plain
+from jaxgran.dynamics import jax_engine
 from jaxgran.dynamics.engine import _warn_once, select_engine, solver_in_use
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.maps.dataset import map_dataset
@@ -49,7 +49,7 @@ def refusal(call) -> str:
 
 def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> None:
     state = flowing(0.7)
-    assert select_engine(of()) == select_engine(of(), state) == "machine_code"
+    assert select_engine(of()) == select_engine(of(), state) == "numba"
     assert select_engine(of(solver="nesterov"), state) == "jax"
     assert select_engine(of(), single(state)) == "jax"
     assert select_engine(of(), state, "events") == "jax"
@@ -57,7 +57,7 @@ def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> 
     batch = jax.tree.map(lambda x: x[None], state)
     jax.vmap(lambda one: found.append(select_engine(of(), one)), axis_name=AXIS)(batch)
     jax.vmap(lambda one: found.append(select_engine(of(), one)))(batch)
-    assert found == ["jax", "machine_code"]
+    assert found == ["jax", "numba"]
 
 
 def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
@@ -85,59 +85,59 @@ def test_jax_takes_whatever_it_is_asked_for(flowing) -> None:
 
 IMPOSSIBLE = {
     "thread block on a processor": (
-        lambda state: jg.advance(of("thread_block"), state, STEPS),
-        "on a CPU, not thread_block: it is made for NVIDIA GPUs",
+        lambda state: jg.advance(of("pallas"), state, STEPS),
+        "on a CPU, not pallas: it is made for NVIDIA GPUs",
     ),
     "another solver": (
-        lambda state: jg.advance(of("machine_code", solver="jacobi"), state, STEPS),
-        "with the solver jacobi, not machine_code",
+        lambda state: jg.advance(of("numba", solver="jacobi"), state, STEPS),
+        "with the solver jacobi, not numba",
     ),
     "single precision": (
-        lambda state: jg.advance(of("machine_code"), single(state), STEPS),
-        "in float32, not machine_code: it computes in float64",
+        lambda state: jg.advance(of("numba"), single(state), STEPS),
+        "in float32, not numba: it computes in float64",
     ),
     "a named axis": (
-        lambda state: jax.vmap(lambda one: jg.advance(of("machine_code"), one, STEPS), axis_name=AXIS)(
+        lambda state: jax.vmap(lambda one: jg.advance(of("numba"), one, STEPS), axis_name=AXIS)(
             jax.tree.map(lambda x: x[None], state)
         ),
-        "in a vmap with the axis name 'replica', not machine_code",
+        "in a vmap with the axis name 'replica', not numba",
     ),
     "every step": (
-        lambda state: jg.advance(of("machine_code"), state, STEPS, free_flight=False),
-        "with free_flight=False, not machine_code",
+        lambda state: jg.advance(of("numba"), state, STEPS, free_flight=False),
+        "with free_flight=False, not numba",
     ),
     "moving contacts": (
-        lambda state: jg.advance(of("machine_code"), state, STEPS, moving_contacts=True),
-        "with moving_contacts, not machine_code",
+        lambda state: jg.advance(of("numba"), state, STEPS, moving_contacts=True),
+        "with moving_contacts, not numba",
     ),
     "derivatives in reverse mode": (
         lambda state: jax.grad(
             lambda alpha: jnp.sum(
-                jg.advance(replace(of("machine_code"), restitution=alpha), state, STEPS, events=50)[0].velocities ** 2
+                jg.advance(replace(of("numba"), restitution=alpha), state, STEPS, events=50)[0].velocities ** 2
             )
         )(0.5),
-        "with events, not machine_code: only the engine jax does that",
+        "with events, not numba: only the engine jax does that",
     ),
     "an observable": (
-        lambda state: jg.sample(of("machine_code", solver="jacobi"), state, 0.1, observe=lambda seen: seen.state.side),
-        "with the solver jacobi, not machine_code",
+        lambda state: jg.sample(of("numba", solver="jacobi"), state, 0.1, observe=lambda seen: seen.state.side),
+        "with the solver jacobi, not numba",
     ),
     "an observable, block by block": (
         lambda state: jg.sample(
-            of("thread_block"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
+            of("pallas"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
         ),
-        "on a CPU, not thread_block",
+        "on a CPU, not pallas",
     ),
-    "a sample": (lambda state: jg.sample(of("thread_block"), state, 0.1), "on a CPU, not thread_block"),
-    "a preparation": (lambda _: jg.prepare(of("thread_block"), jax.random.key(0)), "on a CPU, not thread_block"),
-    "snapshots": (lambda state: jg.snapshot_series(of("thread_block"), state, 0.1, 2), "on a CPU, not thread_block"),
+    "a sample": (lambda state: jg.sample(of("pallas"), state, 0.1), "on a CPU, not pallas"),
+    "a preparation": (lambda _: jg.prepare(of("pallas"), jax.random.key(0)), "on a CPU, not pallas"),
+    "snapshots": (lambda state: jg.snapshot_series(of("pallas"), state, 0.1, 2), "on a CPU, not pallas"),
     "free cooling": (
-        lambda state: jg.cooling(of("thread_block", shear_rate=0.0), state, [0.1]),
-        "on a CPU, not thread_block",
+        lambda state: jg.cooling(of("pallas", shear_rate=0.0), state, [0.1]),
+        "on a CPU, not pallas",
     ),
     "a map": (
-        lambda _: jg.ratio_map([0.5], [0.6], engine="machine_code", solver="nesterov"),
-        "with the solver nesterov, not machine_code",
+        lambda _: jg.ratio_map([0.5], [0.6], engine="numba", solver="nesterov"),
+        "with the solver nesterov, not numba",
     ),
 }
 
@@ -154,11 +154,11 @@ def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> N
 
 def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
     state, advance = flowing(0.7), jax.jit(jg.advance)
-    assert_same_bits(advance(of("machine_code"), state, STEPS), advance(of(), state, STEPS))
+    assert_same_bits(advance(of("numba"), state, STEPS), advance(of(), state, STEPS))
 
 
 def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
-    monkeypatch.setattr(plain, "advance", lambda *arguments: arguments)
+    monkeypatch.setattr(jax_engine, "advance", lambda *arguments: arguments)
     for flow in (of("jax"), of(solver="jacobi"), of("jax", solver="jacobi")):
         assert jg.advance(flow, flowing(0.7), STEPS) == (flow, flowing(0.7), STEPS, True, None, False)
 
@@ -171,9 +171,9 @@ def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) ->
         found[flow.engine] = in_batch()
         return state, empty_tally(state.side.dtype)
 
-    for engine in ("auto", "machine_code", "jax"):
+    for engine in ("auto", "numba", "jax"):
         batch.batch_program(notes)(stack([of(engine)] * 2), states, jnp.ones(2, jnp.int32))
-    assert found == {"auto": False, "machine_code": False, "jax": True}
+    assert found == {"auto": False, "numba": False, "jax": True}
 
 
 # What stands in a dataset
@@ -182,8 +182,8 @@ def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) ->
 @pytest.mark.parametrize(
     ("asked", "engine", "solver"),
     [
-        ({}, "machine_code", "gauss-seidel, barzilai-borwein where stiff"),
-        ({"engine": "machine_code"}, "machine_code", "gauss-seidel, barzilai-borwein where stiff"),
+        ({}, "numba", "gauss-seidel, barzilai-borwein where stiff"),
+        ({"engine": "numba"}, "numba", "gauss-seidel, barzilai-borwein where stiff"),
         ({"engine": "jax"}, "jax", "barzilai-borwein"),
         ({"solver": "nesterov"}, "jax", "nesterov"),
         ({"engine": "jax", "solver": "jacobi"}, "jax", "jacobi"),
@@ -193,14 +193,14 @@ def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: st
     settings = replace(SETTINGS, **asked)
     data = map_dataset(settings, {}, {})
     assert (data.attrs["engine"], data.attrs["solver"]) == (engine, solver)
-    assert (data.attrs["engine_asked"], data.attrs["solver_asked"]) == (settings.engine, settings.solver)
+    assert (data.attrs["engine_requested"], data.attrs["solver_requested"]) == (settings.engine, settings.solver)
     assert MapSettings(**choices_of(data)) == settings
 
 
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
-        assert "in float32, not machine_code" in refusal(lambda: replace(SETTINGS, engine="machine_code"))
+        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine="numba"))
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
         "float32",
         "jax",
@@ -209,7 +209,7 @@ def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
 
 
 def test_the_thread_block_solves_by_its_own_method() -> None:
-    assert solver_in_use("thread_block", "barzilai-borwein") == "barzilai-borwein"
+    assert solver_in_use("pallas", "barzilai-borwein") == "barzilai-borwein"
 
 
 def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ RANGES = {
     "relaxation": "between 0 and 2, both excluded",
     "activation": "midpoint or touching",
     "solver": "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal",
-    "engine": "auto, machine_code, jax or thread_block",
+    "engine": "auto, numba, jax or pallas",
 }
 
 

@@ -17,7 +17,7 @@ from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics import collision as collision_module
-from jaxgran.dynamics.plain import advance, count_events
+from jaxgran.dynamics.jax_engine import advance, count_events
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow

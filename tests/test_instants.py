@@ -15,10 +15,10 @@ from jaxgran.maps import instants, sweep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.instants import first_of_points, instant_variables
+from jaxgran.maps.ratio_map import replicas
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.sweep import replicas
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.status import Status
 from jaxgran.plotting.flow import scene_of

@@ -1,4 +1,4 @@
-"""Ctrl-C ends what is computed at once, and leaves the machine code as it was."""
+"""Ctrl-C ends what is computed at once, and leaves the numba engine as it was."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.dynamics.machine_code import ffi
+from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling.sample import sample
@@ -21,7 +21,7 @@ FLOW = ShearFlow(pytest.GRAINS, 0.7, 0.7, 1e-3)
 
 
 def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flowing) -> None:
-    advance, state = engines["machine_code"], flowing(0.7)
+    advance, state = engines["numba"], flowing(0.7)
     end, whole = advance(FLOW, state, 1000)
     with ffi.stopped():
         _, cut = advance(FLOW, state, 1000)

@@ -11,7 +11,7 @@ import pytest
 from jax import monitoring
 from synthetic import random_tally
 
-from jaxgran.io.atomic import Damaged, read_arrays
+from jaxgran.io.atomic import CorruptFile, read_arrays
 from jaxgran.maps import journal as journal_module
 from jaxgran.maps.journal import Journal
 from jaxgran.model.flow import ShearFlow
@@ -99,10 +99,10 @@ def test_nothing_is_done_twice(tmp_path: Path) -> None:
 def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "batch.nc"
     walk(Journal(path, KEYS, fake_drive, seconds=0), 3)
-    with pytest.raises(Damaged, match="another batch"):
+    with pytest.raises(CorruptFile, match="another batch"):
         Journal(path, [(0, 0), (2, 0)], fake_drive)
     journal = Journal(path, KEYS, fake_drive)
-    with pytest.raises(Damaged, match="another run"):
+    with pytest.raises(CorruptFile, match="another run"):
         journal(None, small_state(), np.array([5, 5]))
 
 

@@ -6,7 +6,7 @@ import pytest
 from jaxgran.maps.large_system import BOUNDS, LIMIT_SEEN, large_system_estimate, large_system_variables
 
 SIZES = np.array([100, 400, 1600])
-SEEN, NOT_SEEN, TOO_FEW = (LIMIT_SEEN[name] for name in ("limit_seen", "no_limit_seen", "too_few_sizes"))
+SEEN, NOT_SEEN, TOO_FEW = (LIMIT_SEEN[name] for name in ("limit_seen", "no_converged", "too_few_sizes"))
 
 PRESSURES = {  # measured at N = 100, 400, 1600, and the largest N: 25600, and 6400 at ν = 0.8; by α and ν
     (0.2, 0.2): (0.302, 0.349, 0.367, 0.392),
@@ -105,5 +105,5 @@ def test_variables_of_a_map_stand_at_their_points() -> None:
     np.testing.assert_array_equal(variables["pressure_large_system"][1], values[-1])
     wider = variables["granular_temperature_large_system_error"][1] / variables["pressure_large_system_error"][1]
     assert np.all((wider > 1.4) & (wider < 1.5))  # K is 3 and not 2
-    flags = variables["pressure_limit_seen"][2]
+    flags = variables["pressure_converged"][2]
     assert dict(zip(flags["flag_meanings"].split(), flags["flag_values"].tolist(), strict=True)) == LIMIT_SEEN

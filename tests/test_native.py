@@ -1,4 +1,4 @@
-"""Machine code and thread block are the plain advance: same contacts, same impulses, same sums, same failures.
+"""Numba engine and thread block are the plain advance: same contacts, same impulses, same sums, same failures.
 
 The thread block is interpreted here. That Pallas can lower it for a GPU needs none, and is tested too.
 """
@@ -18,15 +18,14 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics import collision
+from jaxgran.dynamics import collision, jax_engine
 from jaxgran.dynamics import engine as engine_module
-from jaxgran.dynamics import plain as plain_module
 from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
-from jaxgran.dynamics.machine_code import cluster_solver, layout
-from jaxgran.dynamics.machine_code.ffi import object_file
-from jaxgran.dynamics.machine_code.near_pairs import LIFE, find_near_pairs, skin_loss
+from jaxgran.dynamics.numba_engine import cluster_solver, layout
+from jaxgran.dynamics.numba_engine.ffi import object_file
+from jaxgran.dynamics.numba_engine.near_pairs import LIFE, find_near_pairs, skin_loss
+from jaxgran.dynamics.pallas_engine import kernel
 from jaxgran.dynamics.tally import empty_tally
-from jaxgran.dynamics.thread_block import kernel
 from jaxgran.model.checks import InputError
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
@@ -38,7 +37,7 @@ GRAINS = pytest.GRAINS
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
-@pytest.fixture(scope="module", params=["machine_code", "thread_block"])
+@pytest.fixture(scope="module", params=["numba", "pallas"])
 def native_run(request, engines):
     return engines[request.param]
 
@@ -101,13 +100,13 @@ def test_any_flow_takes_its_first_events_as_in_the_plain_advance(
         state = replace(state, tilt=jnp.asarray(tilt, float))
     flow = of(packing_fraction, restitution, timestep)
     ours, plain = native_run(flow, state, 5), run(flow, state, 5)
-    assume(plain[1].status < Status.capacity)  # its lists are narrower: the machine code may still hold such a flow
+    assume(plain[1].status < Status.capacity)  # its lists are narrower: the numba engine may still hold such a flow
     assert ours[1].status == plain[1].status
     if plain[1].status < Status.infeasible:
         assert_same(ours, plain, float(state.side), 1e-6 * max(1, speed))
 
 
-@pytest.mark.parametrize("rows", [10, 50])  # 100 grains, and more than the machine code takes as they come
+@pytest.mark.parametrize("rows", [10, 50])  # 100 grains, and more than the numba engine takes as they come
 def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
     rng, count = np.random.default_rng(rows), rows * rows
     radii = rng.uniform(0.37, 0.63, count)
@@ -170,7 +169,7 @@ def gpu(monkeypatch, engines):
     device = Device()
     monkeypatch.setattr(jax, "devices", lambda *_: [device])
     monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
-    monkeypatch.setattr(kernel, "advance", engines["thread_block"])
+    monkeypatch.setattr(kernel, "advance", engines["pallas"])
     monkeypatch.setattr(kernel, "jax", SimpleNamespace(jit=lambda compiled: compiled))
     yield monkeypatch
     _forget()
@@ -184,14 +183,14 @@ def _forget() -> None:
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
     flow, state = of(0.6, tolerance=1e-4), flowing(0.6)
-    assert select_engine(flow, state) == select_engine(replace(flow, engine="thread_block"), state) == "thread_block"
+    assert select_engine(flow, state) == select_engine(replace(flow, engine="pallas"), state) == "pallas"
     refused = {"the solver nesterov": {"solver": "nesterov"}, "more than 1024 grains": {"grains": MOST_GRAINS + 1}}
     for words, change in refused.items():
         assert select_engine(replace(flow, **change), state) == "jax"
-        with pytest.raises(InputError, match=f"engine must be auto or jax with {words}, not thread_block: "):
-            select_engine(replace(flow, engine="thread_block", **change), state)
-    with pytest.raises(InputError, match="engine must be auto or jax on a GPU, not machine_code: it is made for proc"):
-        select_engine(replace(flow, engine="machine_code"), state)
+        with pytest.raises(InputError, match=f"engine must be auto or jax with {words}, not pallas: "):
+            select_engine(replace(flow, engine="pallas", **change), state)
+    with pytest.raises(InputError, match="engine must be auto or jax on a GPU, not numba: it is made for proc"):
+        select_engine(replace(flow, engine="numba"), state)
 
 
 def broken(*_):
@@ -220,8 +219,8 @@ def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, f
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
         assert select_engine(flow, state) == "jax"
     assert select_engine(flow, state) == "jax"  # and says so once
-    with pytest.raises(InputError, match=f"engine must be auto or jax here, not thread_block: .*{said}"):
-        select_engine(replace(flow, engine="thread_block"), state)
+    with pytest.raises(InputError, match=f"engine must be auto or jax here, not pallas: .*{said}"):
+        select_engine(replace(flow, engine="pallas"), state)
 
 
 def without_a_gpu() -> AbstractContextManager:
@@ -244,7 +243,7 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
         return jax.ShapeDtypeStruct((replicas, *shape), dtype)
 
     state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
-    way = advance_module.thread_block if count == 16 else kernel.advance  # the former is traced with the plain advance
+    way = advance_module.pallas if count == 16 else kernel.advance  # the former is traced with the plain advance
     advance = jax.vmap(partial(way, ShearFlow(count, 0.5, 0.6, 1e-3)), (0, None), axis_name=AXIS)
     with without_a_gpu():
         traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
@@ -305,7 +304,7 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
 def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run, engines) -> None:
     flow, state = of(0.7, tolerance=1e-6), flowing(0.7)
     after, tally = jax.tree.map(lambda x: x[0], grid_run(flow, (state, state, state), [100, 0, 0]))
-    expected, sums = engines["thread_block"](flow, state, 100)
+    expected, sums = engines["pallas"](flow, state, 100)
     assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
     np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
@@ -320,14 +319,14 @@ def test_transformations_apply(flowing) -> None:
             jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found))
 
 
-@pytest.mark.parametrize("engine", ["auto", "machine_code"])
+@pytest.mark.parametrize("engine", ["auto", "numba"])
 def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) -> None:
     state = flowing(0.6)
 
     def plain(flow, state, steps):
         return replace(state, velocities=flow.restitution * state.velocities), empty_tally(state.side.dtype)
 
-    monkeypatch.setattr(plain_module, "advance", plain)
+    monkeypatch.setattr(jax_engine, "advance", plain)
 
     @jax.jit
     def velocities(alpha):
@@ -390,7 +389,7 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distanc
 
 @pytest.fixture(scope="module")
 def near_pairs_found():
-    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the machine code is the same."""
+    """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the numba engine is the same."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(numba.config, "CACHE_DIR", str(compiled_programs.compiled_programs() / object_file().stem))
         return numba.njit(cache=True)(find_near_pairs.py_func)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from jaxgran.contact import near_pairs
 from jaxgran.contact.cell_list import _cells_per_side, cell_list_pairs, set_bit
 from jaxgran.dynamics import collision
-from jaxgran.dynamics.plain import advance
+from jaxgran.dynamics.jax_engine import advance
 from jaxgran.model.cell import cell_side, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains

@@ -32,7 +32,7 @@ def test_a_notebook_has_no_outputs_begins_with_a_question_and_ends_with_a_figure
     title = cells[0].source.splitlines()[0]
     assert title.startswith("# ") and title.endswith("?")
     last = cells[-1].source.splitlines()[-1]
-    figures = ("plt.show()", "jg.flow_figure(", "jg.ratio_contours(", "jg.theory_errors(", "jg.theory_losses(")
+    figures = ("plt.show()", "jg.flow_figure(", "jg.ratio_contours(", "jg.theory_errors(", "jg.enskog_factors(")
     assert last.startswith(figures)
 
 

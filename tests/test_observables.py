@@ -13,7 +13,7 @@ DATASET_NAMES = """
     force_ratio contact_force binary_force force_second_moment
     pressure contact_pressure binary_pressure kinetic_pressure
     shear_stress contact_shear_stress binary_shear_stress kinetic_shear_stress
-    granular_temperature local_granular_temperature wave_share bagnold_pressure bagnold_shear_stress
+    granular_temperature local_granular_temperature longwave_energy_ratio bagnold_pressure bagnold_shear_stress
     cluster_pressure_share cluster_shear_share
     coordination_number macroscopic_friction inertial_number collision_rate iterations
     median_residual worst_residual unconverged_share mean_overlap max_overlap

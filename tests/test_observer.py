@@ -16,7 +16,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS, sample
 
 GRAINS, STRAIN = pytest.GRAINS, 0.32
-FLOW = ShearFlow(GRAINS, 0.6, 0.7, 1e-3)  # by the machine code
+FLOW = ShearFlow(GRAINS, 0.6, 0.7, 1e-3)  # by the numba engine
 
 
 def observe(seen: Snapshot) -> dict:
@@ -91,7 +91,7 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
 
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
-    """Flown with room for three, the machine code ends after every other step with contacts, and takes none twice."""
+    """Flown with room for three, the numba engine ends after every other step with contacts, and takes none twice."""
     monkeypatch.setattr(observed_advance, "_ROOM", 3)
     advance = jax.jit(lambda state: observed_advance.advance_observed(FLOW, state, jnp.int32(320), all_of_step))
     state, tally, own = advance(flowing(0.7))

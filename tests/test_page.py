@@ -174,7 +174,7 @@ def test_page_forbids_itself_every_request() -> None:
         assert "http:" not in template and "https:" not in template and "connect-src" not in policy[1]
 
 
-@pytest.mark.parametrize("name", ["activation", "solver_asked", "tolerance", "seeds"])
+@pytest.mark.parametrize("name", ["activation", "solver_requested", "tolerance", "seeds"])
 def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> None:
     data = page_map()
     again = map_data(data)["again"]

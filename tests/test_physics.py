@@ -16,10 +16,10 @@ from jaxgran.sampling.observables import averages
 
 EPS = np.finfo(float).eps
 # Cases and blocks of steps; the interpreted thread block is slow
-COLLISIONS = {"machine_code": 100, "thread_block": 10, "jax": 100}
-BLOCKS = {"machine_code": 50, "thread_block": 12, "jax": 50}
-# Share of the power that one iteration wastes at least; one of the machine code is a sweep over all contacts
-WASTED = {"machine_code": 5e-4, "thread_block": 1e-2, "jax": 1e-2}
+COLLISIONS = {"numba": 100, "pallas": 10, "jax": 100}
+BLOCKS = {"numba": 50, "pallas": 12, "jax": 50}
+# Share of the power that one iteration wastes at least; one of the numba engine is a sweep over all contacts
+WASTED = {"numba": 5e-4, "pallas": 1e-2, "jax": 1e-2}
 
 
 def pair_velocity(state: State) -> np.ndarray:
@@ -189,7 +189,7 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     engine, engine_run, flowing, packing_fraction
 ):
     """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with its square."""
-    interpreted = engine == "thread_block" and packing_fraction > 0.2  # and slow where dense
+    interpreted = engine == "pallas" and packing_fraction > 0.2  # and slow where dense
     steps, most = (150, 70) if interpreted else (500, 100_000)
     state, flow = flowing(packing_fraction), flow_of(packing_fraction, tolerance=1e-4, max_iterations=most)
     faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)

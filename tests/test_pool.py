@@ -11,7 +11,7 @@ import pool_tasks
 import pytest
 
 from jaxgran.maps import pool
-from jaxgran.maps.pool import ATTEMPTS, Died, run_tasks
+from jaxgran.maps.pool import ATTEMPTS, WorkerDied, run_tasks
 from jaxgran.model.checks import InputError
 
 
@@ -85,7 +85,7 @@ def test_a_worker_that_dies_in_the_middle_of_a_word_is_replaced(tmp_path: Path) 
 def test_a_task_that_keeps_killing_its_worker_is_given_up_and_the_others_are_done(tmp_path: Path) -> None:
     tasks = [(str(tmp_path), k, 99 if k == 1 else 0) for k in range(6)]
     results = run(pool_tasks.die_at_first, tasks)
-    assert isinstance(results.pop(1), Died)
+    assert isinstance(results.pop(1), WorkerDied)
     assert results == {k: k for k in (0, 2, 3, 4, 5)}
     assert len(list(tmp_path.iterdir())) == ATTEMPTS
 

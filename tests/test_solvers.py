@@ -19,8 +19,8 @@ from benchmarks.profiles import STYLES
 from benchmarks.solvers import groups, measure
 from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
 from benchmarks.solvers.forms import in_impulses, in_velocities, weighted
-from benchmarks.solvers.machine_code import by_cluster
 from benchmarks.solvers.measure import TARGETS, Row, measured
+from benchmarks.solvers.numba_engine import by_cluster
 from benchmarks.solvers.roster import Solver, own, peers
 from benchmarks.solvers.run import agreement, compile_for, warm_summary
 from benchmarks.solvers.warm import WarmRow, swept_from
@@ -82,7 +82,7 @@ def test_peers_and_ours_find_the_same_velocities(entries):
     """Each that is installed; all know that a full row has no solution, apart from those that only iterate."""
     pytest.importorskip("pinocchio")
     pytest.importorskip("proxsuite")
-    solvers = {name: own()[name] for name in ("machine code", "barzilai-borwein")} | peers()
+    solvers = {name: own()[name] for name in ("numba engine", "barzilai-borwein")} | peers()
     finest: dict = {}
     compile_for(entries, solvers)
     rows = measured(
@@ -92,7 +92,7 @@ def test_peers_and_ours_find_the_same_velocities(entries):
     for entry in entries[:4]:
         good = {name: run for name, run in finest[entry.name].items() if run.residual <= TARGETS[-1]}
         assert set(good) >= {
-            "machine code",
+            "numba engine",
             "barzilai-borwein",
             "Pinocchio ADMM",
             "PIQP",
@@ -102,11 +102,11 @@ def test_peers_and_ours_find_the_same_velocities(entries):
         for run in good.values():
             assert measure.velocity_error(entry, entry.matrix, run.impulses) <= 1e-6
     denying = {name for name, run in finest["jammed row"].items() if run.impulses is None}
-    assert denying >= {"machine code", "barzilai-borwein", "PIQP", "ProxQP", "OSQP", "SciPy NNLS"}
+    assert denying >= {"numba engine", "barzilai-borwein", "PIQP", "ProxQP", "OSQP", "SciPy NNLS"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["machine code", "barzilai-borwein"])
+@pytest.mark.parametrize("name", ["numba engine", "barzilai-borwein"])
 def test_few_solves_of_flows_have_a_larger_error_of_the_stress_than_is_counted(name: str) -> None:
     flows = [entry for entry in load() if entry.family in groups.FLOWS]
     solver, ratios = {name: own()[name]}, []
@@ -171,7 +171,7 @@ def row(solver: str, problem: int, family: str, target: float, seconds: float | 
 
 @pytest.fixture
 def rows() -> list[Row]:
-    costs = {"machine code": (1e-5, 1e-5, 4e-5), "PIQP": (2e-5, 3e-5, 1e-5), "Pinocchio PGS": (1e-4, None, None)}
+    costs = {"numba engine": (1e-5, 1e-5, 4e-5), "PIQP": (2e-5, 3e-5, 1e-5), "Pinocchio PGS": (1e-4, None, None)}
     return [
         row(solver, problem, "flow" if problem < 2 else "chain", target, seconds)
         for solver, each in costs.items()
@@ -183,9 +183,9 @@ def rows() -> list[Row]:
 def test_table_names_the_fastest_and_counts_failures(rows):
     lines = groups.table(rows, targets=(1e-4,)).splitlines()
     small, medium, chains = (line.split(" | ") for line in lines[2:])
-    assert small[2].startswith("machine code: 10 µs") and small[3].startswith("PIQP: 20 µs")
+    assert small[2].startswith("numba engine: 10 µs") and small[3].startswith("PIQP: 20 µs")
     assert medium[4].startswith("Pinocchio PGS: –, 0 of 1")
-    assert chains[2].startswith("PIQP: 10 µs") and chains[3].startswith("machine code: 40 µs")
+    assert chains[2].startswith("PIQP: 10 µs") and chains[3].startswith("numba engine: 40 µs")
 
 
 def test_summary_has_a_null_where_the_median_fails(rows):
@@ -209,8 +209,8 @@ def test_other_charts_hold_the_numbers(rows):
     profiles = draw_profiles(rows)
     in_time, _, in_products, _ = profiles.axes
     ends = {line.get_label(): line.get_ydata()[-1] for line in in_time.lines}
-    assert ends == {"machine code": 1, "PIQP": 1, "Pinocchio PGS": pytest.approx(1 / 3)}
-    assert {line.get_label() for line in in_products.lines} == {"machine code", "Pinocchio PGS"}
+    assert ends == {"numba engine": 1, "PIQP": 1, "Pinocchio PGS": pytest.approx(1 / 3)}
+    assert {line.get_label() for line in in_products.lines} == {"numba engine", "Pinocchio PGS"}
     flows, _ = draw_scaling(rows).axes
     drawn = next(line for line in flows.lines if line.get_color() == "black")
     np.testing.assert_allclose(drawn.get_ydata(), 0.01)
@@ -230,7 +230,7 @@ def test_committed_solutions_of_ours_agree_with_those_of_peers():
     told = json.loads((RESULTS / "solvers.json").read_text())
     peers_there = set(told["settings"]) - set(own())
     assert len(peers_there) == 9 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(told["packages"])
-    for ours in ("machine code", "barzilai-borwein"):
+    for ours in ("numba engine", "barzilai-borwein"):
         pairs = {
             name: pair
             for pair in told["agreement"]

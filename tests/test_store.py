@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from jaxgran.files import replaced
-from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
+from jaxgran.files import atomic_write
+from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 
 ARRAYS = {
     "numbers": np.random.default_rng(0).normal(size=(3, 7)),
@@ -32,7 +32,7 @@ def reads_as_written(path: Path) -> bool:
     """Whether a file holds what was written; False where it is known to be damaged."""
     try:
         arrays, about = read_arrays(path)
-    except Damaged:
+    except CorruptFile:
         return False
     assert set(arrays) == set(ARRAYS) and about == ABOUT
     for name, array in ARRAYS.items():
@@ -74,12 +74,12 @@ def test_what_is_no_file_of_ours_is_damaged(tmp_path: Path) -> None:
     (tmp_path / "text.nc").write_bytes(text)
     (tmp_path / "sealed.nc").write_bytes(text + hashlib.sha256(text).digest())
     for name in ("text.nc", "sealed.nc", "none.nc", "."):
-        with pytest.raises(Damaged):
+        with pytest.raises(CorruptFile):
             read_arrays(tmp_path / name)
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(file: Path) -> None:
-    with pytest.raises(RuntimeError), replaced(file) as temporary:
+    with pytest.raises(RuntimeError), atomic_write(file) as temporary:
         temporary.write_bytes(b"half")
         raise RuntimeError
     assert reads_as_written(file)

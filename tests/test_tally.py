@@ -53,9 +53,11 @@ def test_every_row_of_the_table_is_in_the_docstring():
 
 def test_terms_of_a_contact_stand_where_the_table_says():
     rng = np.random.default_rng(0)
-    angle, distance, overlap, approach, half_change, bounce, p, binary, clustered = rng.uniform(0.1, 1, 9)
+    angle, distance, overlap, approach, half_change, one_plus_alpha, p, binary, clustered = rng.uniform(0.1, 1, 9)
     nx, ny = np.cos(angle), np.sin(angle)
-    terms = contact_terms(nx, ny, distance, overlap, approach, half_change, bounce, p, binary, clustered, 1, 2, 3)
+    terms = contact_terms(
+        nx, ny, distance, overlap, approach, half_change, one_plus_alpha, p, binary, clustered, 1, 2, 3
+    )
     moment = distance * np.array([nx * nx, nx * ny, ny * ny])
     after = approach + 2 * half_change
     expected = {
@@ -65,7 +67,7 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "binary_moment": binary * moment,
         "cluster_moment": clustered * moment,
         "dissipation": -p * (approach + after) / 2,
-        "complementarity": p * (after + (bounce - 1) * approach) / 2,
+        "complementarity": p * (after + (one_plus_alpha - 1) * approach) / 2,
         "contacts": 1,
         "loaded_contacts": 2,
         "collisions": 3,

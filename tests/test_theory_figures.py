@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
+from jaxgran.plotting.enskog_factors import PANELS, enskog_factors
 from jaxgran.plotting.friction import friction_figure, parameters_text
-from jaxgran.plotting.losses import PANELS, theory_losses
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
 
@@ -59,8 +59,8 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
         added[f"theory_{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
         for k, factor in enumerate(PANELS):
             value = np.exp(factor_of(k, x, nu)) * np.ones(measured.shape)
-            added[f"theory_loss_{name}_{factor}"] = (DIMS, value)
-            added[f"theory_loss_{name}_{factor}_stderr"] = (DIMS, STDERR * value)
+            added[f"enskog_factor_{name}_{factor}"] = (DIMS, value)
+            added[f"enskog_factor_{name}_{factor}_stderr"] = (DIMS, STDERR * value)
     ratio = np.ones((*data.force_ratio.shape, 2, 2))
     added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
     added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
@@ -206,7 +206,7 @@ def test_caption_names_the_run_and_the_theory() -> None:
         assert words in text
 
 
-@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
 def test_bad_status_is_ringed_in_every_plane(draw) -> None:
     data = theory_dataset()
     data.status[2, 3] = 2
@@ -229,7 +229,7 @@ def test_theory_needs_a_plane(alphas: int, nus: int) -> None:
 
 @pytest.mark.parametrize("stress", ["pressure", "shear_stress"])
 def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(stress) -> None:
-    figure = theory_losses(theory_dataset(), stress)
+    figure = enskog_factors(theory_dataset(), stress)
     assert [axes.get_title() for axes in figure.axes] == list(PANELS.values())
     for k, axes in enumerate(figure.axes):
         corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
@@ -374,7 +374,7 @@ def test_restitution_with_too_few_points_says_so() -> None:
 # --------------------------------------------------------------------------------------------- together
 
 
-@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
 @pytest.mark.parametrize(("alphas", "nus"), [(2, 2), pytest.param(5, 6, marks=pytest.mark.slow), (10, 12)])
 def test_nothing_overlaps_on_the_page(page, draw, alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
@@ -390,7 +390,7 @@ def test_laws_do_not_overlap_on_the_page(page, alphas: tuple[float, ...]) -> Non
     assert_nothing_overlaps(friction_figure(data))
 
 
-@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares])
+@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
 def test_map_without_any_value_is_drawn(draw, page) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
@@ -399,7 +399,7 @@ def test_map_without_any_value_is_drawn(draw, page) -> None:
     assert all("no measured values" in [text.get_text() for text in axes.texts] for axes in figure.axes)
 
 
-@pytest.mark.parametrize("draw", [theory_errors, theory_losses, cluster_shares, friction_figure])
+@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares, friction_figure])
 def test_shortest_time_step_is_drawn(draw) -> None:
     data = dense_dataset() if draw is friction_figure else theory_dataset()
     several = with_timesteps(data, 3e-4, 1e-2)
@@ -415,10 +415,10 @@ def test_shortest_time_step_is_drawn(draw) -> None:
 @pytest.mark.parametrize(
     ("data", "names"),
     [
-        (theory_dataset(3, 3), ["curves", "contours", "theory", "losses", "clusters"]),
+        (theory_dataset(3, 3), ["curves", "contours", "theory", "factors", "clusters"]),
         (theory_dataset(1, 3), ["curves", "clusters"]),
-        (theory_dataset(3, 3).drop_vars("theory_pressure"), ["curves", "contours", "losses", "clusters"]),
-        (theory_dataset(3, 3).drop_vars("theory_loss_pressure_pairs"), ["curves", "contours", "theory", "clusters"]),
+        (theory_dataset(3, 3).drop_vars("theory_pressure"), ["curves", "contours", "factors", "clusters"]),
+        (theory_dataset(3, 3).drop_vars("enskog_factor_pressure_pairs"), ["curves", "contours", "theory", "clusters"]),
         (dense_dataset(), ["curves", "contours", "rheology"]),
         (dense_dataset(nus=3, alphas=(0.5,)), ["curves"]),
     ],

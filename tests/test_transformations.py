@@ -88,7 +88,15 @@ WITHOUT_ARRAYS = {
         "ratio_contours",
         "ratio_curves",
     ),
-    *("Tracks", "read_tracks", "read_trajectory", "save_figures", "theory_errors", "theory_losses", "write_trajectory"),
+    *(
+        "Tracks",
+        "read_tracks",
+        "read_trajectory",
+        "save_figures",
+        "theory_errors",
+        "enskog_factors",
+        "write_trajectory",
+    ),
 }
 
 

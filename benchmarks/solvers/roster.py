@@ -5,12 +5,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple, get_args
 
 from benchmarks.collection.compare import Prepare, projected, swept
-from benchmarks.solvers.machine_code import by_cluster
+from benchmarks.solvers.numba_engine import by_cluster
 from benchmarks.solvers.single_precision import projected_in_float32
 from jaxgran.model.choices import Solver as Method
 
 DEFAULT = "barzilai-borwein"
-MACHINE_CODE = "machine code"
+MACHINE_CODE = "numba engine"
 PACKAGES = ("pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy")
 
 

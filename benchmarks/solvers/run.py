@@ -5,7 +5,7 @@ python -m benchmarks solvers --quick  # every tenth problem and the smallest one
 
 The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's solvers are compared
 alone. All solve in this process, on one core, with one thread; times are those of the processor. A call from Python is
-part of them: about 2 µs for the machine code, 80 µs for JAX, 300 µs for OSQP.
+part of them: about 2 µs for the numba engine, 80 µs for JAX, 300 µs for OSQP.
 """
 
 import itertools

@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.analysis.coarse_graining import CoarseGraining
 from jaxgran.dynamics.snapshots import Snapshot, collided
 from jaxgran.model.cell import displacement
-from jaxgran.model.checks import InputError, require, shown
+from jaxgran.model.checks import InputError, require, short_repr
 from jaxgran.model.state import State
 
 _POINTS_AT_ONCE = 128  # points in one matrix product
@@ -140,7 +140,7 @@ def fields_at(seen: Snapshot, points: Float[Array, "points 2"], graining: Coarse
     if not isinstance(seen, Snapshot) or jnp.ndim(seen.state.positions) != 2:
         raise InputError("seen must be one Snapshot: one of a series is jax.tree.map(lambda x: x[k], series).")
     if not isinstance(graining, CoarseGraining):
-        raise InputError(f"graining must be made by gaussian, lucy or heaviside, not {shown(graining)}.")
+        raise InputError(f"graining must be made by gaussian, lucy or heaviside, not {short_repr(graining)}.")
     words = "an array (points, 2) of finite numbers"
     require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), words)
     _check(graining, seen.state)

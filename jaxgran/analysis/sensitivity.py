@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.network import first_contact_time
-from jaxgran.dynamics.plain import advance
+from jaxgran.dynamics.jax_engine import advance
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.checks import require_whole
@@ -58,7 +58,7 @@ def growth(flow: ShearFlow, state: State, strain: float | Array, count: int, mov
       state: the flow at the beginning.
       strain: total strain.
       count: number of points, static.
-      moving_contacts: whether the derivative lets contacts move in time, see ``dynamics.plain``.
+      moving_contacts: whether the derivative lets contacts move in time, see ``dynamics.jax_engine``.
 
     Raises:
       ValueError: the strain is shorter than a time step for each point.

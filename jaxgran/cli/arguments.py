@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import MAX_REPLICAS
 
 _MOST_DIGITS = 20  # of a whole number
@@ -33,7 +33,7 @@ def number_list(text: str, name: str) -> tuple[float, ...]:
     except ValueError:
         raise InputError(
             f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to "
-            f"{MAX_REPLICAS}, not {shown(text)}."
+            f"{MAX_REPLICAS}, not {short_repr(text)}."
         ) from None
 
 
@@ -51,7 +51,7 @@ def whole_numbers(text: str | None, name: str) -> int | tuple[int, ...] | str | 
         return text
     parts = text.split(",")
     if not all(part.isdecimal() and len(part) <= _MOST_DIGITS for part in parts):
-        raise InputError(f"{name} must be a whole number or a list like 256,1000,4000, not {shown(text)}.")
+        raise InputError(f"{name} must be a whole number or a list like 256,1000,4000, not {short_repr(text)}.")
     numbers = tuple(int(part) for part in parts)
     return numbers[0] if len(numbers) == 1 else numbers
 
@@ -61,7 +61,9 @@ def batch_size(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
     if not text.isdecimal() or len(text) > 9 or int(text) < 1:
-        raise InputError(f"batch must be auto or a whole number of at least 1, below a billion, not {shown(text)}.")
+        raise InputError(
+            f"batch must be auto or a whole number of at least 1, below a billion, not {short_repr(text)}."
+        )
     return int(text)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxgran.cli.terminal import say_written
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 
 EXPLORE_EXAMPLES = {
     "A page beside the map": "jaxgran explore jaxgran_map.nc",
@@ -32,7 +32,7 @@ def explore_command(
     page = explore(read_dataset(file, needed=()))
     if path.exists() and not overwrite and not shows_same_map(path, page):
         raise InputError(
-            f"output must be another file, or --overwrite be given: {shown(str(path))} is no page of this map."
+            f"output must be another file, or --overwrite be given: {short_repr(str(path))} is no page of this map."
         )
     page.save(path)
     say_written([path])

@@ -10,7 +10,7 @@ import typer
 
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say, stop
-from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.display import with_error
 
 _LARGEST_CHI_SQUARED = 9.0  # above it, no restitution of the map has these stresses
@@ -71,12 +71,12 @@ def fit_command(
     of_tracks = [name for name, value in (of_file | noise | others).items() if value is not None]
     if file.suffix != ".nc":
         if of_map:
-            raise InputError(f"{of_map[0]} goes with a map, and {shown(file.name)} is not one.")
+            raise InputError(f"{of_map[0]} goes with a map, and {short_repr(file.name)} is not one.")
         thinned = {} if every is None else {"every": every}
         _fit_tracks(file, _observed(peculiar=peculiar, **of_file) | thinned, noise)
     else:
         if of_tracks:
-            raise InputError(f"{of_tracks[0]} goes with tracks of discs, and {shown(file.name)} is a map.")
+            raise InputError(f"{of_tracks[0]} goes with tracks of discs, and {short_repr(file.name)} is a map.")
         if 0 < len(of_map) < len(stresses):
             missing = next(name for name in stresses if name not in of_map)
             raise InputError(f"{missing} must be given too, or a restitution cannot be sought.")

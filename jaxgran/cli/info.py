@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from jaxgran import environment
-from jaxgran.caches import obstacle, users_folder
+from jaxgran.caches import users_folder, why_unwritable
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
@@ -58,17 +58,17 @@ def _caches(programs: str | None) -> dict[str, str]:
     """The folders of caches, and whether files can be written there."""
     import matplotlib
 
-    from jaxgran.dynamics.machine_code.ffi import object_file
+    from jaxgran.dynamics.numba_engine.ffi import object_file
 
     folders = {
         "cache folder": users_folder(),
         "compiled programs": None if programs is None else Path(programs),
-        "machine code": object_file().parent,
+        "numba engine": object_file().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }
     return {name: "none" if folder is None else f"{folder}, {_state(folder)}" for name, folder in folders.items()}
 
 
 def _state(folder: Path) -> str:
-    why = obstacle(folder)
+    why = why_unwritable(folder)
     return f"cannot be written ({why})" if why else "works"

@@ -21,7 +21,7 @@ from jaxgran.cli.measure import finish, measured, print_budget
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, require_device, say, say_written
 from jaxgran.maps.presets import PRESETS
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import Activation, Engine, FileFormat, Solver
 from jaxgran.model.display import with_error
 
@@ -169,7 +169,7 @@ def plot_command(
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
     if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
-        raise InputError(f"output must be a folder that can be made and written to, not {shown(str(folder))}.")
+        raise InputError(f"output must be a folder that can be made and written to, not {short_repr(str(folder))}.")
     pictures = save_figures(data, folder / file.stem, format, dpi, caption)
     remove_pictures(folder / file.name, but=pictures)
     say_written(pictures)
@@ -226,7 +226,7 @@ def _large_system_table(data) -> Table:
             cells = []
             for name in BOUNDS:
                 value, error = float(point[f"{name}_large_system"]), float(point[f"{name}_large_system_error"])
-                no_limit = int(point[f"{name}_limit_seen"]) == LIMIT_SEEN["no_limit_seen"]
+                no_limit = int(point[f"{name}_converged"]) == LIMIT_SEEN["no_converged"]
                 cells.append("no limit seen" if no_limit else with_error(value, error))
             table.rows.append([f"{nu:g}", f"{alpha:g}", *cells])
     return table

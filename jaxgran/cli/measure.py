@@ -25,7 +25,7 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.environment import usable_cores
 from jaxgran.maps.progress import progress
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 
@@ -62,8 +62,8 @@ def measured(
     require_device()
     from jaxgran.maps.checkpoint import Checkpoint
     from jaxgran.maps.output import check_output, remove_pictures
+    from jaxgran.maps.ratio_map import check_batches, predicted_cost, replicas
     from jaxgran.maps.settings import MapSettings, automatic
-    from jaxgran.maps.sweep import check_batches, predicted_cost, replicas
 
     if output is not None:
         check_output(output)
@@ -80,7 +80,9 @@ def measured(
     if output is not None:
         earlier, lost, kept = _earlier(output, settings)
         if lost and not overwrite:
-            raise InputError(f"output must be another file, or --overwrite be given: {shown(str(output))} has {lost}.")
+            raise InputError(
+                f"output must be another file, or --overwrite be given: {short_repr(str(output))} has {lost}."
+            )
         folder = Checkpoint(output, settings, bool(resume))
         if resume and kept and not lost and not folder.done and not folder.journals():
             folder.close(finished=True)
@@ -144,13 +146,13 @@ def _earlier(output: Path, settings) -> tuple[Any, str, bool]:
 
 
 def _load_beside(settings, modules: Iterable[str]) -> None:
-    """Load, beside the flows, their machine code and what is needed at the end; errors come back where it is used."""
+    """Load, beside the flows, their numba engine and what is needed at the end; errors come back where it is used."""
     with suppress(Exception):
-        from jaxgran.dynamics.advance import register_machine_code
+        from jaxgran.dynamics.advance import register_numba
         from jaxgran.dynamics.engine import select_engine
 
-        if select_engine(settings.flows()[0]) == "machine_code":
-            register_machine_code()
+        if select_engine(settings.flows()[0]) == "numba":
+            register_numba()
         for name in ("jaxgran.maps.dataset", "jaxgran.maps.results", *modules):
             import_module(name)
         import xarray
@@ -216,7 +218,7 @@ def _say_retried(data) -> None:
 
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
     """Print what was written and what went wrong, and exit with the matching status."""
-    from jaxgran.maps.verdict import bad_points, in_words, short_in_words
+    from jaxgran.maps.status_report import bad_points, in_words, short_in_words
 
     say_written(written)
     _say_imprecise(data)

@@ -5,8 +5,6 @@ from typing import Any
 
 import typer
 
-from jaxgran.model.checks import shown
-
 UsageError: Any = typer.BadParameter.__base__  # typer raises it for options that it cannot read
 _LONGEST_SENTENCE = 500  # characters; a quoted value may be longer
 _KINDS_OF_NUMBER = {"integer": "a whole number", "number": "a number", "float": "a number"}
@@ -64,15 +62,15 @@ def _words(mistake: Any, arguments: list[str]) -> str:
     found = re.match("No such command '(.*?)'(?:. Did you mean '([^']*)')?", words, re.DOTALL)
     if found:
         command, meant = found.groups()
-        return f"there is no command {shown(command)}" + (f", perhaps {meant} is meant" if meant else "")
+        return f"there is no command {short_repr(command)}" + (f", perhaps {meant} is meant" if meant else "")
     found = re.match(r"Got unexpected extra argument\(?s?\)? \((.*)\)", words, re.DOTALL)
     if found:
-        return f"{shown(found[1])} stands alone, and values follow their options; a list has commas and no spaces"
+        return f"{short_repr(found[1])} stands alone, and values follow their options; a list has commas and no spaces"
     found = re.search("(?:should be|is not) a valid (integer|number|float)", words)  # the latter before typer 0.29
     if found and parameter is not None:
         given = _given(arguments, parameter.opts[0])
         return f"{parameter.opts[0]} must be {_KINDS_OF_NUMBER[found[1]]}" + (
-            "" if given is None else f", not {shown(given)}"
+            "" if given is None else f", not {short_repr(given)}"
         )
     found = re.match(r"Invalid value for '(\S+)': (?:Value error, )?(.*) is not one of (.*)", words, re.DOTALL)
     if found:

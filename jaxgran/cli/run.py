@@ -13,7 +13,7 @@ from jaxgran.cli.measure import finish, measured, print_budget
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, say
 from jaxgran.maps.progress import counted
-from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.choices import Activation, Engine, Solver
 from jaxgran.model.display import with_error
 
@@ -28,7 +28,7 @@ _GROUPS = {  # names of observables by what they tell; those that are not here a
         *("bagnold_pressure", "bagnold_shear_stress", "macroscopic_friction", "inertial_number"),
     ),
     "Motion and structure": (
-        *("granular_temperature", "local_granular_temperature", "wave_share", "collision_rate"),
+        *("granular_temperature", "local_granular_temperature", "longwave_energy_ratio", "collision_rate"),
         *("coordination_number", "network_size", "cluster_pressure_share", "cluster_shear_share"),
     ),
 }
@@ -89,11 +89,11 @@ def run_command(
 ) -> None:
     step = numbers_or_auto(timestep, "timestep")
     if isinstance(step, tuple):
-        raise InputError(f"timestep must be one number or auto, not {shown(timestep)}.")
+        raise InputError(f"timestep must be one number or auto, not {short_repr(timestep)}.")
     require_one(strain, error)
     residual = numbers_or_auto(tolerance, "tolerance")
     if isinstance(residual, tuple):
-        raise InputError(f"tolerance must be one number or auto, not {shown(tolerance)}.")
+        raise InputError(f"tolerance must be one number or auto, not {short_repr(tolerance)}.")
     frames_wanted = any(x is not None for x in (trajectory, movie, page))
     if seeds > 1 and frames_wanted:
         raise InputError(
@@ -121,7 +121,7 @@ def run_command(
     }
     for name, file in (("trajectory", trajectory), ("movie", movie), ("page", page)):
         if file is not None and os.path.isfile(file) and not overwrite:
-            raise InputError(f"{name} must be a new file, or --overwrite be given: {shown(str(file))} is there.")
+            raise InputError(f"{name} must be a new file, or --overwrite be given: {short_repr(str(file))} is there.")
     recorder, frames, film = _recorder(trajectory, movie, page, every, strain or _RECORDED_STRAIN)
     record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
     data, interrupted, written = measured(chosen, "auto", None, output, quiet, record=record, overwrite=overwrite)

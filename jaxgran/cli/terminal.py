@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
-from jaxgran.caches import cache_folder, elsewhere, enable_cache
+from jaxgran.caches import cache_folder, enable_cache, fallback_message
 from jaxgran.environment import devices
 
 NO_FILE = 1
@@ -55,10 +55,10 @@ def require_device() -> None:
 @cache
 def _say_cache() -> None:
     """Print once if the cache is not in the user's folder. The caches of figures then go to the same place."""
-    if not elsewhere():
+    if not fallback_message():
         return
-    say(elsewhere())
-    for words in ("the cache folder", "the machine code is compiled anew"):
+    say(fallback_message())
+    for words in ("the cache folder", "the numba engine is compiled anew"):
         warnings.filterwarnings("ignore", words)
     folder = cache_folder()
     if folder is not None:

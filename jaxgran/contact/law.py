@@ -1,7 +1,7 @@
 """The law of a contact: arithmetic that every engine shares.
 
 These functions take numbers or arrays and have no branches on values. The plain engine and the thread block call them
-with arrays of JAX; the machine code compiles the same source for numbers (``dynamics.machine_code.compiled``). What
+with arrays of JAX; the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What
 branches, such as the search for the next contact or a solver, is written for each engine, and tests compare them.
 
 The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With s the separation,
@@ -118,7 +118,7 @@ def contact_terms(
     overlap: Number,
     approach: Number,
     half_change: Number,
-    bounce: Number,
+    one_plus_alpha: Number,
     impulse: Number,
     binary_impulse: Number,
     clustered: Number,
@@ -153,7 +153,7 @@ def contact_terms(
         clustered * xy,
         clustered * yy,
         -impulse * (approach + half_change),
-        impulse * (bounce / 2 * approach + half_change),
+        impulse * (one_plus_alpha / 2 * approach + half_change),
         used,
         loaded,
         approaching,

@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # its parts are loaded when they are used
 
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, DelassusProblem, entries, is_sparse
-from jaxgran.model.checks import InputError, known, require, shown
+from jaxgran.model.checks import InputError, concrete_or_none, require, short_repr
 
 LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are judged; Cholesky's factor of it takes 0.1 s
 _UNIT_LENGTH = 1e-5  # by which the length of a normal may differ from one; float32 and typed digits pass
@@ -38,7 +38,7 @@ def judged(problem: Any) -> ContactProblem:
         kind = _precision(matrix, problem.approach)
         matrix = matrix.astype(kind) if is_sparse(matrix) else jnp.asarray(matrix, kind)
         return DelassusProblem(matrix, jnp.asarray(problem.approach, kind))
-    raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {shown(problem)}.")
+    raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}.")
 
 
 def require_impulses(problem: ContactProblem, impulses: Any) -> jax.Array:
@@ -60,7 +60,11 @@ def _require_network(network: ContactNetwork) -> None:
     require("masses", network.masses, lambda x: x > 0, "positive, or infinite for a wall")
     require("approach", network.approach, np.isfinite, _FINITE)
     require("normals", network.normals, np.isfinite, _FINITE)
-    ends, normals, masses = known(network.ends), known(network.normals), known(network.masses)
+    ends, normals, masses = (
+        concrete_or_none(network.ends),
+        concrete_or_none(network.normals),
+        concrete_or_none(network.masses),
+    )
     if normals is None:
         return
     lengths = np.linalg.norm(normals, axis=1)
@@ -135,8 +139,8 @@ def _scaled(matrix: Any, factors: np.ndarray) -> Any:
 def _known_matrix(matrix: Any) -> Any:
     """The matrix as an array of NumPy or a sparse one of SciPy; None while JAX traces it."""
     if not is_sparse(matrix):
-        return known(matrix)
-    rows, columns, values = (known(x) for x in entries(matrix))
+        return concrete_or_none(matrix)
+    rows, columns, values = (concrete_or_none(x) for x in entries(matrix))
     if rows is None or columns is None or values is None:
         return None
     inside = (rows < matrix.shape[0]) & (columns < matrix.shape[1])  # a BCOO is padded with indices outside of it
@@ -158,7 +162,7 @@ def _require_shape(name: str, value: Any, shape: tuple[int, ...], words: str) ->
 
 
 def _described(value: Any) -> str:
-    return f"of the shape {tuple(np.shape(value))}" if hasattr(value, "dtype") else shown(value)
+    return f"of the shape {tuple(np.shape(value))}" if hasattr(value, "dtype") else short_repr(value)
 
 
 def _precision(*values: Any) -> Any:

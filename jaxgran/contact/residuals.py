@@ -85,9 +85,9 @@ def residuals_of(problem: ContactProblem, impulses: Array, restitution: Array) -
     network = isinstance(problem, ContactNetwork)
     operator = as_contacts(problem) if network else problem
     grains = problem.masses.size if network else 0
-    own, bounce = diagonal(operator, grains), 1 + restitution
-    after = delassus_product(operator, impulses, grains) + bounce * operator.approach
-    stopped = bounce * jnp.minimum(operator.approach, 0)
+    own, one_plus_alpha = diagonal(operator, grains), 1 + restitution
+    after = delassus_product(operator, impulses, grains) + one_plus_alpha * operator.approach
+    stopped = one_plus_alpha * jnp.minimum(operator.approach, 0)
     speed, energy = jnp.sqrt(dot(stopped, stopped)), dot(stopped, stopped / own)
     speed, energy = (jnp.where(x > 0, x, 1) for x in (speed, energy))
     push, work = own * impulses, impulses * after

@@ -12,7 +12,7 @@ from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
 from jaxgran.contact.problem_checks import judged
 from jaxgran.contact.residuals import ContactResiduals, residuals_of
 from jaxgran.contact.solver import solve
-from jaxgran.model.checks import InputError, require_number, shown
+from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.choices import Solver
 from jaxgran.model.flow import RANGES
 
@@ -85,7 +85,7 @@ def solve_contacts(
     """
     problem = judged(problem)
     if method not in get_args(Solver):
-        raise InputError(f"method must be one of {', '.join(get_args(Solver))}, not {shown(method)}.")
+        raise InputError(f"method must be one of {', '.join(get_args(Solver))}, not {short_repr(method)}.")
     numbers = {
         "restitution": restitution,
         "tolerance": tolerance,

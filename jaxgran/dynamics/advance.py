@@ -1,6 +1,6 @@
 """Advances one replica through time, with the engine that ``dynamics.engine`` selects.
 
-XLA calls the machine code through its foreign function interface. The thread block is a Pallas kernel. So ``jit``,
+XLA calls the numba engine through its foreign function interface. The thread block is a Pallas kernel. So ``jit``,
 ``lax.map`` and ``vmap`` apply to all engines.
 """
 
@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.dynamics import plain as plain_module
+from jaxgran.dynamics import jax_engine
 from jaxgran.dynamics.engine import select_engine
-from jaxgran.dynamics.plain import NEEDS_EVENTS, ended, require_advance
+from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
@@ -51,8 +51,8 @@ def advance(
         same.
       events: number of visited steps, static, for a loop of fixed length; ``steps + 1`` is always enough, and
         ``count_events`` counts them. If they are too few, the status is ``capacity``. None visits as many as needed.
-      moving_contacts: whether derivatives include the shift of the contacts in time, see ``dynamics.plain``. Values do
-        not change.
+      moving_contacts: whether derivatives include the shift of the contacts in time, see
+        ``dynamics.jax_engine``. Values do not change.
 
     Returns:
       The state after the last step, and the tally of the steps. A replica with a number that is not finite stops with
@@ -67,8 +67,8 @@ def advance(
     options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
     engine = select_engine(flow, state, " and ".join(name for name, given in options.items() if given))
     if engine == "jax":
-        return plain_module.advance(flow, state, steps, free_flight, events, moving_contacts)
-    return _advance(machine_code if engine == "machine_code" else thread_block, flow, state, steps)
+        return jax_engine.advance(flow, state, steps, free_flight, events, moving_contacts)
+    return _advance(numba if engine == "numba" else pallas, flow, state, steps)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -81,26 +81,26 @@ def _advance(engine: _CompiledEngine, flow: ShearFlow, state: State, steps: Arra
 def _advance_jvp(
     engine: _CompiledEngine, primals: tuple, tangents: tuple
 ) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
-    return jax.jvp(plain_module.advance, primals, tangents)
+    return jax.jvp(jax_engine.advance, primals, tangents)
 
 
-def register_machine_code() -> None:
-    """Tell XLA where the machine code is, which is compiled at its first use."""
-    from jaxgran.dynamics.machine_code import ffi
+def register_numba() -> None:
+    """Tell XLA where the numba engine is, which is compiled at its first use."""
+    from jaxgran.dynamics.numba_engine import ffi
 
     ffi.register()
 
 
-def machine_code(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica with the machine code."""
-    end, sums, _, _ = call_machine_code(flow, state, steps)
+def numba(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica with the numba engine."""
+    end, sums, _, _ = call_numba(flow, state, steps)
     return ended(state, end.positions, end.tilt, end.velocities, sums)
 
 
-def call_machine_code(
+def call_numba(
     flow: ShearFlow, state: State, steps: Array, solved: Array | int = 0, room: int = 0
 ) -> tuple[State, RunningSums, Array, Array]:
-    """What one call of the machine code leaves.
+    """What one call of the numba engine leaves.
 
     Args:
       flow, state, steps: as in ``advance``.
@@ -108,12 +108,12 @@ def call_machine_code(
       room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
 
     Returns:
-      The state at the end, the running sums, the results in the order of ``machine_code.layout``, and the records.
+      The state at the end, the running sums, the results in the order of ``numba.layout``, and the records.
     """
-    from jaxgran.dynamics.machine_code import layout
-    from jaxgran.dynamics.machine_code.ffi import TARGET
+    from jaxgran.dynamics.numba_engine import layout
+    from jaxgran.dynamics.numba_engine.ffi import TARGET
 
-    register_machine_code()
+    register_numba()
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
     numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps, solved)
@@ -130,8 +130,8 @@ def call_machine_code(
     return end, sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32)), found, records
 
 
-def thread_block(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica with the GPU kernel of ``thread_block``, or with the engine "jax" on another device."""
-    from jaxgran.dynamics.thread_block.kernel import advance
+def pallas(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica with the GPU kernel of ``pallas``, or with the engine "jax" on another device."""
+    from jaxgran.dynamics.pallas_engine.kernel import advance
 
-    return lax.platform_dependent(flow, state, steps, cuda=advance, default=plain_module.advance)
+    return lax.platform_dependent(flow, state, steps, cuda=advance, default=jax_engine.advance)

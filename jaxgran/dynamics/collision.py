@@ -130,10 +130,10 @@ def _alone(near: PairList, contact: Array, grains: Grains) -> Array:
     return contact & (degree[near.i] == 1) & (degree[near.j] == 1)
 
 
-def _binary_impulses(network: Contacts, bounce: Array | float) -> Float[Array, " contacts"]:
+def _binary_impulses(network: Contacts, one_plus_alpha: Array | float) -> Float[Array, " contacts"]:
     """The impulses if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻)."""
     reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
-    return bounce * reduced_mass * jnp.maximum(0, -network.approach)
+    return one_plus_alpha * reduced_mass * jnp.maximum(0, -network.approach)
 
 
 def shifted(
@@ -174,8 +174,8 @@ def _impulses(
     solution = solve(
         network, count, flow.shear_rate, flow.tolerance, flow.max_iterations, flow.relaxation, flow.solver, meets
     )
-    bounce = 1 + flow.restitution
-    impulses = bounce * solution.impulses
+    one_plus_alpha = 1 + flow.restitution
+    impulses = one_plus_alpha * solution.impulses
     approach, (nx, ny), distance = network.approach, network.normals.T, network.distances
     reach = grains.radii[network.i] + grains.radii[network.j]
     overlap = jnp.where(network.used, jnp.maximum(reach - distance, 0), 0)
@@ -189,17 +189,19 @@ def _impulses(
         distance,
         overlap,
         approach,
-        bounce / 2 * solution.response,
-        bounce,
+        one_plus_alpha / 2 * solution.response,
+        one_plus_alpha,
         impulses,
-        _binary_impulses(network, bounce),
+        _binary_impulses(network, one_plus_alpha),
         jnp.where(clustered, impulses, 0),
         *flags,
     )
     status = jnp.where(overflow, Status.capacity, Status.ok)
     status = jnp.maximum(status, solution.status).astype(jnp.int32)
     unconverged = solution.status != Status.ok
-    counts = jnp.stack([jnp.asarray(x, nx.dtype) for x in (jnp.ones_like(bounce), solution.iterations, unconverged)])
+    counts = jnp.stack(
+        [jnp.asarray(x, nx.dtype) for x in (jnp.ones_like(one_plus_alpha), solution.iterations, unconverged)]
+    )
     edges = jnp.asarray(RESIDUAL_EDGES[1:-1], nx.dtype)
     above = jnp.concatenate([jnp.ones(1, bool), solution.residual > edges])
     by_residual = above & ~jnp.append(above[1:], False)

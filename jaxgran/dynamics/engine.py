@@ -3,14 +3,14 @@
 ================  ====================================  ============================================================
 engine            for                                   needs
 ================  ====================================  ============================================================
-machine_code      processors                            float64, the default solver, no ``vmap`` with a named axis
-thread_block      NVIDIA GPUs                           at most 1024 grains, the default solver
+numba      processors                            float64, the default solver, no ``vmap`` with a named axis
+pallas      NVIDIA GPUs                           at most 1024 grains, the default solver
 jax               everything else, and as reference     nothing: every backend, precision, solver and derivative
 auto              every flow                            nothing: the engine of the backend if possible, or else jax
 ================  ====================================  ============================================================
 
 All engines solve the same steps to the same tolerance. Derivatives and steps without free flight run in the engine
-"jax" only, and ``observe`` in it and in the machine code. "auto" selects an engine that can. A named engine that cannot
+"jax" only, and ``observe`` in it and in the numba engine. "auto" selects an engine that can. A named engine that cannot
 raises an InputError.
 """
 
@@ -30,17 +30,17 @@ from jaxgran.model.state import State
 
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
 _DEFAULT_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
-_ENGINE_OF_PLATFORM: dict[str, Engine] = {"cpu": "machine_code", "gpu": "thread_block"}
+_ENGINE_OF_PLATFORM: dict[str, Engine] = {"cpu": "numba", "gpu": "pallas"}
 _SINGLE_PRECISION = (
-    "JAX computes in single precision, in which flows take the engine jax, several times slower than the machine code: "
+    "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
     'begin with jax.config.update("jax_enable_x64", True).'
 )
-_OPTIONS_OF_ENGINE = {"machine_code": ("observe",)}
-_SOLVER_OF_ENGINE = {"machine_code": "gauss-seidel, barzilai-borwein where stiff", "thread_block": "barzilai-borwein"}
+_OPTIONS_OF_ENGINE = {"numba": ("observe",)}
+_SOLVER_OF_ENGINE = {"numba": "gauss-seidel, barzilai-borwein where stiff", "pallas": "barzilai-borwein"}
 
 
 def select_engine(flow: ShearFlow, state: State | None = None, option: str = "") -> Engine:
-    """Selects the engine for the backend, precision and solver: ``machine_code``, ``thread_block`` or ``jax``.
+    """Selects the engine for the backend, precision and solver: ``numba``, ``pallas`` or ``jax``.
 
     Args:
       flow: gives the engine, the solver and the number of grains; it may be a batch.
@@ -58,12 +58,12 @@ def select_engine(flow: ShearFlow, state: State | None = None, option: str = "")
         return "jax"
     option = "" if option in _OPTIONS_OF_ENGINE.get(engine, ()) else option
     obstacle = _obstacle(engine, flow, state, option, device)
-    if obstacle is None and engine == "thread_block":
+    if obstacle is None and engine == "pallas":
         obstacle = _kernel_obstacle(flow, state, device)
     if obstacle is None:
         return engine
     if flow.engine == "auto":
-        if state is not None and engine == "machine_code" and _only_precision_is_missing(flow, option):
+        if state is not None and engine == "numba" and _only_precision_is_missing(flow, option):
             _warn_once(_SINGLE_PRECISION)
         return "jax"
     where, why = obstacle
@@ -76,7 +76,7 @@ def solver_in_use(engine: Engine, solver: str) -> str:
     Examples:
       >>> solver_in_use("jax", "jacobi")
       'jacobi'
-      >>> solver_in_use("machine_code", "barzilai-borwein")
+      >>> solver_in_use("numba", "barzilai-borwein")
       'gauss-seidel, barzilai-borwein where stiff'
     """
     return _SOLVER_OF_ENGINE.get(engine, solver)
@@ -85,24 +85,24 @@ def solver_in_use(engine: Engine, solver: str) -> str:
 def _obstacle(engine: Engine, flow: ShearFlow, state: State | None, option: str, device: Any) -> tuple[str, str] | None:
     """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
     if _ENGINE_OF_PLATFORM.get(device.platform) != engine:
-        made_for = "processors" if engine == "machine_code" else "NVIDIA GPUs"
+        made_for = "processors" if engine == "numba" else "NVIDIA GPUs"
         return f"on a {device.platform.upper()}", f"it is made for {made_for}"
     if option:
         others = [name for name, options in _OPTIONS_OF_ENGINE.items() if option in options]
         return f"with {option}", f"only the engine {' or '.join([*others, 'jax'])} does that"
     if flow.solver != _DEFAULT_SOLVER:
         return f"with the solver {flow.solver}", "it has a contact solve of its own"
-    if engine == "machine_code" and _dtype(state) != jnp.float64:
+    if engine == "numba" and _dtype(state) != jnp.float64:
         return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
-    if engine == "machine_code" and in_batch():
+    if engine == "numba" and in_batch():
         return f"in a vmap with the axis name {AXIS!r}", "it advances one replica after another, as in jax.lax.map"
-    if engine == "thread_block" and flow.grains > MOST_GRAINS:
+    if engine == "pallas" and flow.grains > MOST_GRAINS:
         return f"with more than {MOST_GRAINS} grains", "every grain has a thread of one block"
     return None
 
 
 def _only_precision_is_missing(flow: ShearFlow, option: str) -> bool:
-    """Whether the machine code would advance the flow if double precision were switched on."""
+    """Whether the numba engine would advance the flow if double precision were switched on."""
     other = option or flow.solver != _DEFAULT_SOLVER or in_batch()
     return not other and not jax.config.read("jax_enable_x64")
 
@@ -132,7 +132,7 @@ def _kernel_problem(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> st
     """Why the kernel does not compile on a device or breaks the contact law there; "" if it works. Tried once."""
 
     def trial() -> None:
-        from jaxgran.dynamics.thread_block import kernel
+        from jaxgran.dynamics.pallas_engine import kernel
 
         with jax.default_device(device), jax.enable_x64(x64):
             kernel.trial(grains, dtype)

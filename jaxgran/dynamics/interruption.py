@@ -1,4 +1,4 @@
-"""Ctrl-C while compiled code runs: the wait for its results ends at once, and so does the machine code."""
+"""Ctrl-C while compiled code runs: the wait for its results ends at once, and so does the numba engine."""
 
 import sys
 import time
@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import jax
 
-_FFI = "jaxgran.dynamics.machine_code.ffi"
+_FFI = "jaxgran.dynamics.numba_engine.ffi"
 _PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
 T = TypeVar("T")
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 def waited(results: T) -> T:
     """The results when they are computed.
 
-    Ctrl-C, or whatever raises a KeyboardInterrupt, ends all machine code of the process within a step of its flow.
+    Ctrl-C, or whatever raises a KeyboardInterrupt, ends all numba engine of the process within a step of its flow.
     The engine "jax" cannot be stopped: what it was asked for is computed beside what follows, and lost.
     """
     try:

@@ -1,7 +1,7 @@
-"""Advances one replica and sums what a function of the user's finds, with the machine code or the engine "jax".
+"""Advances one replica and sums what a function of the user's finds, with the numba engine or the engine "jax".
 
-The machine code knows nothing of the function. It records the steps that it visits until its room is full; then JAX
-applies the function to the records, and the machine code goes on. So only the function is compiled, and not an engine.
+The numba engine knows nothing of the function. It records the steps that it visits until its room is full; then JAX
+applies the function to the records, and the numba engine goes on. So only the function is compiled, and not an engine.
 """
 
 from functools import partial
@@ -15,12 +15,12 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.advance import call_machine_code
+from jaxgran.dynamics.advance import call_numba
 from jaxgran.dynamics.collision import Observe
 from jaxgran.dynamics.engine import select_engine
+from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, require_advance
+from jaxgran.dynamics.jax_engine import advance_observed as plain_advance
 from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
-from jaxgran.dynamics.plain import NEEDS_EVENTS, ended, require_advance
-from jaxgran.dynamics.plain import advance_observed as plain_advance
 from jaxgran.dynamics.tally import Tally, empty_sums, place_of
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
@@ -29,7 +29,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
-_ROOM = 64  # records of one call, after which the machine code searches anew
+_ROOM = 64  # records of one call, after which the numba engine searches anew
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
@@ -61,7 +61,7 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally, Any]:
-    """``advance_observed`` with the machine code; its derivatives are those of the engine "jax"."""
+    """``advance_observed`` with the numba engine; its derivatives are those of the engine "jax"."""
 
     def unfinished(now) -> Array:
         _, done, _, sums = now
@@ -69,7 +69,7 @@ def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> 
 
     def called(now):
         state, done, solved, sums = now
-        end, new, found, records = call_machine_code(flow, state, steps - done, solved, _ROOM)
+        end, new, found, records = call_numba(flow, state, steps - done, solved, _ROOM)
         flown = found[place_of("steps")]
         user_sums = _with_records(flow, state, observe, sums.user_sums, records, found, flown)
         return end, done + flown.astype(done.dtype), _solved(found), sums.joined(new._replace(user_sums=user_sums))
@@ -88,7 +88,7 @@ def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
 
 
 def _solved(found: Array) -> Array:
-    from jaxgran.dynamics.machine_code.layout import SOLVED
+    from jaxgran.dynamics.numba_engine.layout import SOLVED
 
     return found[SOLVED]
 
@@ -97,7 +97,7 @@ def _with_records(
     flow: ShearFlow, state: State, observe: Observe, user_sums: Any, records: Array, found: Array, flown: Array
 ) -> Any:
     """The user sums with what is found in the records of a call that flew so many steps from a state."""
-    from jaxgran.dynamics.machine_code.layout import ACTED, AT_STEP, CONTACTS, RECORDED
+    from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS, RECORDED
 
     dtype, count = records.dtype, found[RECORDED].astype(jnp.int32)
     most = 3 * flow.grains  # contacts of discs form a planar graph
@@ -126,7 +126,7 @@ def _with_records(
 
 def _recorded_state(record: Array, state: State) -> State:
     """The state of a record, before its contacts act."""
-    from jaxgran.dynamics.machine_code import layout
+    from jaxgran.dynamics.numba_engine import layout
 
     tilt, count = record[layout.TILTED], state.grains.radii.size
     numbers = record[layout.RECORD_HEAD : layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * count]
@@ -136,7 +136,7 @@ def _recorded_state(record: Array, state: State) -> State:
 
 def _recorded_contacts(record: Array, grains: Grains, slots: int) -> tuple[Contacts, Array]:
     """The contacts of a record and their impulses, in so many slots."""
-    from jaxgran.dynamics.machine_code import layout
+    from jaxgran.dynamics.numba_engine import layout
 
     first = layout.RECORD_HEAD + layout.RECORD_OF_GRAIN * grains.radii.size
     rows = record[first : first + slots * layout.RECORD_OF_CONTACT].reshape(slots, layout.RECORD_OF_CONTACT)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.contact.network import Contacts
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
 ObserveNow = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
@@ -42,7 +42,7 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
             values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
             for x in jax.tree.leaves(values):
                 if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
-                    raise InputError(f"observe must return real numbers, not {shown(x)}.")
+                    raise InputError(f"observe must return real numbers, not {short_repr(x)}.")
             return jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), dtype), values)
 
         return jax.eval_shape(numbers)

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.model.checks import InputError, require, require_number, shown
+from jaxgran.model.checks import InputError, require, require_number, short_repr
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.steady_shear import Scalar
@@ -196,7 +196,7 @@ def _outside(value: Array, span: Numbers) -> Array:
 
 def require_closure(closure: Closure) -> None:
     if not isinstance(closure, Closure):
-        raise InputError(f"closure must be a Closure, as fit_closure returns, not {shown(closure)}.")
+        raise InputError(f"closure must be a Closure, as fit_closure returns, not {short_repr(closure)}.")
 
 
 def require_fraction(packing_fraction: Scalar) -> None:

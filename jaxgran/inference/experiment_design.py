@@ -28,7 +28,7 @@ from jaxgran.inference.collisions import LONGEST, Candidates, Flights, Noise, ca
 from jaxgran.inference.restitution import LEAST_NOISE, LONGEST_STEP
 from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, struck_windows, without_repeats
 from jaxgran.io.tracks import Tracks, tracks_of_states
-from jaxgran.model.checks import InputError, require_key, require_number, require_untraced, require_whole, shown
+from jaxgran.model.checks import InputError, require_key, require_number, require_untraced, require_whole, short_repr
 from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
 from jaxgran.model.state import State
 from jaxgran.model.status import MEANINGS, Status
@@ -141,7 +141,7 @@ def fisher_information(
     require_sheared(flow)
     require_whole("frames", frames, 2, _MOST_FRAMES, "a bound of what is meaningful")
     if not isinstance(noise, TrackNoise):
-        raise InputError(f"noise must be a TrackNoise, such as jg.TrackNoise(position=1e-3), not {shown(noise)}.")
+        raise InputError(f"noise must be a TrackNoise, such as jg.TrackNoise(position=1e-3), not {short_repr(noise)}.")
     if frame_strain is not None:
         require_number("frame_strain", frame_strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     require_number("missing", missing, lambda x: (x >= 0) & (x < 1), "at least 0 and below 1")

@@ -39,7 +39,7 @@ from jaxgran.inference.collisions import (
 )
 from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, struck_windows, without_repeats
 from jaxgran.io.tracks import Tracks
-from jaxgran.model.checks import InputError, require_number, require_untraced, shown
+from jaxgran.model.checks import InputError, require_number, require_untraced, short_repr
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions, the best of which starts the iteration
 DIAMETER_NOISE = 0.01  # of a diameter, with which the search for collisions begins
@@ -114,7 +114,9 @@ def fit_restitution(
       RuntimeError: the restitution does not settle.
     """
     if not isinstance(tracks, Tracks):
-        raise InputError(f"tracks must be Tracks, as read_tracks and tracks_of_states return, not {shown(tracks)}.")
+        raise InputError(
+            f"tracks must be Tracks, as read_tracks and tracks_of_states return, not {short_repr(tracks)}."
+        )
     words = "it iterates in Python, so call it for each trajectory"
     require_untraced("fit_restitution", words, *vars(tracks).values())
     given = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}

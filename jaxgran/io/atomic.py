@@ -17,27 +17,27 @@ from pathlib import Path
 import netCDF4  # noqa: F401 before h5py: where both bring the same HDF5, netCDF4 fails after it
 import numpy as np
 
-from jaxgran.files import replaced
-from jaxgran.model.checks import InputError, shown
+from jaxgran.files import atomic_write
+from jaxgran.model.checks import InputError, short_repr
 
 _DIGEST = hashlib.sha256().digest_size  # bytes
 _LONGEST_NAME = 200  # bytes; file systems accept 255, and the temporary files beside a file have longer names
 
 
-class Damaged(Exception):
+class CorruptFile(Exception):
     """A file cannot be read, or its content is not what was written."""
 
 
 def require_place(path: Path, option: str, ending: str) -> None:
     """Raise an InputError that says what is accepted, unless a file with this ending can be written to ``path``."""
     if path.suffix != ending:
-        raise InputError(f"{option} must be a file name that ends in {ending}, not {shown(str(path))}.")
+        raise InputError(f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.")
     if len(os.fsencode(path.name)) > _LONGEST_NAME:
-        raise InputError(f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {shown(path.name)}.")
+        raise InputError(f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {short_repr(path.name)}.")
     if os.path.isdir(path):
         raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.")
     if not os.path.isdir(path.parent):
-        raise InputError(f"{option} must be in a folder that exists, and {shown(str(path.parent))} does not.")
+        raise InputError(f"{option} must be in a folder that exists, and {short_repr(str(path.parent))} does not.")
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
@@ -61,7 +61,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
         file.attrs["names"] = json.dumps(list(arrays))
         file.attrs["about"] = json.dumps(about, sort_keys=True)
     content = memory.getvalue()
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(content + hashlib.sha256(content).digest())
 
 
@@ -72,13 +72,13 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
     try:
         file_bytes = path.read_bytes()
     except OSError as error:
-        raise Damaged(f"{path.name} cannot be read: {error}") from error
+        raise CorruptFile(f"{path.name} cannot be read: {error}") from error
     content = file_bytes[:-_DIGEST]
     if hashlib.sha256(content).digest() != file_bytes[-_DIGEST:]:
-        raise Damaged(f"{path.name} is not what was written")
+        raise CorruptFile(f"{path.name} is not what was written")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
             return arrays, json.loads(str(file.attrs["about"]))
     except (OSError, KeyError, ValueError) as error:  # the checksum is right, but the file was not written here
-        raise Damaged(f"{path.name} cannot be read: {error}") from error
+        raise CorruptFile(f"{path.name} cannot be read: {error}") from error

@@ -31,7 +31,7 @@ from jaxgran.io.tracks import (
     tracks_of_table,
 )
 from jaxgran.io.trajectory import read_trajectory
-from jaxgran.model.checks import InputError, require_whole, shown
+from jaxgran.model.checks import InputError, require_whole, short_repr
 
 _NAMES = {
     "frame": ("frame", "step", "timestep"),
@@ -77,16 +77,16 @@ def read_tracks(
       InputError: (a ValueError) there is no such file, or it does not hold such tracks; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"path must be a file name, not {shown(path)}.")
+        raise InputError(f"path must be a file name, not {short_repr(path)}.")
     said = Observation(interval, shear_rate, peculiar, diameter)
     require_observation(said)
     require_whole("every", every, 1, 10**9, "as files have fewer frames")
     path = Path(os.fspath(path))
-    name, reader = shown(path.name), _READERS.get(path.suffix.lower())
+    name, reader = short_repr(path.name), _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"tracks must be a file that ends in {', '.join(_READERS)}, not {name}.")
     if not path.is_file():
-        raise InputError(f"there is no file {shown(str(path))}.")
+        raise InputError(f"there is no file {short_repr(str(path))}.")
     if reader is _gsd_table and _of_jaxgran(path):
         if said != Observation():
             raise InputError(f"{name} says its time, shear rate and diameters itself, so none is to be given.")
@@ -100,7 +100,7 @@ def read_tracks(
     except OSError:
         raise
     except Exception as error:  # a damaged file may raise any exception in the library that reads it
-        why = shown(str(error)).strip("'\"").rstrip(".")
+        why = short_repr(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} cannot be read: {why}.") from None
     return every_frame(tracks_of_table(table, said, name), every, name)
 
@@ -291,7 +291,7 @@ def _first_word(column: np.ndarray) -> str:
         try:
             float(word)
         except ValueError:
-            return shown(word[:30])
+            return short_repr(word[:30])
     return "something"
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxgran.model.checks import InputError, require_number, require_untraced, shown
+from jaxgran.model.checks import InputError, require_number, require_untraced, short_repr
 from jaxgran.model.state import State
 
 _LARGEST = 50_000_000  # entries of discs × frames; more do not fit into the memory of a small machine
@@ -284,4 +284,4 @@ def require_observation(said: Observation) -> None:
     if said.shear_rate is not None:
         require_number("shear_rate", said.shear_rate, np.isfinite, "a finite number")
     if said.peculiar and not said.shear_rate:
-        raise InputError(f"peculiar goes with a shear rate, and shear_rate is {shown(said.shear_rate)}.")
+        raise InputError(f"peculiar goes with a shear rate, and shear_rate is {short_repr(said.shear_rate)}.")

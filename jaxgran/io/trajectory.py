@@ -40,10 +40,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
-from jaxgran.files import replaced
+from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
 from jaxgran.model.cell import centred, remap_tilt, wrap
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
@@ -95,12 +95,12 @@ def check_trajectory(path: Path) -> None:
     """Raise a ValueError in one sentence if a trajectory cannot be written to ``path``."""
     require_place(path, "trajectory", ".gsd")
     if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library opens no other names
-        raise InputError(f"trajectory must be a file name in UTF-8, not {shown(str(path))}.")
+        raise InputError(f"trajectory must be a file name in UTF-8, not {short_repr(str(path))}.")
 
 
 def start_trajectory(path: Path, seen: Snapshot) -> None:
     """Write the first frame of a trajectory; an existing file is replaced."""
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         _write(temporary, "x", seen, 0)
 
 
@@ -146,11 +146,11 @@ def write_trajectory(
         of the flow, or the strain does not increase by at least one time step from frame to frame.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"path must be a file name, not {shown(path)}.")
+        raise InputError(f"path must be a file name, not {short_repr(path)}.")
     path = Path(path)
     check_trajectory(path)
     if path.exists() and not overwrite:
-        raise InputError(f"path must be another file, or overwrite be True: {shown(str(path))} exists.")
+        raise InputError(f"path must be another file, or overwrite be True: {short_repr(str(path))} exists.")
     if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
         raise InputError("states must have one leading axis of frames: stack them, or take those of snapshot_series.")
     strains = np.asarray(strain, np.float64)
@@ -163,7 +163,7 @@ def write_trajectory(
     for state in frames:
         require_state(flow, state)
     seen = jax.jit(snapshot)
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
             _write(temporary, "r+" if k else "x", seen(flow, state), step)
 
@@ -240,8 +240,8 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       ValueError: there is no such file, or it is not such a trajectory; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise InputError(f"path must be a file name, not {shown(path)}.")
-    name = shown(os.fspath(path))
+        raise InputError(f"path must be a file name, not {short_repr(path)}.")
+    name = short_repr(os.fspath(path))
     if not os.path.isfile(path):
         raise InputError(f"there is no file {name}.")
     try:
@@ -249,7 +249,7 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
     except InputError as lack:
         raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {lack}.") from None
     except Exception as error:  # a damaged file may raise any exception
-        why = shown(str(error)).strip("'\"").rstrip(".")
+        why = short_repr(str(error)).strip("'\"").rstrip(".")
         raise InputError(f"{name} is not a GSD file that can be read: {why}.") from None
     steps, numbers, states = zip(*frames, strict=True)
     state = jax.tree.map(lambda *x: np.stack(x), *states)
@@ -268,7 +268,7 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
     fl, _ = _library()
     with fl.open(path, "r") as file:
         if file.schema != "hoomd":
-            raise InputError(f"its schema is {shown(file.schema)}, and must be hoomd")
+            raise InputError(f"its schema is {short_repr(file.schema)}, and must be hoomd")
         if file.nframes == 0:
             raise InputError("it has no frames")
         first = _chunks(file, 0, {})

@@ -27,7 +27,7 @@ import jax
 import numpy as np
 
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
-from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
+from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.instants import as_arrays, from_arrays
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -182,7 +182,7 @@ class Checkpoint:
         """The content of a file; a damaged file is removed, its name noted, and the result is None."""
         try:
             return read_arrays(path)[0]
-        except Damaged:
+        except CorruptFile:
             self.damaged.append(path.name)
             path.unlink(missing_ok=True)
             return None
@@ -194,7 +194,7 @@ class Checkpoint:
         """Raise an InputError with the first difference between this map and the unfinished one."""
         try:
             _, begun = read_arrays(self.folder / "map.nc")
-        except Damaged:
+        except CorruptFile:
             if not self._has_batch_of_this_map():
                 raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
             self.damaged.append("map.nc")
@@ -212,7 +212,7 @@ class Checkpoint:
         for path in self._batches():
             try:
                 keys = [(row[0], row[1]) for row in read_arrays(path)[0]["keys"].tolist()]
-            except Damaged:
+            except CorruptFile:
                 continue
             if path.stem.endswith(f"-{self._name(keys)}"):
                 return True

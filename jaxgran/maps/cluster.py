@@ -6,7 +6,7 @@ The cluster replaces workers that die and repeats their tasks. It gives up a tas
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
-from jaxgran.maps.pool import Died
+from jaxgran.maps.pool import WorkerDied
 from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
@@ -19,7 +19,7 @@ def run_on_cluster(
     tasks: Sequence[tuple],
     configure: Callable[..., None],
     arguments: tuple,
-) -> Generator[tuple[int, T | Died]]:
+) -> Generator[tuple[int, T | WorkerDied]]:
     """Run a function on the arguments of every task on a cluster, and yield each result when it is there.
 
     Args:
@@ -47,7 +47,7 @@ def run_on_cluster(
             try:
                 yield futures[future], future.result()
             except KilledWorker:
-                yield futures[future], Died("a batch has killed its workers too often")
+                yield futures[future], WorkerDied("a batch has killed its workers too often")
             future.release()
 
 

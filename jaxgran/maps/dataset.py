@@ -14,16 +14,16 @@ import xarray as xr
 from jaxgran import environment
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
+from jaxgran.maps.enskog_factor_variables import enskog_factor_variables
 from jaxgran.maps.error_variables import error_variables
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import BOUNDS, large_system_variables
-from jaxgran.maps.loss_variables import loss_variables
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.choices import Engine
 from jaxgran.model.status import Status
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
-from jaxgran.sampling.memory import memory_strain
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
@@ -58,8 +58,8 @@ def map_dataset(
     theory_NAME                   point                 prediction of kinetic theory, for the names in ``THEORY``
     enskog_STRESS                 point                 contact pressure and shear stress of Enskog's theory at the
                                                         measured granular temperature, with ``_stderr``
-    theory_loss_STRESS_FACTOR     point                 factors whose product times enskog_STRESS is contact_STRESS, see
-                                                        ``sampling.losses``, with ``_stderr``
+    enskog_factor_STRESS_FACTOR   point                 factors whose product times enskog_STRESS is contact_STRESS,
+                                                        see ``sampling.enskog_factors``, with ``_stderr``
     status, status_by_seed        point, (point, seed)  worst status
     memory                        point                 strain over which the flow remembers
     strain_by_seed                (point, seed)         sampled strain
@@ -128,7 +128,7 @@ def map_dataset(
                 values[name][point], errors[name][point] = value[name], error[name]
             grains, spread = flows[point].grains, float(flows[point].polydispersity)
             mass = grains * (1 + spread**2 / 3)
-            memory[point] = memory_strain(value, grains, mass, samples[0].area, samples[0].shear_rate)
+            memory[point] = flow_correlation_strain(value, grains, mass, samples[0].area, samples[0].shear_rate)
             drifting[point] = is_drifting(samples, memory[point])
             friction_correlation[point] = error_correlation_of(samples, "macroscopic_friction", "inertial_number")
             independent = correlation_strains(samples)
@@ -155,7 +155,7 @@ def map_dataset(
         variables |= large_system_variables(point_dims[1:], settings.sizes, averages, OBSERVABLES)
     if settings.snapshots:
         variables |= instant_variables(point_dims, shape, first_of_points(results))
-    variables |= loss_variables(settings, point_dims, measured)
+    variables |= enskog_factor_variables(settings, point_dims, measured)
     predictions = _predictions(settings)
     for name in THEORY:
         long_name, units = OBSERVABLES[name]
@@ -254,7 +254,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     title, Conventions          what the file is, and the version of the CF conventions
     restitution, …, first_seed  the settings by their names in ``ratio_map``
     engine, solver              what ran; numbers of grains may have different ones on a GPU
-    engine_asked, solver_asked  what was asked for
+    engine_requested, solver_requested  what was asked for
     equilibrate                 strain before the sample, or "until steady"
     timestep_unit               of the time step
     strain_meaning              of the strain
@@ -287,8 +287,8 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "snapshots": int(settings.snapshots),  # NetCDF has no True and False
         "engine": ", ".join(dict.fromkeys(engines)),
         "solver": ", ".join(dict.fromkeys(solvers)),
-        "engine_asked": settings.engine,
-        "solver_asked": settings.solver,
+        "engine_requested": settings.engine,
+        "solver_requested": settings.solver,
         "equilibrate": "until steady" if equilibrate is None else equilibrate,
         "timestep_unit": "1 / shear rate",
         "strain_meaning": "sampled strain of each seed; where none is given, see strain_by_seed",

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
-from jaxgran.io.atomic import Damaged, read_arrays, write_arrays
+from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import Drive
+from jaxgran.sampling.batch import AdvanceBatch
 
 SECONDS = 5.0  # shortest time between two writes of a journal
 _WRITING_SHARE = 0.05  # of the time: large journals are written less often
@@ -39,7 +39,7 @@ class Journal:
       Damaged: the file is the journal of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: Drive, seconds: float | None = None):
+    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: AdvanceBatch, seconds: float | None = None):
         self.path, self.drive, self.seconds = path, drive, seconds
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
@@ -54,7 +54,7 @@ class Journal:
         if k < len(self.tallies):
             if np.array_equal(self.steps[k], steps):
                 return self._repeated(k, state)
-            raise Damaged(f"{self.path.name} is the journal of another run")
+            raise CorruptFile(f"{self.path.name} is the journal of another run")
         state, tally = self.drive(flow, state, steps)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
@@ -86,6 +86,6 @@ class Journal:
     def _read(self) -> None:
         arrays, _ = read_arrays(self.path)
         if not np.array_equal(arrays["keys"], self.keys):
-            raise Damaged(f"{self.path.name} is the journal of another batch")
+            raise CorruptFile(f"{self.path.name} is the journal of another batch")
         self.steps, self.tallies = list(arrays["steps"]), list(arrays["tallies"])
         self.leaves = [arrays[f"state_{k}"] for k in range(len(arrays) - 3)]

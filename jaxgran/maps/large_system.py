@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxgran.model.choices import HALF_INTERVAL
 
-LIMIT_SEEN = {"no_limit_seen": 0, "limit_seen": 1, "too_few_sizes": 2}  # values of the flag and their meanings
+LIMIT_SEEN = {"no_converged": 0, "limit_seen": 1, "too_few_sizes": 2}  # values of the flag and their meanings
 BOUNDS = {  # K of each observable that has an estimate
     "force_ratio": 2.0,
     "pressure": 2.0,
@@ -82,7 +82,7 @@ def large_system_estimate(grains: np.ndarray, values: np.ndarray, errors: np.nda
     if len(x) == 2:
         return LargeSystem(float(x[-1]), error, LIMIT_SEEN["too_few_sizes"])
     if _goes_on(log, x, s, bound):
-        return LargeSystem(math.nan, math.nan, LIMIT_SEEN["no_limit_seen"])
+        return LargeSystem(math.nan, math.nan, LIMIT_SEEN["no_converged"])
     return LargeSystem(float(x[-1]), error, LIMIT_SEEN["limit_seen"])
 
 
@@ -117,7 +117,7 @@ def large_system_variables(
             "flag_values": np.array(list(LIMIT_SEEN.values()), np.int8),
             "flag_meanings": " ".join(LIMIT_SEEN),
         }
-        variables[f"{name}_limit_seen"] = (dims, seen.astype(np.int8), flags)
+        variables[f"{name}_converged"] = (dims, seen.astype(np.int8), flags)
     return variables
 
 

@@ -9,7 +9,7 @@ from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import FileFormat
 
-PICTURES = ("curves", "contours", "timestep", "size", "theory", "losses", "clusters", "errors", "rheology")
+PICTURES = ("curves", "contours", "timestep", "size", "theory", "factors", "clusters", "errors", "rheology")
 FORMATS = get_args(FileFormat)
 
 

@@ -53,7 +53,7 @@ def require_processes() -> None:
         )
 
 
-class Died(Exception):
+class WorkerDied(Exception):
     """A task was given up, since its workers died ``ATTEMPTS`` times."""
 
 
@@ -103,7 +103,7 @@ def run_tasks(
     initialise: Callable[..., None],
     arguments: tuple,
     on_message: Callable[[Any], None],
-) -> Generator[tuple[int, T | Died]]:
+) -> Generator[tuple[int, T | WorkerDied]]:
     """Run a function on the arguments of every task, started in order, and yield each result when it is there.
 
     Args:
@@ -162,7 +162,7 @@ def run_tasks(
                         waiting.appendleft(task)
                     else:
                         unfinished -= 1
-                        yield task, Died(f"a batch has killed its worker {ATTEMPTS} times")
+                        yield task, WorkerDied(f"a batch has killed its worker {ATTEMPTS} times")
     finally:
         for worker in running:
             worker.end()

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from jaxgran.files import replaced
+from jaxgran.files import atomic_write
 from jaxgran.maps.schema import RATIO, what_lacks
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 
 if TYPE_CHECKING:
     from jaxgran.maps.settings import MapSettings
@@ -29,7 +29,7 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
     known = {name: {"_FillValue": None} for name in data.coords}  # CF: a coordinate has no missing values
     content = bytes(data.to_netcdf(engine="netcdf4", encoding=known))
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(content + _MARK + hashlib.sha256(content).digest())
 
 
@@ -39,15 +39,15 @@ def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr
     A file is one if it has the axes of a map and the variables that are needed.
     """
     if not os.path.isfile(path):
-        raise InputError(f"there is no file {shown(str(path))}.")
+        raise InputError(f"there is no file {short_repr(str(path))}.")
     try:
         data = xr.load_dataset(_whole(path), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"{shown(str(path))} is not a NetCDF file that can be read: {why}.") from None
+        raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
     problem = what_lacks(data, *needed)
     if problem:
-        raise InputError(f"{shown(str(path))} is not a ratio map: {problem}.")
+        raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
     return data
 
 
@@ -109,7 +109,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None,
     for field in fields(settings):
         there, here = chosen.get(field.name, field.default), getattr(settings, field.name)
         if there != here:
-            return data, f"a map with {field.name} {shown(there)} and not {shown(here)}"
+            return data, f"a map with {field.name} {short_repr(there)} and not {short_repr(here)}"
     return data, ""
 
 

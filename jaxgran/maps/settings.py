@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from jaxgran.dynamics.engine import select_engine
-from jaxgran.model.checks import InputError, require_number, require_whole, shown, two_digits
+from jaxgran.model.checks import InputError, require_number, require_whole, short_repr, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, Solver
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
-from jaxgran.sampling.memory import LEAST_SAMPLE
+from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
@@ -48,21 +48,21 @@ class MapSettings:
     def __post_init__(self):
         for name, values in self.axes.items():
             if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
-                raise InputError(f"{name} must be a list of at most {MAX_REPLICAS} numbers, not {shown(values)}.")
+                raise InputError(f"{name} must be a list of at most {MAX_REPLICAS} numbers, not {short_repr(values)}.")
             if len(values) == 0:
                 raise InputError(f"{name} must be a list of at least one number, and it is empty.")
             if not all(
                 isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values
             ):
-                raise InputError(f"{name} must be a list of numbers, not {shown(values)}.")
+                raise InputError(f"{name} must be a list of numbers, not {short_repr(values)}.")
             if len(set(values)) < len(values) or (
                 list(values) != sorted(values) and list(values) != sorted(values)[::-1]
             ):
-                raise InputError(f"{name} must be sorted and without repetition, not {shown(list(values))}.")
+                raise InputError(f"{name} must be sorted and without repetition, not {short_repr(list(values))}.")
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
         require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
         if not isinstance(self.snapshots, bool):
-            raise InputError(f"snapshots must be True or False, not {shown(self.snapshots)}.")
+            raise InputError(f"snapshots must be True or False, not {short_repr(self.snapshots)}.")
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
             raise InputError(f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.")

@@ -10,7 +10,7 @@ class InputError(ValueError):
     """A mistake in the user's input; the message is one sentence that says what is accepted."""
 
 
-def known(value: Any) -> np.ndarray | None:
+def concrete_or_none(value: Any) -> np.ndarray | None:
     """The value as an array; None while JAX traces it.
 
     What is neither a number nor an array of numbers becomes ``array(None)``, which no check accepts.
@@ -38,7 +38,7 @@ _SHORT_REPR = Repr()
 _SHORT_REPR.maxother = _SHORT_REPR.maxstring = 100
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """A value as one short line, for an error message."""
     try:
         return " ".join(_SHORT_REPR.repr(value).split())
@@ -48,14 +48,14 @@ def shown(value: Any) -> str:
 
 def require(name: str, value, accepts, words: str) -> None:
     """Raise an InputError with ``words`` unless all numbers of ``value`` are accepted; traced values pass."""
-    numbers = known(value)
+    numbers = concrete_or_none(value)
     if numbers is None:
         return
     if numbers.dtype.kind not in "iuf" or numbers.size == 0 or not np.all(accepts(numbers)):
-        raise InputError(f"{name} must be {words}, not {shown(value)}.")
+        raise InputError(f"{name} must be {words}, not {short_repr(value)}.")
 
 
-def listed(values: Any) -> Any:
+def as_array(values: Any) -> Any:
     """A list or tuple of numbers as an array; any other value unchanged, for the check that follows."""
     numbers = isinstance(values, (list, tuple)) and all(
         isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
@@ -72,9 +72,9 @@ def require_number(name: str, value, accepts, words: str) -> None:
 def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
     """Raise an InputError unless the value is a whole number in [least, most]; ``why`` explains the upper limit."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(f"{name} must be a whole number of at least {least}, not {shown(value)}.")
+        raise InputError(f"{name} must be a whole number of at least {least}, not {short_repr(value)}.")
     if value > most:
-        raise InputError(f"{name} must be at most {most}, {why}, not {shown(value)}.")
+        raise InputError(f"{name} must be at most {most}, {why}, not {short_repr(value)}.")
 
 
 def require_untraced(name: str, instead: str, *values: Any) -> None:
@@ -89,7 +89,7 @@ def require_untraced(name: str, instead: str, *values: Any) -> None:
 def require_key(key: Any) -> None:
     """Raise an InputError unless this is a single JAX random key."""
     if key_shape(key) != ():
-        raise InputError(f"key must be a random key such as jax.random.key(0), not {shown(key)}.")
+        raise InputError(f"key must be a random key such as jax.random.key(0), not {short_repr(key)}.")
 
 
 def key_shape(key: Any) -> tuple[int, ...] | None:

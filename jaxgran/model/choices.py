@@ -3,7 +3,7 @@
 from typing import Literal
 
 Activation = Literal["midpoint", "touching"]
-Engine = Literal["auto", "machine_code", "jax", "thread_block"]
+Engine = Literal["auto", "numba", "jax", "pallas"]
 FileFormat = Literal["png", "pdf", "svg"]  # of a figure
 Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 

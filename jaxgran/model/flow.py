@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.model.checks import InputError, known, require, require_number, require_whole, shown
+from jaxgran.model.checks import InputError, concrete_or_none, require, require_number, require_whole, short_repr
 from jaxgran.model.choices import (
     MAX_GRAINS,
     MAX_PACKING_FRACTION,
@@ -58,8 +58,8 @@ class ShearFlow:
     engine            –                  program that advances the flow, see ``dynamics.engine``; engines differ in
                                          speed and rounding, not in the contact law:
                                          "auto": selected for the backend, precision and solver;
-                                         "machine_code": on processors, in float64;
-                                         "thread_block": on NVIDIA GPUs, up to 1024 grains;
+                                         "numba": on processors, in float64;
+                                         "pallas": on NVIDIA GPUs, up to 1024 grains;
                                          "jax": everywhere, every solver, derivatives; a map advances its batches
                                          in lockstep by ``vmap``
     ================  =================  ===============================================================
@@ -89,19 +89,19 @@ class ShearFlow:
             allowed = get_args(kind)
             value = getattr(self, name)
             if not isinstance(value, str) or value not in allowed:
-                raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {shown(value)}.")
+                raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {short_repr(value)}.")
         if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
             require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
         for name, (accepts, words) in RANGES.items():
             require(name, getattr(self, name), accepts, words)
         shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
         if len(shapes) > 1:
-            raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {shown(shapes)}.")
-        timestep, shear_rate = known(self.timestep), known(self.shear_rate)
+            raise InputError(f"the numbers of a batch of flows must be arrays of one shape, not {short_repr(shapes)}.")
+        timestep, shear_rate = concrete_or_none(self.timestep), concrete_or_none(self.shear_rate)
         with np.errstate(over="ignore"):
             too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
         if too_long:
-            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {shown(self.timestep)}.")
+            raise InputError(f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}.")
 
     @property
     def activation_fraction(self) -> float | jax.Array:
@@ -180,7 +180,7 @@ def one_of(flow: Any, k: int, count: int) -> ShearFlow:
 
 def _require_flows(flow: Any) -> None:
     if not isinstance(flow, ShearFlow):
-        raise InputError(f"flow must be a ShearFlow, not {shown(flow)}.")
+        raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
 
 
 def require_flow(flow: Any) -> None:

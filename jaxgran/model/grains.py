@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxgran.model.checks import InputError, listed, require, require_key, require_number, require_whole, shown
+from jaxgran.model.checks import InputError, as_array, require, require_key, require_number, require_whole, short_repr
 from jaxgran.model.choices import MAX_GRAINS
 
 _POSITIVE = "a list of positive numbers"
@@ -74,7 +74,7 @@ def own_grains(diameters: ArrayLike, masses: ArrayLike | None = None) -> Grains:
     Raises:
       InputError: these are not two lists of positive numbers of the same length.
     """
-    given = {"diameters": listed(diameters), **({} if masses is None else {"masses": listed(masses)})}
+    given = {"diameters": as_array(diameters), **({} if masses is None else {"masses": as_array(masses)})}
     for name, values in given.items():
         require(name, values, lambda x: (x.ndim == 1) & (x > 0) & (x < _LARGEST_VALUE), _POSITIVE)
     sizes = jnp.asarray(given["diameters"], float)
@@ -89,7 +89,7 @@ def require_grains(grains: Any, count: int) -> None:
     """Raise an InputError unless these are ``count`` grains of mean diameter 1; traced values are not checked."""
     words = f"grains must be Grains with radii and masses of {count} discs, as the flow has, not"
     if not isinstance(grains, Grains):
-        raise InputError(f"{words} {shown(grains)}.")
+        raise InputError(f"{words} {short_repr(grains)}.")
     shapes = np.shape(grains.radii), np.shape(grains.masses)
     if shapes != ((count,), (count,)):
         raise InputError(f"{words} of shapes {shapes[0]} and {shapes[1]}.")

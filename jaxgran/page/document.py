@@ -16,7 +16,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jaxgran.files import replaced
+from jaxgran.files import atomic_write
 from jaxgran.model.checks import InputError
 
 _ESCAPED = {ord(sign): f"\\u{ord(sign):04x}" for sign in "<>&"}
@@ -33,7 +33,7 @@ class Page:
 
     def save(self, path: str | Path) -> None:
         """Write the page to a file, whole or not at all."""
-        with replaced(Path(path)) as temporary:
+        with atomic_write(Path(path)) as temporary:
             temporary.write_text(self.text, encoding="utf-8")
 
     def __repr__(self) -> str:

@@ -13,7 +13,7 @@ from jaxgran.model.state import State
 from jaxgran.page.document import Page, document
 from jaxgran.page.grain_data import ENCODING, grain_data, scale_of
 from jaxgran.plotting.movie import Frames
-from jaxgran.sampling.batch import Drive, Wrap
+from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper
 from jaxgran.sampling.observables import OBSERVABLES, averages
 from jaxgran.sampling.recorder import Recorder
 
@@ -40,11 +40,11 @@ class Film:
         self.flow: ShearFlow | None = None
         self.frames = Frames(self._seen)
 
-    def recording(self, recorder: Recorder) -> Wrap:
+    def recording(self, recorder: Recorder) -> AdvanceWrapper:
         """What records a drive with the recorder, and keeps the sums of the time steps up to each frame."""
         return lambda drive: recorder.recording(self._summed(drive))
 
-    def _summed(self, drive: Drive) -> Drive:
+    def _summed(self, drive: AdvanceBatch) -> AdvanceBatch:
         self._sum = None
 
         def driven(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:

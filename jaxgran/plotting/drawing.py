@@ -23,9 +23,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox
 
-from jaxgran.files import replaced
+from jaxgran.files import atomic_write
 from jaxgran.maps.schema import FINEST
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 
 LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
 FILE_DPI = 200  # dots per inch of a picture, unless another number is given
@@ -281,13 +281,15 @@ def _run_description(attrs: dict) -> str:
 def writable_stem(stem: Path | str) -> Path:
     """Return folder and beginning of the names of figures; raise an InputError if no file can be written there."""
     if not isinstance(stem, (str, os.PathLike)):
-        raise InputError(f"stem must be folder and beginning of the file names, not {shown(stem)}.")
+        raise InputError(f"stem must be folder and beginning of the file names, not {short_repr(stem)}.")
     stem = Path(stem)
     if len(os.fsencode(stem.name)) > LONGEST_NAME:
-        raise InputError(f"the names of figures must begin with at most {LONGEST_NAME} bytes, not {shown(stem.name)}.")
+        raise InputError(
+            f"the names of figures must begin with at most {LONGEST_NAME} bytes, not {short_repr(stem.name)}."
+        )
     if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
         raise InputError(
-            f"figures must be written to a folder that exists and can be written to, not {shown(str(stem.parent))}."
+            f"figures must be written to a folder that exists and can be written to, not {short_repr(str(stem.parent))}."
         )
     return stem
 
@@ -301,7 +303,7 @@ def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True)
     fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
     kind = path.suffix.removeprefix(".")
     area = None if caption else _cut_caption(figure)
-    with replaced(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
+    with atomic_write(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
         figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches=area, **_SAVED.get(kind, {}))
     return path
 

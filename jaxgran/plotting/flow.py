@@ -22,7 +22,7 @@ from jaxgran.analysis.force_chains import pair_forces
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import centred, minimum_image
-from jaxgran.model.checks import InputError, require_untraced, shown
+from jaxgran.model.checks import InputError, require_untraced, short_repr
 from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, force_lines, scientific
 from jaxgran.plotting.encoding import (
     BINARY_COLOUR,
@@ -130,13 +130,15 @@ def flow_figure(
 def require_colour(colour: Any) -> None:
     """Raise an InputError unless the colour is "speed" or "pressure"."""
     if colour not in get_args(Colour):
-        raise InputError(f"colour must be speed or pressure, not {shown(colour)}.")
+        raise InputError(f"colour must be speed or pressure, not {short_repr(colour)}.")
 
 
 def scene_of(seen: Snapshot) -> Scene:
     """The scene of a snapshot, or of a series of snapshots."""
     if not isinstance(seen, Snapshot) or np.ndim(seen.state.side) > 1:
-        raise InputError(f"seen must be a Snapshot of one flow or a series of them, not {shown(type(seen).__name__)}.")
+        raise InputError(
+            f"seen must be a Snapshot of one flow or a series of them, not {short_repr(type(seen).__name__)}."
+        )
     require_untraced("flow_figure", "draw what the transformed function returns", seen)
     frames, pairs = series(seen), pair_forces(seen)
     state, times = frames.state, len(frames.state.side)

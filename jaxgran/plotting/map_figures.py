@@ -11,18 +11,18 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, require_map
-from jaxgran.model.checks import InputError, require_whole, shown
+from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
+from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
 from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
-from jaxgran.plotting.losses import has_losses, theory_losses
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 from jaxgran.plotting.two_processes import do_all
 
-_DEAREST = (theory_errors, theory_losses, cluster_shares, friction_figure)
+_DEAREST = (theory_errors, enskog_factors, cluster_shares, friction_figure)
 
 
 def save_figures(
@@ -40,7 +40,7 @@ def save_figures(
     `{stem}_timestep.png`   at least two time steps
     `{stem}_size.png`       at least two numbers of grains
     `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
-    `{stem}_losses.png`     a plane, and the factors of the error of the theory
+    `{stem}_factors.png`     a plane, and the factors of the error of the theory
     `{stem}_clusters.png`   the shares of the clusters
     `{stem}_errors.png`     a plane, and the error budget of its points
     `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
@@ -66,7 +66,7 @@ def save_figures(
         "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
         "size": (data.sizes.get("grains", 1) >= 2, averages_against_grains),
         "theory": (is_plane(data) and has_theory(data), theory_errors),
-        "losses": (is_plane(data) and has_losses(data), theory_losses),
+        "factors": (is_plane(data) and has_factors(data), enskog_factors),
         "clusters": (has_clusters(data), cluster_shares),
         "errors": (is_plane(data) and has_errors(data), dominating_errors),
         "rheology": (has_friction_law(data), friction_figure),
@@ -85,7 +85,7 @@ def save_figures(
 def require_file(format: Any, dpi: Any) -> None:
     """Raise an InputError unless figures can have this format and resolution."""
     if format not in get_args(FileFormat):
-        raise InputError(f"format must be png, pdf or svg, not {shown(format)}.")
+        raise InputError(f"format must be png, pdf or svg, not {short_repr(format)}.")
     require_whole("dpi", dpi, 50, 1200, "as no print shows more")
 
 

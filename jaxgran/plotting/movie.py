@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.files import replaced
+from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.encoding import BINARY_COLOUR
 from jaxgran.plotting.flow import COLOURS, Colour, common_scale, draw_picture, scene_of
@@ -65,7 +65,7 @@ class Frames:
 def check_movie(path: Path) -> None:
     """Raise an InputError in one sentence if a movie cannot be written to ``path``."""
     if path.suffix not in (".gif", ".mp4"):
-        raise InputError(f"movie must be a file name that ends in .gif or .mp4, not {shown(str(path))}.")
+        raise InputError(f"movie must be a file name that ends in .gif or .mp4, not {short_repr(str(path))}.")
     if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise InputError("movie must be a .gif here, as there is no ffmpeg to write .mp4: use .gif, or install ffmpeg.")
     require_place(path, "movie", path.suffix)
@@ -84,7 +84,7 @@ def write_movie(path: Path, frames: Frames, colour: Colour = "speed", follow: _F
     figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
     drawings = _drawings(figure, frames, colour, follow)
-    with replaced(path) as temporary:
+    with atomic_write(path) as temporary:
         if path.suffix == ".gif":
             palette = _palette(colour)
             nearest = _nearest(palette)

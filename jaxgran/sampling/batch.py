@@ -17,18 +17,18 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
-from jaxgran.dynamics.advance import advance, register_machine_code
+from jaxgran.dynamics.advance import advance, register_numba
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.programs import kept_jit
+from jaxgran.persistent_jit import persistent_jit
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
-Drive = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
-Wrap = Callable[[Drive], Drive]  # adds reports or records to a drive; states stay the same
+AdvanceBatch = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
+AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]  # adds reports or records to a drive; states stay the same
 _DEVICES = "devices"
 _GROUP = 4  # replicas of a compiled program that advances them in turn
 
@@ -112,7 +112,7 @@ def batch_program(function: Callable, register: Callable[[], None] = lambda: Non
 
         return lax.map(lambda each: one(*each), (real, arguments))
 
-    together, in_group = kept_jit(all_replicas, register), kept_jit(group, register)
+    together, in_group = persistent_jit(all_replicas, register), persistent_jit(group, register)
 
     @wraps(function)
     def program(flow, *arguments):
@@ -135,10 +135,10 @@ def _on_host(array: Array) -> Array | np.ndarray:
     return array if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else np.asarray(array)
 
 
-advance_batch: Drive = batch_program(advance, register_machine_code)  # the plain one
+advance_batch: AdvanceBatch = batch_program(advance, register_numba)  # the plain one
 
 
-def reporting(drive: Drive, report: Report | None) -> Drive:
+def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:
     """The drive with a report of the replica-steps after each call; the drive itself without ``report``."""
     if report is None:
         return drive

@@ -23,7 +23,7 @@ def is_drifting(seeds: Sequence[Sample], memory: float) -> bool:
 
     Args:
       seeds: samples of one flow with NumPy arrays, of 16 blocks or a multiple.
-      memory: strain over which the flow remembers, see ``memory_strain``.
+      memory: strain over which the flow remembers, see ``flow_correlation_strain``.
 
     Returns:
       Whether they drift; True if a value is not finite.

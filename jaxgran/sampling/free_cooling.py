@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, listed, require, two_digits
+from jaxgran.model.checks import InputError, as_array, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, require_match, require_state
@@ -113,7 +113,7 @@ def _require_times(flow: ShearFlow, times: Any) -> Array:
     """The times as an array; InputError unless they are positive and increase by a time step or more."""
     if isinstance(times, Tracer):
         return times
-    values = listed(times)
+    values = as_array(times)
     words = "a list of positive times that increase"
     require("times", values, lambda x: (x.ndim == 1) & (x > 0) & np.isfinite(x), words)
     values = np.asarray(values, float)

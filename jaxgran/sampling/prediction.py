@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.programs import kept_jit
+from jaxgran.persistent_jit import persistent_jit
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 from jaxgran.theory.steady_shear import SteadyShear
 
@@ -41,12 +41,12 @@ def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
     return jax.tree.map(np.asarray, _mixture_moments(*numbers, grains))
 
 
-@kept_jit
+@persistent_jit
 def _gaussian_moments(numbers: Float[Array, "flows 4"]) -> SteadyShear:
     return jax.vmap(gaussian_moments)(*numbers.T)
 
 
-@kept_jit
+@persistent_jit
 def _mixture_moments(alpha: Array, packing_fraction: Array, shear_rate: Array, grains: Grains) -> SteadyShear:
     return jax.vmap(mixture_moments)(alpha, packing_fraction, shear_rate, *jax.vmap(_classes)(grains))
 

@@ -14,7 +14,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import Drive
+from jaxgran.sampling.batch import AdvanceBatch
 
 Keep = Callable[[Snapshot, int], None]  # called with a frame and the number of time steps since the first frame
 
@@ -35,12 +35,12 @@ class Recorder:
         self.every, self.keep = every, keep
         self.frames = self.steps = 0
 
-    def recording(self, drive: Drive) -> Drive:
+    def recording(self, drive: AdvanceBatch) -> AdvanceBatch:
         """A drive of a batch of one replica that records frames; the first call starts a new series."""
         self.frames = self.steps = 0
         return partial(self._driven, drive)
 
-    def _driven(self, drive: Drive, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    def _driven(self, drive: AdvanceBatch, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
         every = max(1, round(self.every / (np.asarray(flow.shear_rate) * np.asarray(flow.timestep)).item()))
         if self.frames == 0:
             self._record(flow, state)

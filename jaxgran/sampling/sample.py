@@ -19,7 +19,7 @@ from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.batches import in_numpy, replica_of
-from jaxgran.model.checks import InputError, require_untraced, require_whole, shown, two_digits
+from jaxgran.model.checks import InputError, require_untraced, require_whole, short_repr, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
@@ -283,7 +283,7 @@ def sample(
       strain: strain γ̇t to sample, rounded to whole time steps. A new value does not recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is static: each new function,
-        such as a lambda that is written anew, is compiled, so define it once. Beside the machine code this takes about
+        such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
         2 s. Where the engine "jax" runs, or the function uses values from outside that JAX traces, that engine is
         compiled with it, in about 20 s. ``enable_cache`` keeps the program for the next process.
         The contacts are those of a step with an approaching contact, before the impulses act. The size of their
@@ -307,7 +307,7 @@ def sample(
     check_precision(flow, state)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
-            raise InputError(f"{name} must be a function or None, not {shown(function)}.")
+            raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
         return waited(_sample(flow, state, strain, blocks, observe))
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, state, strain))):

@@ -32,13 +32,13 @@ from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import Drive, advance_batch, batch_program, stack
-from jaxgran.sampling.memory import (
-    FEWEST_MEMORIES,
+from jaxgran.sampling.batch import AdvanceBatch, advance_batch, batch_program, stack
+from jaxgran.sampling.correlation_strain import (
+    FEWEST_CORRELATION_STRAINS,
     LEAST_SAMPLE,
     RELAXATION_STRAIN,
     SAMPLE_MEMORIES,
-    memory_strain,
+    flow_correlation_strain,
 )
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
@@ -121,7 +121,7 @@ def prepare_batch(
     flow: ShearFlow,
     keys: Array,
     equilibrate: float | None = None,
-    drive: Drive = advance_batch,
+    drive: AdvanceBatch = advance_batch,
     coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
     heat: float = 1.0,
@@ -151,7 +151,7 @@ def prepare_batch(
 
 
 def sample_batch(
-    batch: Batch, strain: float | None, drive: Drive = advance_batch, error: float | None = None
+    batch: Batch, strain: float | None, drive: AdvanceBatch = advance_batch, error: float | None = None
 ) -> tuple[Batch, Sample]:
     """Sample every replica of a batch in blocks of equal strain.
 
@@ -179,7 +179,7 @@ def sample_batch(
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
     batch = batch._replace(memory=_memory(batch, _averages(batch, sample._total)))
-    short = strains < FEWEST_MEMORIES * batch.memory
+    short = strains < FEWEST_CORRELATION_STRAINS * batch.memory
     found = np.where(short, Status.short_sample, Status.ok)
     return batch._replace(status=np.maximum.reduce([batch.status, found, sample.status])), sample
 
@@ -250,7 +250,7 @@ def _heated_replica(
 _heated = batch_program(_heated_replica)
 
 
-def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally]:
+def _chunk(batch: Batch, strain: np.ndarray, drive: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain; a replica with a number that is not finite is not advanced."""
     finite = batch.status < Status.nonfinite
     steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
@@ -261,7 +261,7 @@ def _chunk(batch: Batch, strain: np.ndarray, drive: Drive) -> tuple[Batch, Tally
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
 
 
-def _blocks(batch: Batch, strain: np.ndarray, count: int, drive: Drive) -> tuple[Batch, Tally]:
+def _blocks(batch: Batch, strain: np.ndarray, count: int, drive: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica ``count`` times by its own strain, and keep all tallies, (replicas, count)."""
     tallies = []
     for _ in range(count):
@@ -292,7 +292,7 @@ def _split(sample: Sample) -> list[Sample]:
     return [sample[k] for k in range(len(sample.area))]
 
 
-def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, measure: bool = False) -> Batch:
+def _sheared(batch: Batch, strain: np.ndarray, drive: AdvanceBatch, measure: bool = False) -> Batch:
     """Shear every replica by its own strain, in chunks of at most 1 so that progress can be reported.
 
     With ``measure`` the chunks give the memory of the flow; that of the last one stays.
@@ -306,13 +306,13 @@ def _sheared(batch: Batch, strain: np.ndarray, drive: Drive, measure: bool = Fal
 
 
 def _memory(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Strain over which each flow of a batch remembers, see ``memory_strain``."""
+    """Strain over which each flow of a batch remembers, see ``flow_correlation_strain``."""
     masses = np.ascontiguousarray(batch.state.grains.masses)  # or the order of the sum would depend on their place
     mass, area = np.sum(masses, axis=-1), np.asarray(batch.state.side) ** 2
-    return memory_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
+    return flow_correlation_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
 
 
-def _until_steady(batch: Batch, drive: Drive) -> Batch:
+def _until_steady(batch: Batch, drive: AdvanceBatch) -> Batch:
     """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are not advanced."""
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
@@ -337,7 +337,7 @@ def _until_steady(batch: Batch, drive: Drive) -> Batch:
     return batch._replace(status=np.maximum(batch.status, status))
 
 
-def _shortened(batch: Batch, flow: ShearFlow, drive: Drive) -> Batch:
+def _shortened(batch: Batch, flow: ShearFlow, drive: AdvanceBatch) -> Batch:
     """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one.
 
     Every replica has its own series of time steps, which does not depend on the other replicas of the batch. A replica

@@ -1,6 +1,6 @@
-"""The arrays of the machine code, cut from one block of memory.
+"""The arrays of the numba engine, cut from one block of memory.
 
-XLA provides the block with the results of a call. So the machine code never asks for memory, and needs nothing of the
+XLA provides the block with the results of a call. So the numba engine never asks for memory, and needs nothing of the
 runtime of its compiler.
 """
 
@@ -14,8 +14,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from jaxgran.dynamics.machine_code.compiled import compiled
-from jaxgran.dynamics.machine_code.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
+from jaxgran.dynamics.numba_engine.compilation import compiled
+from jaxgran.dynamics.numba_engine.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
 from jaxgran.dynamics.tally import NUMBERS
 
 _PAIR_CAPACITY = 16  # slots of pairs for each grain

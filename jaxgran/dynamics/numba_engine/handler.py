@@ -1,4 +1,4 @@
-"""The machine code as XLA calls it, through its foreign function interface, and its compilation to an object file.
+"""The numba engine as XLA calls it, through its foreign function interface, and its compilation to an object file.
 
 A call frame and its buffers are structures of words of eight bytes, see ``xla/ffi/api/c_api.h``, whose layout is kept
 from version to version. A frame is (size, extensions, interface, context, stage, arguments, results, ...); arguments
@@ -9,10 +9,10 @@ frame that comes with an extension asks for the version that is spoken.
 from llvmlite import binding as llvm
 from numba import njit, types
 
-from jaxgran.dynamics.machine_code.compiled import OPTIONS, compiled
-from jaxgran.dynamics.machine_code.layout import CAPACITY, INPUTS, RESULTS, STATUS
-from jaxgran.dynamics.machine_code.loop import advance_loop
-from jaxgran.dynamics.machine_code.memory import arrays_of, doubles, integers
+from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles, integers
+from jaxgran.dynamics.numba_engine.compilation import OPTIONS, compiled
+from jaxgran.dynamics.numba_engine.layout import CAPACITY, INPUTS, RESULTS, STATUS
+from jaxgran.dynamics.numba_engine.loop import advance_loop
 
 _EXTENSIONS, _INTERFACE, _ARGUMENTS, _RESULTS = 1, 2, 9, 14  # words of a frame
 _DATA, _DIMS = 3, 5  # words of a buffer

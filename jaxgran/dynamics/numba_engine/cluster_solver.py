@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from jaxgran.contact.law import JAMMED_RESPONSE, LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.dynamics.machine_code.compiled import LAW, called, compiled
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.compilation import LAW, called, compiled
+from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     BEST,
     BOUND,

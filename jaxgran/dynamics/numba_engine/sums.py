@@ -1,7 +1,7 @@
-"""The running sums of the machine code, in one row of numbers ordered by the table of ``dynamics.tally``."""
+"""The running sums of the numba engine, in one row of numbers ordered by the table of ``dynamics.tally``."""
 
-from jaxgran.dynamics.machine_code.compiled import LAW, compiled
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.compilation import LAW, compiled
+from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
     FIRST,
@@ -44,7 +44,7 @@ def add_flight(sums, steps, flight, turned, kinetic):
 
 
 @compiled
-def add_contacts(sums, step_sums, contacts, bounce, grains, network):
+def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is memory for it."""
     ends, rows, kicks, loaded, constants = network.ends, network.rows, network.kicks, network.loaded, grains.constants
     for n in range(_PADDED):
@@ -53,7 +53,7 @@ def add_contacts(sums, step_sums, contacts, bounce, grains, network):
         i, j = ends[FIRST, c], ends[SECOND, c]
         nx, ny, approach, distance = rows[NX, c], rows[NY, c], rows[APPROACH, c], rows[DISTANCE, c]
         mi, mj = constants[i, INVERSE_MASS], constants[j, INVERSE_MASS]
-        impulse = bounce * rows[IMPULSE, c]
+        impulse = one_plus_alpha * rows[IMPULSE, c]
         change = nx * (kicks[i, 0] * mi - kicks[j, 0] * mj) + ny * (kicks[i, 1] * mi - kicks[j, 1] * mj)
         terms = (
             contact_terms(
@@ -63,9 +63,9 @@ def add_contacts(sums, step_sums, contacts, bounce, grains, network):
                 max(constants[i, RADIUS] + constants[j, RADIUS] - distance, 0.0),
                 approach,
                 change / 2,
-                bounce,
+                one_plus_alpha,
                 impulse,
-                -bounce * min(approach, 0.0) / (mi + mj),
+                -one_plus_alpha * min(approach, 0.0) / (mi + mj),
                 impulse if loaded[i] > 1 or loaded[j] > 1 else 0.0,
                 1.0,
                 1.0 if impulse > 0.0 else 0.0,

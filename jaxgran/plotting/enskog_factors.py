@@ -42,24 +42,25 @@ _NOTE = (
 
 
 def _needed(stress: str) -> list[str]:
-    """Return the names of the variables that :func:`theory_losses` draws."""
-    return [f"theory_loss_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
+    """Return the names of the variables that :func:`enskog_factors` draws."""
+    return [f"enskog_factor_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
 
 
-def has_losses(data: xr.Dataset) -> bool:
-    """Return whether a map has the variables that :func:`theory_losses` draws."""
+def has_factors(data: xr.Dataset) -> bool:
+    """Return whether a map has the variables that :func:`enskog_factors` draws."""
     return not what_lacks(data, *RATIO, *_needed("pressure"))
 
 
-def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
+def enskog_factors(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
     """Return the four factors by which a measured contact stress differs from Enskog's, in the plane of 1 − α and ν.
 
     Each factor is a stress with one more assumption replaced by what was measured, over the stress before:
-    see ``jaxgran.sampling.losses``. Black contours have it as their label; they are dashed where it is below one. In
-    dotted areas it differs from one by less than its standard error. Green contours show the excess of the force ratio.
+    see ``jaxgran.sampling.enskog_factors``. Black contours have it as their label; they are dashed where it is below
+    one. In dotted areas it differs from one by less than its standard error. Green contours show the excess of the
+    force ratio.
 
     ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `theory_loss_...` of the stress, with `_stderr`,
+    data     (packing_fraction, restitution) `enskog_factor_...` of the stress, with `_stderr`,
                                              `force_ratio` and `status`
     stress   text                            "pressure" or "shear_stress"
     returns  Figure
@@ -71,10 +72,10 @@ def theory_losses(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] 
     data = finest(ordered(data, *_needed(stress)))
     figure = empty_figure(width=7.4, height=6.8)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
-    measured = np.isfinite(data[f"theory_loss_{stress}_pairs"].values)
+    measured = np.isfinite(data[f"enskog_factor_{stress}_pairs"].values)
     panels, fields, noisy, over = [], [], False, {}
     for axes, (factor, title) in zip(grid.flat, PANELS.items(), strict=True):
-        value, error = (data[f"theory_loss_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
+        value, error = (data[f"enskog_factor_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(value > 0, np.log(value), np.nan)
             lines, hidden = draw_errors(axes, data, logarithm, error / value)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from jaxgran.sampling.memory import RELAXATION_STRAIN, memory_strain
+from jaxgran.sampling.correlation_strain import RELAXATION_STRAIN, flow_correlation_strain
 
 
 def memory(temperature=1.0, pressure=1.0, shear_stress=1.0, grains=400, side=20.0, shear_rate=1.0):
     averages = {"granular_temperature": temperature, "pressure": pressure, "shear_stress": shear_stress}
-    return memory_strain(averages, grains, grains, side**2, shear_rate)
+    return flow_correlation_strain(averages, grains, grains, side**2, shear_rate)
 
 
 def test_memory_is_the_longer_of_heating_and_waves():

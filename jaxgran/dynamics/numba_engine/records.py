@@ -7,8 +7,8 @@ not wrapped. A list of near pairs begins with a record without contacts, so no f
 
 import math
 
-from jaxgran.dynamics.machine_code.compiled import called
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.compilation import called
+from jaxgran.dynamics.numba_engine.layout import (
     ACTED,
     APPROACH,
     AT_STEP,
@@ -44,7 +44,7 @@ def record_flight(record, step, acted, tilt, t, rate, grains, places):
 
 
 @called
-def record_contacts(record, contacts, bounce, places, network):
+def record_contacts(record, contacts, one_plus_alpha, places, network):
     """Add the contacts of a step and their impulses to its record."""
     ends, rows = network.ends, network.rows
     record[ACTED], record[CONTACTS] = 1.0, contacts
@@ -52,4 +52,4 @@ def record_contacts(record, contacts, bounce, places, network):
         at = RECORD_HEAD + RECORD_OF_GRAIN * places.size + RECORD_OF_CONTACT * c
         record[at], record[at + 1] = places[ends[FIRST, c]], places[ends[SECOND, c]]
         record[at + 2], record[at + 3], record[at + 4] = rows[NX, c], rows[NY, c], rows[APPROACH, c]
-        record[at + 5], record[at + 6] = rows[DISTANCE, c], bounce * rows[IMPULSE, c]
+        record[at + 5], record[at + 6] = rows[DISTANCE, c], one_plus_alpha * rows[IMPULSE, c]

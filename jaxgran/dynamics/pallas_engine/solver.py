@@ -24,7 +24,7 @@ from jaxgran.contact.law import (
     relative_residual,
     residual_target,
 )
-from jaxgran.dynamics.thread_block.memory import (
+from jaxgran.dynamics.pallas_engine.memory import (
     APPROACH,
     BEST,
     BOUND,
@@ -107,7 +107,7 @@ def collided(
       deepest: the deepest overlap.
     """
     flow, block = thread.flow, thread.block
-    bounce = 1 + flow.restitution
+    one_plus_alpha = 1 + flow.restitution
     target = residual_target(jnp.sqrt(scale), flow.tolerance, flow.shear_rate, flow.epsilon)
     thread.tell([TOUCHING], [contacts])
     most, zero = jnp.max(contacts), jnp.zeros_like(motion.x)
@@ -145,9 +145,9 @@ def collided(
         contact = _contact(thread, m, contacts)
         nx, ny, approach = contact.nx, contact.ny, contact.approach
         distance, impulse = _read(thread, m, contact.real, DISTANCE, IMPULSE)
-        half_change = bounce / 2 * _response(thread, contact, x, y)
-        push, approaches = bounce * impulse, contact.real & (approach < 0)
-        single = jnp.where(approaches, -bounce * approach / jnp.where(contact.real, contact.mobility, 1), 0)
+        half_change = one_plus_alpha / 2 * _response(thread, contact, x, y)
+        push, approaches = one_plus_alpha * impulse, contact.real & (approach < 0)
+        single = jnp.where(approaches, -one_plus_alpha * approach / jnp.where(contact.real, contact.mobility, 1), 0)
         clustered = (loaded > 1) | (thread.ask(block.counts, LOADED, contact.other, contact.real) > 1)
         reach = thread.radius + thread.ask(block.given, RADIUS, contact.other, contact.real)
         overlap = jnp.where(contact.real, jnp.maximum(reach - distance, 0), 0)
@@ -159,7 +159,7 @@ def collided(
             overlap,
             approach,
             half_change,
-            bounce,
+            one_plus_alpha,
             push,
             single,
             jnp.where(clustered, push, 0),
@@ -179,7 +179,7 @@ def collided(
         overlap=jnp.maximum(counts.overlap, deepest),
         residual=jnp.maximum(counts.residual, residual),
     )
-    kicked = motion._replace(cx=motion.cx + bounce * x, cy=motion.cy + bounce * y)
+    kicked = motion._replace(cx=motion.cx + one_plus_alpha * x, cy=motion.cy + one_plus_alpha * y)
     return kicked, counts, solve.status
 
 

@@ -2,9 +2,9 @@
 
 import math
 
-from jaxgran.dynamics.machine_code.calendar import pair_motion
-from jaxgran.dynamics.machine_code.compiled import compiled
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.calendar import pair_motion
+from jaxgran.dynamics.numba_engine.compilation import compiled
+from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
     DONE,
@@ -105,13 +105,13 @@ def find_clusters(contacts, hits, network, clusters):
 
 
 @compiled
-def gather_kicks(contacts, hits, bounce, network):
+def gather_kicks(contacts, hits, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
     ends, rows, touched, kicks, loaded = network.ends, network.rows, network.touched, network.kicks, network.loaded
     for h in range(hits):
         kicks[touched[h], 0] = kicks[touched[h], 1] = 0.0
     for c in range(contacts):
-        push = bounce * rows[IMPULSE, c]
+        push = one_plus_alpha * rows[IMPULSE, c]
         if push > 0.0:
             i, j = ends[FIRST, c], ends[SECOND, c]
             kicks[i, 0] += push * rows[NX, c]

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
-from jaxgran.programs import kept_jit
+from jaxgran.persistent_jit import persistent_jit
 from jaxgran.sampling.sample import Sample
 from jaxgran.statistics import Estimates, standard_errors
 from jaxgran.theory.enskog import momentum_transfer
@@ -47,7 +47,7 @@ FACTORS = {  # what is measured, and what is assumed in its place
 _TOGETHER = 256  # tensors of one call: one compiled program serves samples of any number of blocks
 
 
-def stress_losses(flow: ShearFlow, seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
+def stress_factors(flow: ShearFlow, seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """The four factors of pressure and shear stress, and Enskog's stress, with ``standard_errors``.
 
     Args:
@@ -100,6 +100,6 @@ def _transfer(flow: ShearFlow, tensors: Array | np.ndarray) -> list[dict[str, An
     return [_parts(np.concatenate([np.asarray(one[k], np.float64) for one in found])[:count]) for k in range(2)]
 
 
-@kept_jit
+@persistent_jit
 def _momentum_transfer(tensors: Float[Array, "tensors 2 2"], *numbers: Array) -> Any:
     return jax.vmap(lambda tensor: momentum_transfer(tensor, *numbers))(tensors)

@@ -22,20 +22,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
-from jaxgran.io.atomic import Damaged, require_place
+from jaxgran.io.atomic import CorruptFile, require_place
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
-from jaxgran.maps.pool import Died, require_processes, run_tasks, send
+from jaxgran.maps.pool import WorkerDied, require_processes, run_tasks, send
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, automatic
-from jaxgran.model.checks import InputError, shown
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import MAX_REPLICAS, Activation, Engine, Solver
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.programs import kept_jit
-from jaxgran.sampling.batch import Drive, Report, Wrap, advance_batch, in_lockstep, reporting, stack
+from jaxgran.persistent_jit import persistent_jit
+from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper, Report, advance_batch, in_lockstep, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
@@ -144,9 +144,9 @@ def ratio_map(
     settings = MapSettings(**numbers)
     check_batches(batch, workers)
     if report is not None and not callable(report):
-        raise InputError(f"report must be a function of one number, not {shown(report)}.")
+        raise InputError(f"report must be a function of one number, not {short_repr(report)}.")
     if not isinstance(progress, bool):
-        raise InputError(f"progress must be True or False, not {shown(progress)}.")
+        raise InputError(f"progress must be True or False, not {short_repr(progress)}.")
     from jaxgran.maps.progress import progress as meter  # here, so that workers need not load Rich
 
     costs = [predicted_cost(flow) for flow in settings.flows()]
@@ -182,7 +182,7 @@ def _checkpoint(file: str | os.PathLike | None, settings: MapSettings) -> Genera
         yield None
         return
     if not isinstance(file, (str, os.PathLike)):
-        raise InputError(f"checkpoint must be a file name, not {shown(file)}.")
+        raise InputError(f"checkpoint must be a file name, not {short_repr(file)}.")
     require_place(Path(file), "checkpoint", ".nc")
     kept = Checkpoint(Path(file), settings, resume=True)
     try:
@@ -193,7 +193,7 @@ def _checkpoint(file: str | os.PathLike | None, settings: MapSettings) -> Genera
 
 def _warn_of_bad_points(data: "xr.Dataset") -> None:
     """Warn of what the command line prints at the end of a map."""
-    from jaxgran.maps.verdict import bad_points, in_words, short_in_words
+    from jaxgran.maps.status_report import bad_points, in_words, short_in_words
 
     bad = bad_points(data)
     bad.pop("failed", None)  # batches that were given up have had a warning of their own
@@ -210,9 +210,9 @@ def check_batches(batch: int | Literal["auto"], workers: int) -> None:
         whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
         if not whole and not (name == "batch" and isinstance(value, str) and value == "auto"):
             words = "auto or a whole number" if name == "batch" else "a whole number"
-            raise InputError(f"{name} must be {words} of at least 1, not {shown(value)}.")
+            raise InputError(f"{name} must be {words} of at least 1, not {short_repr(value)}.")
     if workers > _MOST_WORKERS:
-        raise InputError(f"workers must be at most {_MOST_WORKERS}, not {shown(workers)}.")
+        raise InputError(f"workers must be at most {_MOST_WORKERS}, not {short_repr(workers)}.")
     if workers > 1 and jax.default_backend() != "cpu":
         raise InputError("workers must be 1 on an accelerator.")
     if workers > 1:
@@ -227,7 +227,7 @@ def replicas(
     checkpoint: Checkpoint | None = None,
     warn: Callable[[str], None] = warnings.warn,
     scheduler: str | None = None,
-    record: Wrap | None = None,
+    record: AdvanceWrapper | None = None,
 ) -> Generator[tuple[Key, Replica | None]]:
     """Run every replica of a map and yield its key and result when its batch is done; None if it was given up.
 
@@ -255,7 +255,7 @@ def replicas(
         outcomes = ((number, _run_task(*call, report, record)) for number, call in enumerate(calls))
     with closing(outcomes):
         for number, outcome in outcomes:
-            if isinstance(outcome, Died):
+            if isinstance(outcome, WorkerDied):
                 warn(f"{outcome}: {_points(settings, tasks[number])} not measured.")
                 yield from ((key, None) for key in tasks[number])
                 continue
@@ -362,7 +362,7 @@ def _run_task(
     task: Sequence[Key],
     journal: Path | None = None,
     report: Report | None = None,
-    record: Wrap | None = None,
+    record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
     drive = reporting(advance_batch, report or send)
@@ -370,7 +370,7 @@ def _run_task(
     try:
         done = measured(settings, task, drive if journal is None else Journal(journal, task, drive))
         return _retried(settings, done, partial(measured, drive=drive, refinement=2))
-    except Damaged:
+    except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
         return _run_task(settings, task, journal, report, record)
@@ -395,7 +395,7 @@ def _retried(
     return [(key, second[key] if key in second and second[key].status < first.status else first) for key, first in done]
 
 
-@kept_jit
+@persistent_jit
 def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
     """The random key of a replica, as numbers; another one for its second run."""
     key = jax.random.fold_in(jax.random.key(seed), point)
@@ -403,7 +403,11 @@ def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
 
 
 def _measured(
-    settings: MapSettings, task: Sequence[Key], drive: Drive, refinement: int = 1, record: Wrap | None = None
+    settings: MapSettings,
+    task: Sequence[Key],
+    drive: AdvanceBatch,
+    refinement: int = 1,
+    record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
     flows = settings.flows()

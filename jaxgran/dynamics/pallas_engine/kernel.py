@@ -31,9 +31,8 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Int
 
 from jaxgran.contact.law import first_step, flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
-from jaxgran.dynamics.plain import ended
-from jaxgran.dynamics.tally import LAYOUT, RESIDUAL_EDGES, RunningSums, Tally, sums_from_row
-from jaxgran.dynamics.thread_block.memory import (
+from jaxgran.dynamics.jax_engine import ended
+from jaxgran.dynamics.pallas_engine.memory import (
     APPROACH,
     CX,
     CY,
@@ -57,7 +56,8 @@ from jaxgran.dynamics.thread_block.memory import (
     results,
     status_if,
 )
-from jaxgran.dynamics.thread_block.solver import collided
+from jaxgran.dynamics.pallas_engine.solver import collided
+from jaxgran.dynamics.tally import LAYOUT, RESIDUAL_EDGES, RunningSums, Tally, sums_from_row
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains

@@ -12,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_replica
 
-from jaxgran.maps import sweep
+from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.ratio_map import predicted_cost, ratio_map, replicas
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.sweep import predicted_cost, ratio_map, replicas
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
@@ -77,7 +77,7 @@ def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_nu
 ) -> None:
     flows = [ShearFlow(*point) for point in points]
     settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, engine="auto")
-    tasks = sweep._tasks(settings, batch, workers)
+    tasks = ratio_map_module._tasks(settings, batch, workers)
     keys = [key for task in tasks for key in task]
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
     assert all(len({flows[point].grains for point, _ in task}) == 1 for task in tasks)
@@ -107,7 +107,10 @@ def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> 
 
 
 def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
-    mixed = [*sweep._run_task(settings, [(1, 1), (0, 0)]), *sweep._run_task(settings, [(1, 0), (0, 1)])]
+    mixed = [
+        *ratio_map_module._run_task(settings, [(1, 1), (0, 0)]),
+        *ratio_map_module._run_task(settings, [(1, 0), (0, 1)]),
+    ]
     assert_same_bits(dict(mixed), results)
 
 
@@ -141,15 +144,15 @@ def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_st
         statuses = {(0, 1): Status.capacity if refinement == 1 else second}
         return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
 
-    monkeypatch.setattr(sweep, "_measured", measured)
-    done = dict(sweep._run_task(settings, task))
+    monkeypatch.setattr(ratio_map_module, "_measured", measured)
+    done = dict(ratio_map_module._run_task(settings, task))
     assert calls == [(task, 1), ([(0, 1)], 2)]
     assert list(done) == task
     assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0]
 
 
 def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
-    (key, refined), *_ = sweep._measured(settings, [(0, 0)], sweep.advance_batch, refinement=2)
+    (key, refined), *_ = ratio_map_module._measured(settings, [(0, 0)], ratio_map_module.advance_batch, refinement=2)
     assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
     assert refined.sample.pressure != results[key].sample.pressure
     data = map_dataset(settings, {**results, key: refined}, {})
@@ -160,7 +163,7 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest, sizes = sweep._measured, 1, []
+    measured, largest, sizes = ratio_map_module._measured, 1, []
 
     def bounded(settings, task, drive, refinement: int = 1):
         sizes.append(len(task))
@@ -168,24 +171,24 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
         return measured(settings, task, drive, refinement)
 
-    monkeypatch.setattr(sweep, "_measured", bounded)
+    monkeypatch.setattr(ratio_map_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    halved = sweep._run_task(settings, tasks, tmp_path / "journal.nc")
+    halved = ratio_map_module._run_task(settings, tasks, tmp_path / "journal.nc")
     assert sizes == [4, 2, 1, 1, 2, 1, 1]
     assert [key for key, _ in halved] == tasks
     assert_same_bits(dict(halved), results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        sweep._run_task(settings, tasks)
+        ratio_map_module._run_task(settings, tasks)
 
 
 def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken_device(*_):
         raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
 
-    monkeypatch.setattr(sweep, "prepare_batch", broken_device)
+    monkeypatch.setattr(ratio_map_module, "prepare_batch", broken_device)
     with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
-        sweep._run_task(settings, [(0, 0), (0, 1)])
+        ratio_map_module._run_task(settings, [(0, 0), (0, 1)])
 
 
 def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
@@ -198,7 +201,7 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.Monkey
         yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
         yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
 
-    monkeypatch.setattr(sweep, "replicas", found)
+    monkeypatch.setattr(ratio_map_module, "replicas", found)
     words = r"^points of the map have a bad status. deep overlap: \(restitution 0.5, packing fraction 0.6\). What"
     with pytest.warns(match=words):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
@@ -269,7 +272,7 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
 
 @pytest.mark.parametrize("grains", [[64, 128], (64, 128), np.array([64, 128])], ids=["list", "tuple", "array"])
 def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep, "replicas", lambda *_: iter(()))
+    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: iter(()))
     data = ratio_map(**{**SETTINGS, "grains": grains, "timestep": [1e-3, 5e-4]})
     assert data.force_ratio.dims == ("grains", "timestep", "packing_fraction", "restitution")
     assert data.pressure_large_system.dims == ("timestep", "packing_fraction", "restitution")
@@ -281,7 +284,7 @@ def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pyte
     "timestep", [[1e-3, 5e-4], (1e-3, 5e-4), np.array([1e-3, 5e-4])], ids=["list", "tuple", "array"]
 )
 def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep, "replicas", lambda *_: iter(()))
+    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: iter(()))
     data = ratio_map(**{**SETTINGS, "timestep": timestep, "strain": 4.0})
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
     assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-3, 5e-4]

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.machine_code.compiled import called, compiled
-from jaxgran.dynamics.machine_code.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
+from jaxgran.dynamics.numba_engine.compilation import called, compiled
+from jaxgran.dynamics.numba_engine.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
 
 LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
 _NARROWER = 12  # lists that are tried with ever narrower skins, where pairs are more than there is room for

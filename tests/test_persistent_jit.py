@@ -25,7 +25,7 @@ def counted(traces: list):
         traces.append(None)
         return {"sum": pair[0] + pair[1], "product": factor * pair[0]}
 
-    return programs.kept_jit(slope)
+    return persistent_jit.persistent_jit(slope)
 
 
 ARGUMENTS = (np.arange(3.0), np.ones(3)), np.float64(2.0)
@@ -61,10 +61,10 @@ def test_whatever_a_program_depends_on_compiles_it_again(folder: Path, change: s
 
 
 def test_flags_of_jax_are_part_of_the_key() -> None:
-    before = programs._flags()
+    before = persistent_jit._flags()
     with jax.enable_x64(False):
-        assert programs._flags() != before
-    assert programs._flags() == before
+        assert persistent_jit._flags() != before
+    assert persistent_jit._flags() == before
 
 
 def test_damaged_program_is_compiled_again(folder: Path) -> None:
@@ -97,7 +97,7 @@ def test_transformations_take_the_function_and_keep_nothing(folder: Path) -> Non
 
 def test_program_that_calls_a_library_of_scipy_is_not_kept(folder: Path) -> None:
     """Loaded without being lowered, it would call a function that is not there."""
-    solved = programs.kept_jit(jnp.linalg.solve)(np.eye(2), np.array([[1.0], [2.0]]))
+    solved = persistent_jit.persistent_jit(jnp.linalg.solve)(np.eye(2), np.array([[1.0], [2.0]]))
     np.testing.assert_allclose(solved, [[1.0], [2.0]])
     assert list(folder.iterdir()) == []
 
@@ -106,7 +106,7 @@ def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None
     path, inside, most = tmp_path / "cache" / "code.o", [], []
 
     def enter(name: int) -> None:
-        with files.one_at_a_time(path):
+        with files.file_lock(path):
             inside.append(name)
             most.append(len(inside))
             time.sleep(0.01)

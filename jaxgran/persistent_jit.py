@@ -23,7 +23,7 @@ from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 from jaxgran.environment import processor_features
-from jaxgran.files import keep, one_at_a_time, read_kept
+from jaxgran.files import file_lock, read_cached, write_cached
 
 _MOST_KEPT = 64  # programs of up to 4 MB
 _PACKAGES = ("jax", "jaxlib", "numpy")
@@ -32,13 +32,13 @@ _SHORTEST_COMPILATION = "jax_persistent_cache_min_compile_time_secs"  # of progr
 _SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX loads when it lowers a program
 
 
-def kept_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
+def persistent_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
     """``jax.jit`` of a function, with its compiled programs kept on disk where JAX has a folder for its cache.
 
     Args:
       function: a function of pytrees of arrays, without static arguments. The flags of JAX are read when it is first
         called for some shapes.
-      register: called before a program that calls the machine code is loaded.
+      register: called before a program that calls the numba engine is loaded.
     """
     jitted = jax.jit(function)
     programs: dict[Any, Callable] = {}
@@ -54,7 +54,7 @@ def kept_jit(function: Callable, register: Callable[[], None] = lambda: None) ->
             path = folder / f"{_digest(function, key)}.program"
             found = _loaded(path, register)
             if found is None:
-                with one_at_a_time(path):
+                with file_lock(path):
                     found = _loaded(path, register) or _compiled(jitted, arguments, path)
             programs[key] = found
         return programs[key](*arguments)
@@ -93,12 +93,12 @@ def _digest(function: Callable, key: tuple) -> str:
 
 def _loaded(path: Path, register: Callable[[], None]) -> Callable | None:
     """A kept program; None if there is none, or if it cannot be loaded."""
-    content = read_kept(path)
+    content = read_cached(path)
     if content is None:
         return None
     with suppress(Exception):  # whatever is wrong with it, it can be compiled again
-        machine_code, *parts = pickle.loads(content)
-        if machine_code:
+        numba, *parts = pickle.loads(content)
+        if numba:
             register()
         return deserialize_and_load(*parts)
     return None
@@ -114,7 +114,7 @@ def _compiled(jitted: Any, arguments: tuple, path: Path) -> Callable:
         program = lowered.compile()
     if not found_by_jax:  # such a program cannot be written again: XLA leaves out part of it
         try:
-            keep(path, pickle.dumps((bool(called), *serialize(program))), _MOST_KEPT)
+            write_cached(path, pickle.dumps((bool(called), *serialize(program))), _MOST_KEPT)
         except OSError as error:
             warnings.warn(
                 f"compiled programs are not kept: {str(path.parent)!r} cannot be written ({error.strerror}).",

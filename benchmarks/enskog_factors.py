@@ -1,12 +1,12 @@
 """Which assumption of kinetic theory fails, against the time step and the number of grains: what survives the limits?
 
 Five flows, midpoint rule. The contact pressure and shear stress over Enskog's are split into four factors, see
-``jaxgran.sampling.losses``. Against dt at N = 256, from 1e-2 to 1e-5: each seed reaches its steady state at dt = 1e-3;
-from there the coarser step is sampled, then the finer ones in turn, each after a strain of 0.5. Against N at dt = 1e-3,
-from 100 to 1600. A seed is sampled over a strain of 2√N, as the memory of a flow grows with the side of its cell.
+``jaxgran.sampling.enskog_factors``. Against dt at N = 256, from 1e-2 to 1e-5: each seed reaches its steady state at
+dt = 1e-3; from there the coarser step is sampled, then the finer ones in turn, each after a strain of 0.5. Against
+N at dt = 1e-3, from 100 to 1600. A seed is sampled over a strain of 2√N, as the memory of a flow grows with the side of its cell.
 
-    python -m benchmarks theory_losses           # about 3 minutes on two cores
-    python -m benchmarks theory_losses --quick   # two flows of 64 and 144 grains, half a minute
+    python -m benchmarks enskog_factors           # about 3 minutes on two cores
+    python -m benchmarks enskog_factors --quick   # two flows of 64 and 144 grains, half a minute
 """
 
 import multiprocessing
@@ -26,7 +26,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.plotting.drawing import curve_styles
-from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
+from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
 from jaxgran.sampling.sample import estimates
 
 START = 1e-3  # time step of the steady state, and of all numbers of grains
@@ -79,8 +79,8 @@ def run(output: Output) -> None:
             rows.append(row(jg.ShearFlow(grains, *flow, timestep), seeds))
             print(line(rows[-1]), flush=True)
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
-    output.write_rows("theory_losses", head, "rows", rows)
-    output.write_picture(draw(plan, rows), "theory_losses")
+    output.write_rows("enskog_factors", head, "rows", rows)
+    output.write_picture(draw(plan, rows), "enskog_factors")
 
 
 def timesteps(plan: Plan, grains: int) -> tuple[float, ...]:
@@ -105,7 +105,7 @@ def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[floa
 
 def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     """The factors of one flow with their standard errors, and what else is known of it."""
-    value, error = (found | more for found, more in zip(stress_losses(flow, seeds), estimates(seeds), strict=True))
+    value, error = (found | more for found, more in zip(stress_factors(flow, seeds), estimates(seeds), strict=True))
     warm = value["local_granular_temperature"] / value["granular_temperature"]
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
     numbers |= {name: [value[name], error[name]] for name in (f"{s}_{f}" for s in STRESSES for f in FACTORS)}

@@ -13,13 +13,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 RELAXATION_STRAIN = 0.5  # strain in which the contact network adapts to a new time step
-FEWEST_MEMORIES = 4.0  # of a sample; a shorter one gets the status ``short_sample``
+FEWEST_CORRELATION_STRAINS = 4.0  # of a sample; a shorter one gets the status ``short_sample``
 SAMPLE_MEMORIES = 6.0  # of a sample whose strain is not given
 LEAST_SAMPLE = 8.0  # its strain, at least
 _WAVE = 0.35  # memory of the longest waves, in L √(ρ/p)
 
 
-def memory_strain(
+def flow_correlation_strain(
     averages: Mapping[str, ArrayLike], grains: int, mass: ArrayLike, area: ArrayLike, shear_rate: ArrayLike
 ) -> np.ndarray:
     """Strain over which a flow remembers: max(nT/τ, 0.35 γ̇ L √(ρ/p)), and at least that of the contact network.

@@ -1,4 +1,4 @@
-"""The contact solve of the engine ``machine_code``, called alone: isolated pairs, then cluster by cluster."""
+"""The contact solve of the engine ``numba``, called alone: isolated pairs, then cluster by cluster."""
 
 import math
 
@@ -7,8 +7,9 @@ from numba import njit
 
 from benchmarks.collection import Entry
 from benchmarks.collection.compare import CAP, Answer, Solve
-from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.allocation import arrays_of
+from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
+from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     EPSILON,
     FIRST,
@@ -22,9 +23,8 @@ from jaxgran.dynamics.machine_code.layout import (
     WORDS,
     WORDS_PER_GRAIN,
 )
-from jaxgran.dynamics.machine_code.loop import residual_target
-from jaxgran.dynamics.machine_code.memory import arrays_of
-from jaxgran.dynamics.machine_code.network import find_clusters, solve_isolated
+from jaxgran.dynamics.numba_engine.loop import residual_target
+from jaxgran.dynamics.numba_engine.network import find_clusters, solve_isolated
 
 
 def by_cluster(entry: Entry, tolerance: float) -> Solve:

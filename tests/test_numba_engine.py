@@ -1,4 +1,4 @@
-"""The machine code is compiled anew when any of its sources changes, and runs without a place to keep it."""
+"""The numba engine is compiled anew when any of its sources changes, and runs without a place to keep it."""
 
 import os
 import shutil
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import jaxgran
-from jaxgran.dynamics.machine_code import ffi
-from jaxgran.files import keep, read_kept
+from jaxgran.dynamics.numba_engine import ffi
+from jaxgran.files import read_cached, write_cached
 
 PACKAGE = Path(jaxgran.__file__).parent
 PROGRAM = """
@@ -52,7 +52,7 @@ def changed(path: Path, old: str, new: str) -> None:
 
 @pytest.fixture
 def of_copy(copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The same folder, where the machine code now finds its sources."""
+    """The same folder, where the numba engine now finds its sources."""
     monkeypatch.setattr(ffi, "__file__", str(copy / Path(ffi.__file__).relative_to(PACKAGE.parent)))
     return copy
 
@@ -65,7 +65,7 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
         assert ffi.object_file() != kept
         path.write_bytes(content)
     assert ffi.object_file() == kept
-    compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "machine_code").glob("*.py")}
+    compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba").glob("*.py")}
     imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
     assert compiled_here | imported <= set(sources)
 
@@ -94,30 +94,30 @@ def test_another_compiler_or_processor_has_another_file(monkeypatch: pytest.Monk
 
 
 def test_a_kept_file_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
-    path, content = tmp_path / "cache" / "code.o", b"machine code" * 100
-    assert read_kept(path) is None
-    keep(path, content, 1)
-    assert read_kept(path) == content
+    path, content = tmp_path / "cache" / "code.o", b"numba engine" * 100
+    assert read_cached(path) is None
+    write_cached(path, content, 1)
+    assert read_cached(path) == content
     assert [file.name for file in path.parent.iterdir()] == ["code.o"]
     whole = path.read_bytes()
     for torn in (b"", whole[:20], whole[:-1], whole[:500] + b"!" + whole[501:]):
         path.write_bytes(torn)
-        assert read_kept(path) is None
+        assert read_cached(path) is None
 
 
 def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
     for k in range(5):
-        keep(tmp_path / f"{k}.o", b"code", 3)
+        write_cached(tmp_path / f"{k}.o", b"code", 3)
         os.utime(tmp_path / f"{k}.o", (k, k))
-    keep(tmp_path / "last.o", b"code", 3)
+    write_cached(tmp_path / "last.o", b"code", 3)
     assert {path.name for path in tmp_path.iterdir()} == {"last.o", "3.o", "4.o"}
 
 
 def test_a_cache_that_cannot_be_written_is_an_error_of_the_file_system(tmp_path: Path) -> None:
-    """The machine code makes a warning of it: see the slow test."""
+    """The numba engine makes a warning of it: see the slow test."""
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OSError):
-        keep(tmp_path / "file" / "machine_code" / "code.o", b"code", 1)
+        write_cached(tmp_path / "file" / "numba" / "code.o", b"code", 1)
 
 
 @pytest.mark.slow
@@ -138,4 +138,4 @@ def test_a_process_without_a_cache_compiles_for_itself(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     found, told = outcome(PACKAGE.parent, tmp_path / "file")
     assert found.startswith("deep_overlap ")
-    assert "the machine code is compiled anew in every process" in told and "cannot be written" in told
+    assert "the numba engine is compiled anew in every process" in told and "cannot be written" in told

@@ -1,4 +1,4 @@
-"""The time loop of the machine code: the advance of one replica from contact to contact.
+"""The time loop of the numba engine: the advance of one replica from contact to contact.
 
 The loop does what the plain engine does, contact for contact, with the same rule, impulses to the same tolerance and
 the same sums. It differs in what it visits:
@@ -18,15 +18,15 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.machine_code.calendar import (
+from jaxgran.dynamics.numba_engine.calendar import (
     clear_calendar,
     contacts_of_step,
     next_contact_step,
     predict_contact_steps,
 )
-from jaxgran.dynamics.machine_code.cluster_solver import solve_cluster
-from jaxgran.dynamics.machine_code.compiled import LAW, called, compiled
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
+from jaxgran.dynamics.numba_engine.compilation import LAW, called, compiled
+from jaxgran.dynamics.numba_engine.layout import (
     CAPACITY,
     EPSILON,
     FAILED,
@@ -49,7 +49,7 @@ from jaxgran.dynamics.machine_code.layout import (
     X,
     Y,
 )
-from jaxgran.dynamics.machine_code.near_pairs import (
+from jaxgran.dynamics.numba_engine.near_pairs import (
     LIFE,
     bring_into_cell,
     kinetic_sums,
@@ -57,9 +57,9 @@ from jaxgran.dynamics.machine_code.near_pairs import (
     search,
     skin_loss,
 )
-from jaxgran.dynamics.machine_code.network import find_clusters, gather_kicks, make_network, solve_isolated
-from jaxgran.dynamics.machine_code.records import record_contacts, record_flight
-from jaxgran.dynamics.machine_code.sums import add_contacts, add_flight, add_solve
+from jaxgran.dynamics.numba_engine.network import find_clusters, gather_kicks, make_network, solve_isolated
+from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
+from jaxgran.dynamics.numba_engine.sums import add_contacts, add_flight, add_solve
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
@@ -152,7 +152,7 @@ def advance_loop(
             solved = 1
             if room > 0:
                 record_flight(records[recorded], done + k, solved, tilt + rate * t, t, rate, grains, order.given)
-                record_contacts(records[recorded], contacts, flow.bounce, order.given, network)
+                record_contacts(records[recorded], contacts, flow.one_plus_alpha, order.given, network)
                 recorded += 1
             kinetic, fastest, finite = _strike(hits, t, rate, grains, network, clusters, kinetic, fastest)
             if not finite:
@@ -211,8 +211,8 @@ def _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, res
             iterations, squared, outcome = max(iterations, needed), squared + left, max(outcome, missed)
             spare -= left if left < share else share
     residual = relative_residual(math.sqrt(squared), scale, target)
-    gather_kicks(contacts, hits, flow.bounce, network)
-    add_contacts(results, step_sums, contacts, flow.bounce, grains, network)
+    gather_kicks(contacts, hits, flow.one_plus_alpha, network)
+    add_contacts(results, step_sums, contacts, flow.one_plus_alpha, grains, network)
     add_solve(results, iterations, residual, outcome, deepest)
     return hits, outcome
 

@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.machine_code.compiled import LAW, compiled
-from jaxgran.dynamics.machine_code.layout import (
+from jaxgran.dynamics.numba_engine.compilation import LAW, compiled
+from jaxgran.dynamics.numba_engine.layout import (
     ACROSS,
     BEGINS,
     ENDS,

@@ -9,7 +9,7 @@ from flows import flow_of
 
 import jaxgran as jg
 from jaxgran.dynamics.tally import Tally, empty_tally
-from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
+from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
 from jaxgran.sampling.sample import BLOCKS, Sample
 from jaxgran.theory.steady_shear import contact_value
 
@@ -57,7 +57,7 @@ def test_factors_times_enskog_are_the_measured_contact_stress(run, flowing, pack
         state, tally = run(flow, state, 500)
         tallies.append(tally)
     sample = sample_of(tallies, pytest.GRAINS, float(state.side) ** 2)
-    value, error = stress_losses(flow, [sample])
+    value, error = stress_factors(flow, [sample])
     for stress in STRESSES:
         factors = [value[f"{stress}_{factor}"] for factor in FACTORS]
         product = np.prod(factors) * value[f"enskog_{stress}"]
@@ -66,7 +66,7 @@ def test_factors_times_enskog_are_the_measured_contact_stress(run, flowing, pack
 
 
 def test_factors_of_chaos_are_one() -> None:
-    value, error = stress_losses(FLOW, [chaotic_sample(0), chaotic_sample(1)])
+    value, error = stress_factors(FLOW, [chaotic_sample(0), chaotic_sample(1)])
     for stress in STRESSES:
         assert value[f"{stress}_binary"] == 1
         for factor in ("chaos", "pairs"):
@@ -86,7 +86,7 @@ def test_slower_approach_is_found_as_its_square() -> None:
 
 def assert_changed(made: str, times: float, expected: dict[str, float]) -> None:
     """A change of the collisions changes these factors of both stresses and no other."""
-    chaotic, failing = (stress_losses(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times))
+    chaotic, failing = (stress_factors(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times))
     for stress in STRESSES:
         for factor in FACTORS:
             change = failing[f"{stress}_{factor}"] / chaotic[f"{stress}_{factor}"]
@@ -95,7 +95,7 @@ def assert_changed(made: str, times: float, expected: dict[str, float]) -> None:
 
 def test_stress_of_no_collisions_has_no_factors_but_an_enskog_stress() -> None:
     nothing = replace(empty_tally(np.dtype(float)), kinetic_moment=GRAINS * TENSOR, duration=np.float64(1.0))
-    value, _ = stress_losses(FLOW, [sample_of([nothing] * 2)])
+    value, _ = stress_factors(FLOW, [sample_of([nothing] * 2)])
     assert np.isnan([value[f"{stress}_{factor}"] for stress in STRESSES for factor in ("chaos", "pairs")]).all()
     assert value["enskog_pressure"] > 0 and value["enskog_shear_stress"] > 0
 
@@ -104,5 +104,5 @@ def test_stress_of_no_collisions_has_no_factors_but_an_enskog_stress() -> None:
 def test_all_assumptions_hold_in_dilute_nearly_elastic_flow() -> None:
     data = jg.ratio_map([0.95], [0.1], grains=400, timestep=2e-4, equilibrate=40.0, strain=20.0).squeeze()
     for factor in ("chaos", "pairs", "binary"):
-        value, error = (float(data[f"theory_loss_pressure_{factor}{end}"]) for end in ("", "_stderr"))
+        value, error = (float(data[f"enskog_factor_pressure_{factor}{end}"]) for end in ("", "_stderr"))
         assert abs(value - 1) < 4 * error + 0.01, factor

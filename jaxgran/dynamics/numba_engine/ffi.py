@@ -1,4 +1,4 @@
-"""The machine code for XLA: compiled once, kept as an object file, and registered as a foreign function.
+"""The numba engine for XLA: compiled once, kept as an object file, and registered as a foreign function.
 
 The name of the file is a hash of all that its content depends on: the sources that are compiled together, the compiler
 and the processor. So a change in any of them compiles anew, in a user's cache and in the tests. A kept file is loaded
@@ -22,12 +22,12 @@ import jax
 from llvmlite import binding as llvm
 
 from jaxgran.caches import cache_folder, users_folder
-from jaxgran.files import keep, one_at_a_time, read_kept
+from jaxgran.files import file_lock, read_cached, write_cached
 
 TARGET = "jaxgran_advance"
-_STOP = "jaxgran_stop"  # a word in the memory of the machine code; it runs while this is zero
+_STOP = "jaxgran_stop"  # a word in the memory of the numba engine; it runs while this is zero
 _LOCK = Lock()
-_MOST_KEPT = 8  # versions of the machine code in the cache
+_MOST_KEPT = 8  # versions of the numba engine in the cache
 _IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
@@ -48,17 +48,17 @@ def sources() -> list[Path]:
 
 
 def object_file() -> Path:
-    """Where the machine code is kept: in the folder of the caches, or in that of numba's environment variable."""
+    """Where the numba engine is kept: in the folder of the caches, or in that of numba's environment variable."""
     words = [version("numba"), version("llvmlite"), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
     digest = hashlib.sha256("\n".join([*words, os.environ.get("NUMBA_OPT", "")]).encode())
     for path in sources():
         digest.update(path.read_bytes())
-    folder = Path(os.environ.get(_CACHE_FOLDER) or (cache_folder() or users_folder()) / "machine_code")
+    folder = Path(os.environ.get(_CACHE_FOLDER) or (cache_folder() or users_folder()) / "numba")
     return folder / f"{digest.hexdigest()[:16]}.o"
 
 
 def register() -> None:
-    """Compile the machine code, or load what is kept of it, and tell XLA where it is; once in a process."""
+    """Compile the numba engine, or load what is kept of it, and tell XLA where it is; once in a process."""
     with _LOCK:
         _register()
 
@@ -71,10 +71,10 @@ def _register() -> None:
     target = llvm.Target.from_default_triple()
     machine = target.create_target_machine(cpu=processor, features=features, opt=3, jit=True)
     path = object_file()
-    content = read_kept(path)
+    content = read_cached(path)
     if content is None:
-        with one_at_a_time(path):
-            content = read_kept(path) or _compiled(path, machine)
+        with file_lock(path):
+            content = read_cached(path) or _compiled(path, machine)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
@@ -86,17 +86,17 @@ def _register() -> None:
 
 
 def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
-    """The machine code, compiled and kept if possible."""
-    from jaxgran.dynamics.machine_code.handler import object_code
+    """The numba engine, compiled and kept if possible."""
+    from jaxgran.dynamics.numba_engine.handler import object_code
 
     content = object_code(TARGET, _STOP, machine)
     try:
-        keep(path, content, _MOST_KEPT)
+        write_cached(path, content, _MOST_KEPT)
     except OSError as error:
         if parent_process() is not None:  # which warns too
             return content
         warnings.warn(
-            f"the machine code is compiled anew in every process, in about 15 s: the cache folder "
+            f"the numba engine is compiled anew in every process, in about 15 s: the cache folder "
             f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
             "one that can.",
             stacklevel=3,
@@ -106,7 +106,7 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
 
 @contextmanager
 def stopped() -> Iterator[None]:
-    """All machine code that runs in this process ends within the block, with the status ``failed``."""
+    """All numba engine that runs in this process ends within the block, with the status ``failed``."""
     for word in _STOP_WORDS:
         word.value = 1
     try:
@@ -116,5 +116,5 @@ def stopped() -> Iterator[None]:
             word.value = 0
 
 
-_ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the machine code
+_ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the numba engine
 _STOP_WORDS: list[ctypes.c_int64] = []

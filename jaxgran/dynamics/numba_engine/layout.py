@@ -1,7 +1,7 @@
-"""Where numbers lie in the memory of the machine code, and what its functions are given together.
+"""Where numbers lie in the memory of the numba engine, and what its functions are given together.
 
 Arrays are handed on whole and read by row and column. Indices are unsigned, which spares a test for negative ones.
-Nothing here needs the compiler, so that kept machine code runs without it.
+Nothing here needs the compiler, so that kept numba engine runs without it.
 """
 
 from typing import Any, NamedTuple
@@ -44,7 +44,7 @@ class Flow(NamedTuple):
     rate: Any
     dt: Any
     theta: Any
-    bounce: Any
+    one_plus_alpha: Any
     tolerance: Any
     most_iterations: Any
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from jaxgran.maps.schema import parts
 from jaxgran.model.status import MEANINGS
-from jaxgran.sampling.memory import FEWEST_MEMORIES
+from jaxgran.sampling.correlation_strain import FEWEST_CORRELATION_STRAINS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,11 +41,11 @@ def short_in_words(data: "xr.Dataset", points: list[str], option: str) -> str:
     """Which samples are shorter than a few memories, and the strain that would do, by ``option`` and the number."""
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
     short = data.status == data.status.attrs["flag_values"][code]
-    enough = FEWEST_MEMORIES * float(data.memory.where(short).max())
+    enough = FEWEST_CORRELATION_STRAINS * float(data.memory.where(short).max())
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
-        f"short sample{which}: it lasts less than {FEWEST_MEMORIES:g} memories of the flow, so its errors may be too "
-        f"small. Add {option}{math.ceil(enough)}."
+        f"short sample{which}: it lasts less than {FEWEST_CORRELATION_STRAINS:g} correlation strains of the flow, so "
+        f"its errors may be too small. Add {option}{math.ceil(enough)}."
     )
 
 

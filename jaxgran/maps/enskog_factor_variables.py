@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 
 from jaxgran.maps.settings import MapSettings
-from jaxgran.sampling.losses import FACTORS, STRESSES, stress_losses
+from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
 from jaxgran.sampling.observables import STRESS_UNIT
 from jaxgran.sampling.sample import Sample
 
 
-def loss_variables(
+def enskog_factor_variables(
     settings: MapSettings, dims: tuple[str, ...], samples: Mapping[int, Sequence[Sample]]
 ) -> dict[str, Any]:
-    """The variables theory_loss_STRESS_FACTOR and enskog_STRESS of a map, and their standard errors.
+    """The variables enskog_factor_STRESS_FACTOR and enskog_STRESS of a map, and their standard errors.
 
     Args:
       settings: the map.
@@ -32,12 +32,12 @@ def loss_variables(
     flows, shape = settings.flows(), tuple(map(len, settings.axes.values()))
     values, errors = ({name: np.full(len(flows), np.nan) for name in attrs} for _ in range(2))
     for point, seeds in samples.items():
-        value, error = stress_losses(flows[point], seeds)
+        value, error = stress_factors(flows[point], seeds)
         for name in attrs:
             values[name][point], errors[name][point] = value[name], error[name]
     variables = {}
     for name, (long_name, units) in attrs.items():
-        full = name if name.startswith("enskog_") else f"theory_loss_{name}"
+        full = name if name.startswith("enskog_") else f"enskog_factor_{name}"
         variables[full] = (dims, values[name].reshape(shape), {"long_name": long_name, "units": units})
         about = {"long_name": f"standard error of {long_name}", "units": units}
         variables[f"{full}_stderr"] = (dims, errors[name].reshape(shape), about)
