@@ -3,7 +3,8 @@
 Five flows, midpoint rule. The contact pressure and shear stress over Enskog's are split into four factors, see
 ``jaxgran.sampling.enskog_factors``. Against dt at N = 256, from 1e-2 to 1e-5: each seed reaches its steady state at
 dt = 1e-3; from there the coarser step is sampled, then the finer ones in turn, each after a strain of 0.5. Against
-N at dt = 1e-3, from 100 to 1600. A seed is sampled over a strain of 2√N, as the memory of a flow grows with the side of its cell.
+N at dt = 1e-3, from 100 to 1600. A seed is sampled over a strain of 2√N, as the correlation strain of a flow grows
+with the side of its cell.
 
     python -m benchmarks enskog_factors           # about 3 minutes on two cores
     python -m benchmarks enskog_factors --quick   # two flows of 64 and 144 grains, half a minute

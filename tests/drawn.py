@@ -10,12 +10,12 @@ from matplotlib.colors import same_color
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.plotting import drawing, losses, map_figures, ratio, theory
+from jaxgran.plotting import drawing, map_figures, ratio, theory
 
 
 def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
     """Figures keep their parts where Matplotlib puts them first: the layout takes longer than all that is drawn."""
-    for module in (drawing, losses, ratio, theory):
+    for module in (drawing, enskog_factors, ratio, theory):
         patch.setattr(module, "fix_layout", lambda figure: figure.set_layout_engine("none"))
 
 

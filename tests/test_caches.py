@@ -30,7 +30,7 @@ def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypa
 
 
 def test_a_temporary_folder_that_nobody_else_can_write_takes_its_place(nothing_for_the_user: Path) -> None:
-    assert caches.obstacle(caches.users_folder()) == "Not a directory"
+    assert caches.why_unwritable(caches.users_folder()) == "Not a directory"
     folder = caches.cache_folder()
     assert folder is not None and folder.parent == nothing_for_the_user
     assert folder.stat().st_mode & 0o777 == 0o700

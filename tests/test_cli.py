@@ -154,7 +154,7 @@ MISTAKES = {
     "map --timestep auto --target-error 1": "--target-error must be between 1e-4 and 0.1",
     "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
     "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
-    "map --engine numba": "--engine must be one of 'auto', 'numba', 'jax', 'pallas', not 'numba'",
+    "map --engine fortran": "--engine must be one of 'auto', 'numba', 'jax', 'pallas', not 'fortran'",
     "map --engine pallas": "--engine must be auto or jax on a CPU, not pallas",
     "map --engine numba --solver jacobi": "--engine must be auto or jax with the solver jacobi",
     "run --restitution 0.5 --packing-fraction 0.6 --engine pallas": "--engine must be auto or jax on a CPU",

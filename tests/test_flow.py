@@ -63,7 +63,7 @@ def refusal(**change) -> str:
         *[(name, value) for name in NUMBERS for value in (np.nan, "0.05", True, 0.05j, [0.05, 0.1])],
         *[("activation", value) for value in ("Midpoint", "", 1, None)],
         *[("solver", value) for value in ("gauss-seidel", "", 0, None)],
-        *[("engine", value) for value in ("numba", "", 0, None, ["jax"])],
+        *[("engine", value) for value in ("fortran", "", 0, None, ["jax"])],
     ],
 )
 def test_bad_value_is_refused_in_one_sentence_with_the_range(name, value):

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran import files, programs
+from jaxgran import files, persistent_jit
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(programs, "_folder", lambda: tmp_path / "programs")
+    monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "programs")
     return tmp_path / "programs"
 
 
@@ -53,9 +53,9 @@ def test_whatever_a_program_depends_on_compiles_it_again(folder: Path, change: s
     elif change == "structure":
         pair = list(pair)
     elif change == "flag of JAX":
-        monkeypatch.setattr(programs, "_flags", lambda: "others")
+        monkeypatch.setattr(persistent_jit, "_flags", lambda: "others")
     else:
-        monkeypatch.setattr(programs, "_origin", lambda: "another")
+        monkeypatch.setattr(persistent_jit, "_origin", lambda: "another")
     counted(traces)(pair, factor)
     assert len(traces) == 2
 
@@ -83,7 +83,7 @@ def test_content_that_is_no_program_is_compiled_again(folder: Path) -> None:
     traces: list = []
     counted(traces)(*ARGUMENTS)
     (path,) = folder.iterdir()
-    files.keep(path, b"whole, but no program", 8)
+    files.write_cached(path, b"whole, but no program", 8)
     counted(traces)(*ARGUMENTS)
     assert len(traces) == 2
 
@@ -123,7 +123,7 @@ def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None
 
 def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(programs, "_folder", lambda: tmp_path / "file")
+    monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "file")
     with pytest.warns(UserWarning, match="compiled programs are not kept"):
         found = counted([])(*ARGUMENTS)
     np.testing.assert_array_equal(found["sum"], [1.0, 2.0, 3.0])

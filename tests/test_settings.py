@@ -72,7 +72,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
     ({"activation": "always"}, "midpoint or touching"),
     ({"snapshots": 1}, "True or False"),
-    ({"engine": "numba"}, "auto, numba, jax or pallas"),
+    ({"engine": "fortran"}, "auto, numba, jax or pallas"),
     ({"engine": "pallas"}, "auto or jax on a CPU, not pallas: it is made for NVIDIA GPUs"),
     ({"engine": "numba", "solver": "jacobi"}, "auto or jax with the solver jacobi, not numba"),
 ]

@@ -224,7 +224,7 @@ def test_theory_needs_a_plane(alphas: int, nus: int) -> None:
         theory_errors(theory_dataset(alphas, nus))
 
 
-# ---------------------------------------------------------------------------------------------- losses
+# ---------------------------------------------------------------------------------------------- factors
 
 
 @pytest.mark.parametrize("stress", ["pressure", "shear_stress"])
@@ -422,7 +422,7 @@ def test_shortest_time_step_is_drawn(draw) -> None:
         (dense_dataset(), ["curves", "contours", "rheology"]),
         (dense_dataset(nus=3, alphas=(0.5,)), ["curves"]),
     ],
-    ids=["all", "line", "no theory", "no losses", "dense", "few"],
+    ids=["all", "line", "no theory", "no factors", "dense", "few"],
 )
 def test_figures_are_written_where_the_map_has_their_data(
     data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

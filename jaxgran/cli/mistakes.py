@@ -5,6 +5,8 @@ from typing import Any
 
 import typer
 
+from jaxgran.model.checks import short_repr
+
 UsageError: Any = typer.BadParameter.__base__  # typer raises it for options that it cannot read
 _LONGEST_SENTENCE = 500  # characters; a quoted value may be longer
 _KINDS_OF_NUMBER = {"integer": "a whole number", "number": "a number", "float": "a number"}

@@ -70,7 +70,7 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
-            attribute = next((name for name in (f"{field.name}_asked", field.name) if name in data.attrs), None)
+            attribute = next((name for name in (f"{field.name}_requested", field.name) if name in data.attrs), None)
             if field.name in data.coords:  # one number where one of a list was selected
                 values = data[field.name].values.tolist()
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values

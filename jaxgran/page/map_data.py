@@ -201,7 +201,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
         return None
     options = {}
     for name, accepted in _NAMED.items():
-        value = data.attrs.get(f"{name}_asked", data.attrs.get(name, accepted[0]))
+        value = data.attrs.get(f"{name}_requested", data.attrs.get(name, accepted[0]))
         if value not in accepted:
             return None
         options[name] = value

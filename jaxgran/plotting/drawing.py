@@ -289,7 +289,7 @@ def writable_stem(stem: Path | str) -> Path:
         )
     if not os.path.isdir(stem.parent) or not os.access(stem.parent, os.W_OK):
         raise InputError(
-            f"figures must be written to a folder that exists and can be written to, not {short_repr(str(stem.parent))}."
+            f"figures must be written to a folder that can be written to, not {short_repr(str(stem.parent))}."
         )
     return stem
 
