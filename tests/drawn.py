@@ -10,7 +10,7 @@ from matplotlib.colors import same_color
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.plotting import drawing, map_figures, ratio, theory
+from jaxgran.plotting import drawing, enskog_factors, map_figures, ratio, theory
 
 
 def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
