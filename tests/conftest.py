@@ -1,67 +1,30 @@
-"""How the tests start: see ``compiled_programs``, and ``shared_flows`` for what they share."""
+"""Set-up of every test: programs compiled in earlier runs are reused, numbers are float64, promotion is strict.
 
-import gc
+Programs are kept in ``.pytest_cache/jaxgran``, or in the folder that ``JAXGRAN_TEST_CACHE`` names, by the package's own
+caches. Both folders may be deleted at any time.
+"""
+
 import os
-import sys
-from contextlib import suppress
+from pathlib import Path
 
-import compiled_programs
-import pytest
+FOLDER = os.environ.get("JAXGRAN_TEST_CACHE") or Path(__file__).parents[1] / ".pytest_cache" / "jaxgran"
+os.environ["XDG_CACHE_HOME"] = str(FOLDER)  # also for the processes that tests start
+# Most of the time of a run is compilation, which takes half as long with less optimisation.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+os.environ.pop("COLUMNS", None)  # pytest-xdist sets it, and tables would take that width
 
-compiled_programs.set_up()
-os.environ.pop("COLUMNS", None)  # the processes of xdist are told a width, and tables would have it
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
 
-CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # of the whole run; on Linux
-damaged = []  # reports of compiled programs that could not be read
+import jaxgran  # noqa: E402
 
+pytest_plugins = ["shared_flows"]
 
-def keep_to_one_core():
-    """Give each process of xdist one core, where each core has one: what XLA hands from core to core costs a tenth."""
-    number, count = (int(os.environ[f"PYTEST_XDIST_WORKER{end}"].removeprefix("gw")) for end in ("", "_COUNT"))
-    if len(CORES) <= count:
-        os.sched_setaffinity(0, {CORES[number % len(CORES)]})
+jaxgran.enable_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
 
-
-@pytest.fixture
-def all_cores():
-    """Processes that are started here may use every core."""
-    if CORES:
-        before = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, CORES)
-    yield
-    if CORES:
-        os.sched_setaffinity(0, before)
-
-
-def pytest_configure(config: pytest.Config):
-    """Load what tests share, but not in a process that leaves the tests to others: it takes two seconds."""
-    with suppress(ImportError):  # a name of pytest's own; to look for garbage five times at the end takes four seconds
-        from _pytest.unraisableexception import gc_collect_iterations_key
-
-        config.stash[gc_collect_iterations_key] = 1
-    if CORES and hasattr(config, "workerinput"):
-        keep_to_one_core()
-    left_to_others = config.getoption("dist", "no") != "no" and not config.option.collectonly
-    if hasattr(config, "workerinput") or not left_to_others:
-        config.pluginmanager.import_plugin("shared_flows")
-
-
-def pytest_collection_finish():
-    """Fits are optimised. What is imported stays: to look through it for garbage would take a fifth of a run."""
-    collision_model = sys.modules.get("jaxgran.inference.collision_model")
-    if collision_model is not None:  # tests of fits would take twice the time
-        collision_model._best_unknowns = compiled_programs.optimised(collision_model._best_unknowns)
-        collision_model._CHUNK = 64  # most fits have few collisions, and a part of a chunk takes as long as a whole one
-    gc.collect()
-    gc.freeze()
-    gc.set_threshold(50_000, 20, 100)
-
-
-def pytest_warning_recorded(warning_message):
-    """Such a program is compiled again, and the folder goes at the end."""
-    if compiled_programs.DAMAGED in str(warning_message.message):
-        damaged.append(warning_message)
-
-
-def pytest_unconfigure():
-    compiled_programs.tidy_up(bool(damaged))
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # the same examples at any speed
+hypothesis.settings.load_profile("tests")

@@ -11,7 +11,8 @@ from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
 
-from jaxgran.maps import journal, sweep
+from jaxgran.maps import journal
+from jaxgran.maps import ratio_map as sweep
 
 PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
 journal.SECONDS = 0.1  # so that its batches have journals

@@ -1,7 +1,7 @@
 """Flows of the shared number of grains, and when two runs are the same."""
 
 import numpy as np
-import pytest
+from shared_flows import GRAINS
 
 from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
 from jaxgran.model.cell import displacement
@@ -18,7 +18,7 @@ OF_THE_SOLVER = ("residual_counts", "worst_residual", "complementarity", "iterat
 def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
     """A flow whose contacts are solved to rounding."""
     numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
-    return ShearFlow(pytest.GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
+    return ShearFlow(GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
 
 
 def assert_same_state(one, two, atol: float):

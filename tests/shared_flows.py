@@ -1,14 +1,8 @@
-"""What tests share: the set-up of JAX, functions of the engine that are compiled once, and flows.
-
-Tests run in float64 with strict promotion, so that no precision or rank changes unnoticed. One number of grains needs
-one compilation of each function; ``pytest.GRAINS`` is that number.
-"""
+"""Fixtures: flows of ``GRAINS`` grains, and functions of the engines that are compiled once for them."""
 
 from dataclasses import replace
 from functools import cache, partial
 
-import compiled_programs
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,61 +17,31 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.sampling.packing import pack
 
-compiled_programs.configure_jax()
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_numpy_rank_promotion", "raise")
-
-hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)  # the same examples at any speed
-hypothesis.settings.load_profile("tests")
-
 GRAINS = 32
 ENGINES = ("numba", "pallas", "jax")
-pytest.GRAINS = GRAINS
-
-
-class Compiled:
-    """A function compiled once per shape, and optimised, that counts how often it is traced."""
-
-    def __init__(self, function):
-        self.traces = 0
-        self._function = function
-        self._call = compiled_programs.optimised(self._traced)
-
-    def _traced(self, *arguments):
-        self.traces += 1
-        return self._function(*arguments)
-
-    def __call__(self, *arguments):
-        return jax.block_until_ready(self._call(*arguments))
 
 
 @pytest.fixture(scope="session")
 def run():
-    """``run(flow, state, steps, free_flight=True)``: advance, compiled; ``run.compiled.traces`` counts the traces."""
-    compiled = Compiled(advance)
+    """``run(flow, state, steps, free_flight=True)``: the advance by JAX alone, compiled."""
+    compiled = jax.jit(advance)
 
     def call(flow: ShearFlow, state: State, steps: int, free_flight: bool = True):
-        return compiled(flow, state, jnp.int32(steps), jnp.asarray(free_flight))
+        return jax.block_until_ready(compiled(flow, state, jnp.int32(steps), jnp.asarray(free_flight)))
 
-    call.compiled = compiled
     return call
 
 
 @pytest.fixture(scope="session")
 def engines(run):
-    """``engines[name](flow, state, steps)``: the advance by an engine, compiled; the thread block is interpreted."""
+    """``engines[name](flow, state, steps)``: the advance by an engine, compiled; Pallas is interpreted."""
 
-    def compiled(advance, jit=jax.jit):
-        call = jit(advance)
+    def compiled(advance):
+        call = jax.jit(advance)
         return lambda flow, state, steps: jax.block_until_ready(call(flow, state, jnp.int32(steps)))
 
     interpreted = partial(kernel.advance, interpret=True)
-    return {
-        "numba": compiled(public.advance),
-        "pallas": compiled(interpreted, compiled_programs.optimised),
-        "jax": run,
-    }
+    return {"numba": compiled(public.advance), "pallas": compiled(interpreted), "jax": run}
 
 
 @pytest.fixture(scope="session", params=ENGINES)
@@ -95,7 +59,7 @@ def engine_run(engine, engines):
 @pytest.fixture(scope="session")
 def packed():
     """``packed(packing_fraction, seed=0)``: a packing at rest."""
-    compiled = compiled_programs.optimised(pack)
+    compiled = jax.jit(pack)
 
     @cache
     def packing(packing_fraction: float, seed: int = 0) -> State:
@@ -157,17 +121,3 @@ def solved():
         return compiled(network, 60, *numbers, method, jnp.asarray(active))
 
     return call
-
-
-@pytest.fixture
-def page() -> None:
-    """A test of what stands where on the page asks for it."""
-
-
-@pytest.fixture
-def layout_of_pages_alone(request, monkeypatch) -> None:
-    """Figures are laid out only in tests that ask for ``page``."""
-    if "page" not in request.fixturenames:
-        from drawn import leave_out_layout  # here, as it loads what draws
-
-        leave_out_layout(monkeypatch)

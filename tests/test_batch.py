@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import own_grains
@@ -23,10 +24,10 @@ STEPS = (120, 90, 60, 0, 120, 30)
 
 def lattice(packing_fraction: float, seed: int) -> State:
     """Grains at rest on a square lattice, moved and thrown a little: they collide within some steps."""
-    rng, grains = np.random.default_rng(seed), own_grains(np.ones(pytest.GRAINS))
-    side = np.sqrt(np.pi / 4 * pytest.GRAINS / packing_fraction)
-    rows = int(np.ceil(np.sqrt(pytest.GRAINS)))
-    places = np.stack(np.divmod(np.arange(pytest.GRAINS), rows), axis=-1) * side / rows
+    rng, grains = np.random.default_rng(seed), own_grains(np.ones(GRAINS))
+    side = np.sqrt(np.pi / 4 * GRAINS / packing_fraction)
+    rows = int(np.ceil(np.sqrt(GRAINS)))
+    places = np.stack(np.divmod(np.arange(GRAINS), rows), axis=-1) * side / rows
     velocities = 3 * rng.normal(size=places.shape)
     return State(grains, jnp.asarray(places), jnp.asarray(velocities), jnp.asarray(side), jnp.asarray(0.0))
 
@@ -36,7 +37,7 @@ def batch(tmp_path: Path) -> Path:
     """A folder with the states of a batch and its results on the one device of this process."""
     states = [lattice(nu, seed) for seed, nu in enumerate((0.4, 0.5, 0.4, 0.5, 0.4, 0.5))]
     state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    flow = stack([ShearFlow(pytest.GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
+    flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
     assert jax.device_count() == 1
     _save(tmp_path / "start.npz", (flow, state, np.asarray(STEPS, np.int32)))
     end, tally = advance_batch(flow, state, jnp.asarray(STEPS, jnp.int32))
@@ -84,7 +85,7 @@ def _assert_same(one: Path, other: Path) -> None:
 def _start(folder: Path, output: str, devices: int, *words: str) -> subprocess.Popen:
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     environment = os.environ | {"XLA_FLAGS": flags}
-    command = [sys.executable, str(PROGRAM), "start.npz", output, str(pytest.GRAINS), *words]
+    command = [sys.executable, str(PROGRAM), "start.npz", output, str(GRAINS), *words]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=environment, **streams)
 

@@ -8,8 +8,6 @@ from made_up_maps import ratio_dataset
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.errors import dominating_errors
 
-pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
-
 PARTS = ("timestep", "size", "tolerance")
 
 

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled_programs import optimised
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from scipy.integrate import quad
+from shared_flows import GRAINS
 
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
 from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
@@ -25,7 +25,6 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.observables import averages
 
-GRAINS = pytest.GRAINS
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
 SMOOTH = {"gaussian": gaussian(0.25), "lucy": lucy(1.9)}  # e^-39 of the Gaussian is beyond half the side
 FLOW = ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-12, max_iterations=100_000)
@@ -368,7 +367,7 @@ def planes_in_time(flowing, run):
     state = flowing(0.78)
     heights = (jnp.arange(8.0) + 0.5) / 8 * state.side
 
-    @optimised
+    @jax.jit
     def block(flow, state):
         def step(now, _):
             seen = snapshot(flow, now)
@@ -382,7 +381,7 @@ def planes_in_time(flowing, run):
     for _ in range(blocks):
         _, tally = run(flow, state, steps)
         state, (through, inside) = block(flow, state)
-        found = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, pytest.GRAINS, 1.0)
+        found = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, GRAINS, 1.0)
         flux.append(through)
         held.append(inside)
         stress.append(found["contact_stress"] + found["kinetic_stress"])

@@ -16,8 +16,6 @@ from matplotlib.image import imread
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
 
-pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
-
 
 def lines_of_contours(figure: Figure) -> dict[float, np.ndarray]:
     """Return the vertices (1 − α, ν) of every contour, by the text of its one label."""
@@ -128,7 +126,7 @@ def test_error_bars_have_no_caps_over_the_marks() -> None:
     assert not any(container.lines[1] for container in containers)
 
 
-def test_labels_of_contours_lie_within_the_frame(page) -> None:
+def test_labels_of_contours_lie_within_the_frame() -> None:
     for data in (ratio_dataset(2, 2), ratio_dataset(3, 3)):
         figure = ratio_contours(data.assign(force_ratio=data.force_ratio + 0.5 * (data.force_ratio - 1)))
         frame = figure.axes[0].bbox.padded(1)
@@ -218,7 +216,7 @@ def test_missing_points_leave_the_rest() -> None:
         assert not inside.any()
 
 
-def test_map_without_any_value_is_drawn(page) -> None:
+def test_map_without_any_value_is_drawn() -> None:
     data = ratio_dataset()
     empty = no_value(data, *np.ndindex(data.force_ratio.shape))
     for figure in (ratio_curves(empty), ratio_contours(empty)):
@@ -299,7 +297,7 @@ def test_bad_status_has_a_ring_at_its_time_step() -> None:
 @pytest.mark.parametrize(
     "timesteps", [(1e-2, 1e-3, 1e-4), (1e-3, 1e-4), (5e-4, 3e-4), (2e-3, 5e-4), (1e-3, 9e-4, 8e-4)]
 )
-def test_time_step_axis_has_at_least_two_numbers(page, timesteps: tuple[float, ...]) -> None:
+def test_time_step_axis_has_at_least_two_numbers(timesteps: tuple[float, ...]) -> None:
     figure = ratio_against_timestep(with_timesteps(ratio_dataset(2, 2), *timesteps))
     figure.canvas.draw()
     low, high = figure.axes[0].get_xlim()
@@ -321,7 +319,7 @@ def test_time_steps_without_any_value_are_drawn() -> None:
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(4, 2), pytest.param(5, 5, marks=pytest.mark.slow), (10, 12)])
-def test_panels_of_time_steps_do_not_overlap(page, alphas: int, nus: int) -> None:
+def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
     data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 3e-4, 1e-5)
     data.status[0, 1, 0] = 1
     figure = ratio_against_timestep(data)
@@ -338,7 +336,7 @@ def test_panels_of_time_steps_do_not_overlap(page, alphas: int, nus: int) -> Non
         assert not any(box.overlaps(other) for k, box in enumerate(labels) for other in labels[:k])
 
 
-def test_nothing_overlaps_on_the_page(page) -> None:
+def test_nothing_overlaps_on_the_page() -> None:
     data = ratio_dataset()
     data.status[5, 0] = 1
     for figure in (ratio_curves(with_stress_ratio(data)), ratio_contours(no_value(data, (5, 2)))):
@@ -350,7 +348,7 @@ def test_nothing_overlaps_on_the_page(page) -> None:
             assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
 
 
-def test_files_are_written_whole(page, tmp_path: Path) -> None:
+def test_files_are_written_whole(tmp_path: Path) -> None:
     written = save_figures(ratio_dataset(), tmp_path / "my.map")
     assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
     assert sorted(tmp_path.iterdir()) == sorted(written)
@@ -365,7 +363,7 @@ def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes,
     assert first.startswith(start) and first == second
 
 
-def test_a_picture_without_caption_has_the_same_axes_and_is_lower(page, tmp_path: Path) -> None:
+def test_a_picture_without_caption_has_the_same_axes_and_is_lower(tmp_path: Path) -> None:
     sizes = {}
     for caption_, dpi in ((True, 100), (False, 100), (True, 50)):
         path, *_ = save_figures(ratio_dataset(alphas=1), tmp_path / "map", dpi=dpi, caption=caption_)

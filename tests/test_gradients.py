@@ -11,6 +11,7 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from oracles import MAX_DISCS, delassus, padded_network, random_network
+from shared_flows import GRAINS
 
 from jaxgran.analysis.sensitivity import margins
 from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
@@ -172,7 +173,7 @@ def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, Sta
 @pytest.fixture(scope="module")
 def tilting(flowing, run) -> tuple[ShearFlow, State]:
     """A flow whose tilt is about to be remapped, in which outer lists are built anew."""
-    flow = ShearFlow(pytest.GRAINS, 0.6, 0.7, 5e-3, tolerance=1e-12, max_iterations=100_000)
+    flow = ShearFlow(GRAINS, 0.6, 0.7, 5e-3, tolerance=1e-12, max_iterations=100_000)
     state = replace(flowing(0.7), tilt=jnp.asarray(0.45))
     end, tally = run(flow, state, STEPS)
     assert end.tilt < 0 and tally.collisions > 20
@@ -189,7 +190,7 @@ def events_of(tilting):
 @pytest.fixture(scope="module")
 def score_of(tilting, run):
     """A random linear function of the end of the run."""
-    weights = np.random.default_rng(0).normal(size=(2, pytest.GRAINS, 2))
+    weights = np.random.default_rng(0).normal(size=(2, GRAINS, 2))
     end, _ = run(*tilting, STEPS)
 
     @jax.jit
@@ -286,7 +287,7 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at rest in the shear."""
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
-    flow = ShearFlow(pytest.GRAINS, 0.5, 0.02, dt, tolerance=1e-12)
+    flow = ShearFlow(GRAINS, 0.5, 0.02, dt, tolerance=1e-12)
     end, _ = differentiable(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]
 
@@ -310,11 +311,11 @@ def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
 def test_derivative_of_many_collisions_is_that_of_the_flow_without_time_steps(packed):
     """With respect to the restitution, at a step so short that differences see the limit; fixed steps miss most."""
     state = packed(0.3)
-    velocities = np.random.default_rng(0).normal(size=(pytest.GRAINS, 2))
+    velocities = np.random.default_rng(0).normal(size=(GRAINS, 2))
     state, dt = replace(state, velocities=jnp.asarray(velocities)), 1e-6
 
     def after(alpha, moving_contacts: bool = False):
-        flow = ShearFlow(pytest.GRAINS, alpha, 0.3, dt, tolerance=1e-11, max_iterations=100_000)
+        flow = ShearFlow(GRAINS, alpha, 0.3, dt, tolerance=1e-11, max_iterations=100_000)
         end, tally = advance(flow, state, jnp.int32(round(0.4 / dt)), True, None, moving_contacts)
         return end.velocities, tally.collisions
 
@@ -341,7 +342,7 @@ def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
     both sides differ, and the one returned is one of them.
     """
     touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    flow = ShearFlow(pytest.GRAINS, 0.0, 0.02, 1e-6, tolerance=1e-12)
+    flow = ShearFlow(GRAINS, 0.0, 0.02, 1e-6, tolerance=1e-12)
 
     @jax.jit
     def pushed(slant):

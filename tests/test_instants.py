@@ -11,7 +11,8 @@ import xarray as xr
 from synthetic import random_instant, random_replica, snapshot_of
 
 from jaxgran.analysis.instant import averaged, instant_of
-from jaxgran.maps import instants, sweep
+from jaxgran.maps import instants
+from jaxgran.maps import ratio_map as sweep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.instants import first_of_points, instant_variables

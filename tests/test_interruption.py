@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 
 from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.model.flow import ShearFlow
@@ -17,7 +18,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.sample import sample
 
 SECOND = 1.0
-FLOW = ShearFlow(pytest.GRAINS, 0.7, 0.7, 1e-3)
+FLOW = ShearFlow(GRAINS, 0.7, 0.7, 1e-3)
 
 
 def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flowing) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.special import ndtr
+from shared_flows import GRAINS
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
 from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_contact, velocity_distribution
@@ -12,7 +13,6 @@ from jaxgran.sampling.observables import averages
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.steady_shear import contact_value
 
-GRAINS = pytest.GRAINS
 STRAIN = 40.0
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
-import compiled_programs
 import jax
 import jax.numpy as jnp
 import numba
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from shared_flows import GRAINS
 
 from jaxgran.dynamics import advance as advance_module
 from jaxgran.dynamics import collision, jax_engine
@@ -33,7 +33,6 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
-GRAINS = pytest.GRAINS
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
@@ -391,7 +390,7 @@ def test_no_pair_closes_by_more_than_its_list_loses_of_the_skin(fastest, distanc
 def near_pairs_found():
     """``find_near_pairs`` with a way in from Python; kept from run to run, as long as the numba engine is the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numba.config, "CACHE_DIR", str(compiled_programs.compiled_programs() / object_file().stem))
+        patch.setattr(numba.config, "CACHE_DIR", str(object_file().with_suffix("")))
         return numba.njit(cache=True)(find_near_pairs.py_func)
 
 

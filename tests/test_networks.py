@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled_programs import optimised
 from oracles import delassus
 
 from benchmarks import networks as module
@@ -30,7 +29,6 @@ def networks():
         patch.setattr(module, "FLOWS", (module.FLOWS[0], *module.FLOWS[2:]))
         sheared = module.sheared
         patch.setattr(module, "sheared", lambda *flow: sheared(*flow[:3], strain=0.5))
-        patch.setattr(module, "_advanced", optimised(module._advanced))
         patch.setattr(collision, "contact_capacities", lambda grains: (3 * grains,))
         return collection(quick=True)
 

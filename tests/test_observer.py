@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 from synthetic import one_sentence
 
 from jaxgran.dynamics import collision, observed_advance
@@ -15,7 +16,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.sample import BLOCKS, sample
 
-GRAINS, STRAIN = pytest.GRAINS, 0.32
+STRAIN = 0.32
 FLOW = ShearFlow(GRAINS, 0.6, 0.7, 1e-3)  # by the numba engine
 
 

@@ -11,6 +11,7 @@ import pytest
 from listed import build, listed_pairs, move, pairs_within
 from oracles import gaps_of
 from scipy.special import ndtri
+from shared_flows import GRAINS
 from synthetic import one_sentence
 
 from jaxgran.contact.near_pairs import widest_skin
@@ -25,7 +26,6 @@ from jaxgran.sampling.prediction import _classes, predicted
 from jaxgran.sampling.steady_state import heated, prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
-GRAINS = pytest.GRAINS
 EVEN = np.arange(GRAINS) % 2 == 0
 LAWS = {
     "1 to 1.4": np.where(EVEN, 1.0, 1.4),

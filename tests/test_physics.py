@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from flows import flow_of
 from oracles import gaps_of, kinetic_energy
+from shared_flows import GRAINS
 
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.state import State
@@ -141,7 +142,7 @@ def test_shear_power_is_dissipation_and_change_of_energy(engine_run, flowing, pa
 def test_flow_without_shear_keeps_its_momentum_and_loses_what_it_dissipates(
     engine_run, packed, packing_fraction, restitution
 ):
-    velocities = np.random.default_rng(0).normal(size=(pytest.GRAINS, 2))
+    velocities = np.random.default_rng(0).normal(size=(GRAINS, 2))
     state = replace(packed(packing_fraction), velocities=jnp.asarray(velocities))
     after, tally = engine_run(flow_of(packing_fraction, restitution=restitution, shear_rate=0.0), state, 300)
     np.testing.assert_allclose(momentum(after), momentum(state), rtol=0, atol=1e-10)
@@ -155,7 +156,7 @@ def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver
     wasted = []
     for tolerance, cap in ((1e-12, 1), (1e-2, 5000), (1e-4, 5000), (1e-8, 5000)):
         _, tally = engine_run(replace(flow, tolerance=tolerance, max_iterations=cap), state, 300)
-        measured = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, pytest.GRAINS, 1.0)
+        measured = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, GRAINS, 1.0)
         assert abs(measured["energy_balance_error"]) < 1e-11
         assert measured["momentum_drift"] < 1e-13
         wasted.append(abs(float(measured["complementarity_power"])))
@@ -216,7 +217,7 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
 def test_compiled_velocities_equal_the_interpreted_ones(flowing):
     """Some releases of JAX return wrong numbers from compiled code, silently."""
     state = flowing(0.75)
-    i, j = (np.arange(pytest.GRAINS), np.roll(np.arange(pytest.GRAINS), 5))
+    i, j = (np.arange(GRAINS), np.roll(np.arange(GRAINS), 5))
 
     def relative(state: State):
         separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)

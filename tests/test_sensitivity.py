@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 
 from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
 from jaxgran.model.cell import displacement
@@ -14,7 +15,7 @@ from jaxgran.model.flow import ShearFlow
 
 
 def flow_of(restitution) -> ShearFlow:
-    return ShearFlow(pytest.GRAINS, restitution, 0.6, 1e-3, tolerance=1e-12, max_iterations=100_000)
+    return ShearFlow(GRAINS, restitution, 0.6, 1e-3, tolerance=1e-12, max_iterations=100_000)
 
 
 @pytest.mark.slow

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from shared_flows import GRAINS
 
 from jaxgran.dynamics.snapshots import collided, flown, snapshot, snapshot_series
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
-
-GRAINS = pytest.GRAINS
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled_programs import optimised
 
 from benchmarks import stability
 from benchmarks.output import Output
@@ -21,7 +20,7 @@ from jaxgran.sampling.observables import averages
 from jaxgran.sampling.sample import sample
 
 PAIRS = stability.GRAINS // 2
-pack = optimised(stability.pack)  # close to jamming it takes long
+pack = jax.jit(stability.pack)
 
 
 @pytest.mark.slow

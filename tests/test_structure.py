@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
 from jaxgran.analysis.force_chains import (
@@ -23,8 +24,6 @@ from jaxgran.analysis.velocity_correlations import near_contact
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
 from jaxgran.model.cell import displacement, minimum_image
 from jaxgran.model.flow import ShearFlow
-
-GRAINS = pytest.GRAINS
 
 
 @pytest.fixture(scope="module")

@@ -23,9 +23,6 @@ DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress, relative
 
 
-pytestmark = pytest.mark.usefixtures("layout_of_pages_alone")
-
-
 def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
     """Return the synthetic ln(binary/measured), linear in x = 1 − α and ν."""
     return -0.5 * x - 0.8 * (nu - 0.3)
@@ -187,7 +184,7 @@ def test_error_within_its_noise_is_dotted() -> None:
     assert "within ± std. error" not in legend_texts(figure)
 
 
-def test_points_without_a_prediction_are_hatched_but_keep_the_collisions(page) -> None:
+def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> None:
     data = theory_dataset()
     elastic = data.restitution == data.restitution[-1]
     data = data.assign({name: data[name].where(~elastic) for name in ("theory_pressure", "theory_shear_stress")})
@@ -298,7 +295,7 @@ def test_excess_too_small_for_the_axis_is_counted() -> None:
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
-def test_line_of_points_has_shares_without_a_plane(page, alphas: int, nus: int) -> None:
+def test_line_of_points_has_shares_without_a_plane(alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
     data.status[0, 0] = 1
     figure = cluster_shares(data)
@@ -376,7 +373,7 @@ def test_restitution_with_too_few_points_says_so() -> None:
 
 @pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
 @pytest.mark.parametrize(("alphas", "nus"), [(2, 2), pytest.param(5, 6, marks=pytest.mark.slow), (10, 12)])
-def test_nothing_overlaps_on_the_page(page, draw, alphas: int, nus: int) -> None:
+def test_nothing_overlaps_on_the_page(draw, alphas: int, nus: int) -> None:
     data = theory_dataset(alphas, nus)
     data.status[1, 1] = 1
     data = data.assign(force_ratio=data.force_ratio.where(data.restitution > 0.1))
@@ -384,14 +381,14 @@ def test_nothing_overlaps_on_the_page(page, draw, alphas: int, nus: int) -> None
 
 
 @pytest.mark.parametrize("alphas", [(0.5,), (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98)])
-def test_laws_do_not_overlap_on_the_page(page, alphas: tuple[float, ...]) -> None:
+def test_laws_do_not_overlap_on_the_page(alphas: tuple[float, ...]) -> None:
     data = dense_dataset(alphas=alphas, nus=10)
     data.status[0, 0] = 2
     assert_nothing_overlaps(friction_figure(data))
 
 
 @pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
-def test_map_without_any_value_is_drawn(draw, page) -> None:
+def test_map_without_any_value_is_drawn(draw) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
     figure = draw(empty)

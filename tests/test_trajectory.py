@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from shared_flows import GRAINS
 
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io.trajectory import (
@@ -28,7 +29,6 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.recorder import Recorder
 
-GRAINS = pytest.GRAINS
 TILTS = (-0.4, 0.0, 0.3)
 
 

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from flows import flow_of
 from made_up_maps import known_closure
+from shared_flows import GRAINS
 from synthetic import one_sentence, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.checks import InputError
 from jaxgran.model.state import State
 
-COUNT = pytest.GRAINS
+COUNT = GRAINS
 STEPS = jnp.int32(20)
 FLOW = flow_of(0.7)
 COOLED = replace(FLOW, shear_rate=0.0)

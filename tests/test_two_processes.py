@@ -35,7 +35,7 @@ do_all([partial(task, number) for number in range(4)])
 
 
 @pytest.fixture
-def copied(all_cores: None) -> None:
+def copied() -> None:
     if sys.platform != "linux" or usable_cores() < 2:
         pytest.skip("the process is not copied")
 
