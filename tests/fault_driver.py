@@ -1,7 +1,6 @@
 """The command line with a fault built in, chosen by the environment variable FAULT; its workers have it too."""
 
 import os
-import random
 import resource
 import signal
 import sys
@@ -31,9 +30,7 @@ def advance_slowly(*arguments):
 
 sweep.advance_batch = advance_slowly
 
-if FAULT == "clock":
-    time.time = lambda: random.uniform(0, 4e9)
-elif FAULT == "disc full":
+if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
 elif FAULT == "deadly batch":

@@ -17,10 +17,7 @@ from command_line import Outcome, jaxgran
 
 from jaxgran.maps.results import read_dataset
 
-MARKS = [
-    pytest.mark.faults,
-    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc"),
-]
+NEEDS_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 DRIVER = Path(__file__).with_name("fault_driver.py")
 FLOWS = ["--restitution", "0.3,0.7", "--packing-fraction", "0.6", "--grains", "32", "--seeds", "2"]
 STRAINS = ["--timestep", "1e-3", "--equilibrate", "3", "--strain", "10"]

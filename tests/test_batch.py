@@ -51,7 +51,7 @@ def test_results_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> Non
     _assert_same(batch / "four devices.npz", batch / "one device.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.environment
 def test_results_in_lockstep_on_four_devices_are_those_on_one_to_the_bit(batch: Path) -> None:
     """As on accelerators: ``vmap`` over the replicas of a device."""
     _run(batch, "one.npz", 1, "lockstep")
@@ -59,7 +59,7 @@ def test_results_in_lockstep_on_four_devices_are_those_on_one_to_the_bit(batch: 
     _assert_same(batch / "four.npz", batch / "one.npz")
 
 
-@pytest.mark.slow
+@pytest.mark.environment
 def test_results_on_two_hosts_are_those_on_one_to_the_bit_and_both_hold_all(batch: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -131,18 +131,6 @@ def test_results_say_what_they_were_measured_with_and_quick_ones_have_names_of_t
     assert '\n  {"a": 1.0},\n' in written
 
 
-@pytest.mark.slow
-def test_quick_charts_are_made_by_one_command(tmp_path: Path) -> None:
-    made = command("speed_vs_accuracy", "--quick", "--output", str(tmp_path))
-    assert made.returncode == 0, made.stderr
-    for name in ("runs", "throughput"):
-        assert json.loads((tmp_path / f"{name}_quick.json").read_text())["hardware"]["processor"]
-        assert (tmp_path / f"{name}_quick.png").stat().st_size > 10_000
-    rows = json.loads((tmp_path / "runs_quick.json").read_text())["flows"][0]["rows"]
-    assert len(rows) == len(run_chart.QUICK.configs)
-    assert all(row["seconds_per_strain"] > 0 for row in rows)
-
-
 def config(seconds: float, error: float, noise: float, status: str = "ok") -> dict:
     return {"seconds_per_strain": seconds, "status": status, "errors": {"pressure": (error, noise)}}
 

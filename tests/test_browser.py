@@ -16,6 +16,8 @@ from pages import MARKUP, browser, made_up_film, open_page, page_map
 import jaxgran as jg
 from jaxgran.maps.settings import MapSettings
 
+pytestmark = pytest.mark.environment
+
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:

@@ -49,7 +49,6 @@ def test_displacement_is_the_shortest_image(seed, side, tilt):
     assert np.all(np.linalg.norm(found[~short], axis=-1) >= side / 2 * (1 - 8 * EPS))
 
 
-@pytest.mark.slow
 def test_displacement_equals_that_of_jax_md():
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         from jax_md import space

@@ -262,17 +262,6 @@ def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> No
     assert not files(tmp_path)
 
 
-@pytest.mark.slow
-def test_a_mistake_is_one_sentence_with_and_without_cached_programs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    for _ in range(2):
-        assert_one_sentence(in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09"))
-        assert any((tmp_path / "cache" / "jaxgran").iterdir())
-    assert files(tmp_path) == {"cache"}
-
-
 # What the commands do
 
 
@@ -440,7 +429,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("command", "platform"),
-    [("info", "cuda"), ("map", "cuda"), pytest.param("fit text.gsd", "banana", marks=pytest.mark.slow)],
+    [("info", "cuda"), ("map", "cuda")],
 )
 def test_a_platform_that_is_not_there_is_one_sentence(command: str, platform: str, folder: Path, monkeypatch) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", platform)
@@ -517,7 +506,6 @@ def test_fit_that_fails_has_a_status_of_its_own(small_run, tmp_path: Path, monke
     assert outcome == (3, "", "jaxgran: the restitution did not settle.\n")
 
 
-@pytest.mark.slow
 def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--every", "0.02")
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
@@ -541,17 +529,6 @@ def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.slow
-def test_fit_tells_how_well_a_law_describes_a_map(known_map: Path, tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path, "fit", str(known_map))
-    assert (outcome.status, outcome.err) == (0, "")
-    for name in ("pressure", "shear stress", "force ratio"):
-        (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
-        assert row.count("%") == 3
-        assert 0 < float(row[len(name.split())]) < 20
-
-
-@pytest.mark.slow
 def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
     point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
     stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")

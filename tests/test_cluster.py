@@ -22,7 +22,7 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.environment
 def test_a_map_on_a_cluster_is_that_of_one_process(tmp_path: Path) -> None:
     here = run(tmp_path, "-m", "jaxgran", "map", *MAP.split(), "--workers", "1", "--output", "here.nc")
     there = run(tmp_path, str(SCRIPT), "--workers", "2", "--", *MAP.split(), "--output", "there.nc")

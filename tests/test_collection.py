@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import os
 import re
-import subprocess
-import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -219,12 +216,3 @@ def test_page_about_own_solvers_runs(tmp_path, monkeypatch):
     assert (tmp_path / "profile.png").stat().st_size > 10_000
     assert {row.solver for row in names["rows"]} > {"mine"}
     assert sum(row.solved for row in names["rows"] if row.solver == "mine") > 3
-
-
-@pytest.mark.slow
-def test_two_runs_write_the_same_bytes(tmp_path):
-    for name in ("one", "two"):
-        words = ["collection", "--quick", "--output", str(tmp_path / name)]
-        subprocess.run([sys.executable, "-m", "benchmarks", *words], cwd=ROOT, env=os.environ, check=True)
-    one, two = (tmp_path / name / "collection_quick.h5" for name in ("one", "two"))
-    assert one.read_bytes() == two.read_bytes()

@@ -11,8 +11,6 @@ from jaxgran.contact.near_pairs import PairList
 from jaxgran.contact.network import contact_network, first_contact_time, is_contact
 from jaxgran.model.grains import Grains
 
-pytestmark = pytest.mark.kernels
-
 EPS = np.finfo(float).eps
 PAIRS, INSTANTS = 256, 1001
 seeds = given(st.integers(0, 2**32 - 1))

@@ -81,7 +81,7 @@ def test_drawing_of_the_folders_shows_every_folder_and_every_import(monkeypatch:
     assert sorted(word for word in shown if word.isdecimal()) == sorted(str(number) for number in imports.values())
 
 
-@pytest.mark.slow
+@pytest.mark.environment
 @pytest.mark.parametrize("page", RUN)
 def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
     code = "\n".join(python_of(page))

@@ -221,13 +221,3 @@ def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path:
     again = read_dataset(tmp_path / "old.nc")
     assert MapSettings(**choices_of(again)) == settings
     assert differences(again) == []
-
-
-@pytest.mark.slow
-def test_a_map_by_jax_and_jacobi_agrees_with_the_machine_code_within_errors() -> None:
-    choices = {"grains": 64, "seeds": 1, "equilibrate": 1.0, "strain": 2.0}
-    way = {"engine": "jax", "solver": "jacobi", "batch": 2}
-    original, usual = jg.ratio_map([0.5, 0.9], [0.6], **choices, **way), jg.ratio_map([0.5, 0.9], [0.6], **choices)
-    error = np.hypot(original.pressure_stderr, usual.pressure_stderr)
-    assert np.all(abs(original.pressure - usual.pressure) < 5 * error)
-    assert (original.attrs["engine"], original.attrs["solver"]) == ("jax", "jacobi")

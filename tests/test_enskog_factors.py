@@ -101,7 +101,6 @@ def test_stress_of_no_collisions_has_no_factors_but_an_enskog_stress() -> None:
     assert value["enskog_pressure"] > 0 and value["enskog_shear_stress"] > 0
 
 
-@pytest.mark.slow
 def test_all_assumptions_hold_in_dilute_nearly_elastic_flow() -> None:
     data = jg.ratio_map([0.95], [0.1], grains=100, seeds=2, timestep=1e-3, equilibrate=20.0, strain=10.0).squeeze()
     for factor in ("chaos", "pairs", "binary"):

@@ -16,8 +16,6 @@ from benchmarks.exact_contacts import (
 )
 from benchmarks.networks import chain, hexagonal, jammed_lattice, jammed_row, mass_ratio, size_ratio
 
-pytestmark = pytest.mark.kernels
-
 EPS = np.finfo(float).eps
 
 

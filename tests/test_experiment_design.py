@@ -51,7 +51,6 @@ def test_error_of_fits_is_predicted() -> None:
     assert 0.5 < predicted.usable <= 1
 
 
-@pytest.mark.slow
 def test_error_falls_as_one_over_the_root_of_frames_and_grains() -> None:
     """From 60 frames on, apart from the first and the last ones; a part of these is simulated."""
     few, many = expected(FRAMES), expected(100 * FRAMES)
@@ -69,7 +68,6 @@ def test_error_grows_with_noise_and_with_what_is_not_seen() -> None:
     assert expected(missing=0.2).stderr > expected().stderr
 
 
-@pytest.mark.slow
 def test_shares_are_the_derivatives_by_the_noise() -> None:
     better = jg.fisher_information(FLOW, 24, jg.TrackNoise(POSITION, 0.9 * velocity_noise()), frame_strain=FRAME_STRAIN)
     found = expected()

@@ -7,7 +7,6 @@ happened to.
 import os
 import random
 import re
-import shutil
 import signal
 import subprocess
 import time
@@ -15,13 +14,11 @@ import time
 import pytest
 import xarray as xr
 from command_line import assert_one_sentence
-from fault_lab import MARKS, PATIENCE, Lab, workers_of
+from fault_lab import NEEDS_PROC, PATIENCE, Lab, workers_of
 
 from jaxgran.maps.results import read_dataset
 
-pytestmark = MARKS
-WORKERS = [1, pytest.param(2, marks=pytest.mark.slow)]
-TERMINATED = pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)  # by default, the first of two maps ends by it
+pytestmark = NEEDS_PROC
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +26,11 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     return Lab(tmp_path_factory.mktemp("lab"))
 
 
-KILLS = [(1, 4), pytest.param(1, 14, marks=pytest.mark.slow), pytest.param(2, 6, marks=pytest.mark.slow)]
-
-
-@pytest.mark.parametrize(("workers", "most_kills"), KILLS)
-def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(
-    lab: Lab, workers: int, most_kills: int
-) -> None:
-    rng, maps, kills, known = random.Random(workers), 1, 0, 0
-    while kills < most_kills:
-        output = f"killed{workers}-{most_kills}-{maps}.nc"
-        process = lab.start(output, "--resume", workers=workers)
+def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: Lab) -> None:
+    rng, maps, kills, known = random.Random(1), 1, 0, 0
+    while kills < 4:
+        output = f"killed{maps}.nc"
+        process = lab.start(output, "--resume")
         if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start
             lab.wait_for_work(output, process)
             time.sleep(rng.uniform(0, 1.0))
@@ -73,29 +64,12 @@ def test_a_worker_that_is_killed_is_replaced(lab: Lab) -> None:
         xr.testing.assert_equal(data[name], lab.whole[name].isel(seed=[0]))
 
 
-@pytest.mark.slow
-def test_workers_that_are_killed_one_after_the_other_are_replaced(lab: Lab) -> None:
-    process = lab.start("workers.nc", workers=2)
-    for _ in range(2):
-        lab.wait_for("workers.nc", process=process)
-        os.kill(random.choice(workers_of(process)), signal.SIGKILL)
-        time.sleep(0.5)
-    done = lab.finish(process)
-    assert done.returncode == 0, done.stderr
-    lab.assert_whole("workers.nc")
-
-
-@pytest.mark.parametrize("workers", WORKERS)
-@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), TERMINATED])
-def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(
-    lab: Lab, sent: signal.Signals, status: int, workers: int
-) -> None:
-    output = f"{sent.name}{workers}.nc"
-    process = lab.start(output, workers=workers)
-    lab.wait_for(output, process=process)
-    os.killpg(process.pid, sent)  # as a terminal and Slurm do, to the workers too
-    assert_tells_what_continues_it(lab.finish(process), status, output)
-    lab.assert_whole_when_continued(output)
+def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab) -> None:
+    process = lab.start("interrupted.nc")
+    lab.wait_for("interrupted.nc", process=process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the workers too
+    assert_tells_what_continues_it(lab.finish(process), 130, "interrupted.nc")
+    lab.assert_whole_when_continued("interrupted.nc")
 
 
 def assert_tells_what_continues_it(done: subprocess.CompletedProcess, status: int, output: str) -> None:
@@ -105,15 +79,13 @@ def assert_tells_what_continues_it(done: subprocess.CompletedProcess, status: in
     assert words[-1] == "--resume" and words[words.index("--output") + 1] == output
 
 
-@pytest.mark.parametrize("workers", WORKERS)
-def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab: Lab, workers: int) -> None:
-    output = f"full{workers}.nc"
-    done = lab.finish(lab.start(output, fault="disc full", workers=workers))
+def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab: Lab) -> None:
+    done = lab.finish(lab.start("full.nc", fault="disc full"))
     assert done.returncode == 1
     *_, last = done.stderr.strip().splitlines()
     assert last.startswith("jaxgran: stopped by the file system, File too large; what is done is in ")
     assert last.endswith("add --resume.")
-    lab.assert_whole_when_continued(output)
+    lab.assert_whole_when_continued("full.nc")
 
 
 def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> None:
@@ -130,7 +102,6 @@ def test_a_second_map_on_one_output_is_refused_and_harms_nothing(lab: Lab) -> No
     lab.assert_whole_when_continued("one.nc")
 
 
-@pytest.mark.slow
 def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: Lab) -> None:
     done = lab.finish(lab.start("deadly.nc", fault="deadly batch", workers=2))
     assert done.returncode == 3
@@ -140,22 +111,3 @@ def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: La
     for name in ("force_ratio", "pressure", "status"):
         assert data[name].values[0, 1] == lab.whole[name].values[0, 1]
     lab.assert_whole_when_continued("deadly.nc")
-
-
-@pytest.mark.slow
-def test_an_output_folder_that_is_removed_is_made_again(lab: Lab) -> None:
-    (lab.folder / "gone").mkdir()
-    process = lab.start("gone/map.nc", workers=2)
-    lab.wait_for("gone/map.nc", process=process)
-    while (lab.folder / "gone").exists():  # a worker may be writing into it
-        shutil.rmtree(lab.folder / "gone", ignore_errors=True)
-    done = lab.finish(process)
-    assert done.returncode == 0, done.stderr
-    lab.assert_whole("gone/map.nc")
-
-
-@pytest.mark.slow
-def test_a_clock_that_jumps_changes_nothing(lab: Lab) -> None:
-    done = lab.finish(lab.start("clock.nc", fault="clock"))
-    assert done.returncode == 0, done.stderr
-    lab.assert_whole("clock.nc")

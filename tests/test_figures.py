@@ -318,7 +318,7 @@ def test_time_steps_without_any_value_are_drawn() -> None:
     assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
 
 
-@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), pytest.param(5, 5, marks=pytest.mark.slow), (10, 12)])
+@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), (10, 12)])
 def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
     data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 3e-4, 1e-5)
     data.status[0, 1, 0] = 1

@@ -108,7 +108,7 @@ def test_record_is_at_the_times_in_whole_steps_and_starts_at_the_start(gases) ->
     np.testing.assert_allclose(record.collisions, 2 * np.cumsum(record.tally.collisions) / GRAINS)
 
 
-@pytest.mark.parametrize("way", ["map", pytest.param("vmap", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["map", "vmap"])
 def test_transformations_apply(gases, way: str) -> None:
     one = partial(cooling, FLOW, times=TIMES)
     all_of_them = jax.vmap(one, axis_name="replica") if way == "vmap" else partial(jax.lax.map, one)

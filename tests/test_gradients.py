@@ -146,7 +146,6 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
 
 # Through time
 
-QUICK_NAMES = ("restitution", "side", "positions")
 NAMES = ("restitution", "shear_rate", "timestep", "side", "radii", "masses", "positions", "velocities")
 
 
@@ -239,9 +238,7 @@ def test_loop_of_fixed_length_has_the_values_of_the_advance(tilting, derivative,
     np.testing.assert_allclose(derivative[0], score_of(run(*tilting, STEPS)[0]), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK_NAMES else pytest.param(name, marks=pytest.mark.slow) for name in NAMES]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, forward, score_of, run, name):
     """Across new lists and a remap of the tilt; the radii decide in which steps grains meet, and nothing else."""
     at = parameters(*tilting)
@@ -259,18 +256,6 @@ def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, fo
         assert exact == 0
     change = {other: jnp.asarray(np.zeros(x.shape)) for other, x in at.items()} | {name: along}
     np.testing.assert_allclose(forward(at, change), exact, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative, score_of, events_of):
-    at, events = parameters(*tilting), events_of(STEPS)
-    batch = jax.tree.map(lambda x: jnp.stack([x, x]), at) | {"restitution": jnp.asarray([0.6, 0.3])}
-    one = jax.grad(lambda values: score_of(advance(*changed(*tilting, values), jnp.int32(STEPS), True, events)[0]))
-    found = jax.jit(jax.vmap(one, axis_name="replica"))(batch)
-    for name in NAMES:
-        scale = float(jnp.max(jnp.abs(derivative[1][name]))) + 1
-        np.testing.assert_allclose(found[name][0], derivative[1][name], rtol=0, atol=1e-6 * scale)
-        assert np.all(np.isfinite(found[name][1]))
 
 
 def test_events_that_do_not_suffice_are_reported(tilting, backward, events_of):
@@ -307,34 +292,6 @@ def test_a_contact_that_moves_in_time_has_the_derivative_of_the_event(scene):
     np.testing.assert_allclose((far - near) / change, 0.75, atol=0.02)
 
 
-@pytest.mark.slow
-def test_derivative_of_many_collisions_is_that_of_the_flow_without_time_steps(packed):
-    """With respect to the restitution, at a step so short that differences see the limit; fixed steps miss most."""
-    state = packed(0.3)
-    velocities = np.random.default_rng(0).normal(size=(GRAINS, 2))
-    state, dt = replace(state, velocities=jnp.asarray(velocities)), 1e-6
-
-    def after(alpha, moving_contacts: bool = False):
-        flow = ShearFlow(GRAINS, alpha, 0.3, dt, tolerance=1e-11, max_iterations=100_000)
-        end, tally = advance(flow, state, jnp.int32(round(0.4 / dt)), True, None, moving_contacts)
-        return end.velocities, tally.collisions
-
-    compiled = jax.jit(after)
-    (high, met), (low, also) = (compiled(jnp.asarray(0.8 + sign * 3e-4)) for sign in (1, -1))
-    assert met == also and met > 8
-    difference = (high - low) / 6e-4
-
-    def missed(moving_contacts: bool) -> float:
-        slope = jax.jit(
-            lambda alpha: jax.jvp(lambda a: after(a, moving_contacts)[0], (alpha,), (jnp.ones_like(alpha),))[1]
-        )
-        return float(jnp.linalg.norm(slope(jnp.asarray(0.8)) - difference) / jnp.linalg.norm(difference))
-
-    assert missed(True) < 0.02
-    assert missed(False) > 0.2
-
-
-@pytest.mark.slow
 def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
     """A disc hits a second one that a third one touches at a right angle: the third contact neither presses nor parts.
 

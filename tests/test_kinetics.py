@@ -133,7 +133,6 @@ def test_enskog_rate_is_that_of_kinetic_theory_at_its_temperature() -> None:
     np.testing.assert_allclose(found.collision_rate.value / found.rate_ratio.value, expected, rtol=0.02)
 
 
-@pytest.mark.slow
 def test_binary_stress_and_collision_rate_of_a_flow_follow_from_its_pairs(flowing, run) -> None:
     """Where collisions are binary, what pairs are about to do is what contacts then do."""
     flow = ShearFlow(GRAINS, 0.9, 0.6, 1e-3)

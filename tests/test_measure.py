@@ -1,7 +1,6 @@
 """A sample is the strain asked for, in blocks that add up, alone or in a batch, and only where positions resolve it."""
 
 import re
-import warnings
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -82,16 +81,6 @@ def test_blocks_add_up_to_the_whole(batch, measured) -> None:
 def test_sample_of_a_batch_is_the_sample_of_each(batch, measured) -> None:
     _, both = sample_batch(batch, STRAIN)
     assert_agree(replica(both, 0), measured[1])
-
-
-@pytest.mark.slow
-def test_vmap_applies(batch, state, measured) -> None:
-    shear = jax.jit(jax.vmap(partial(sample, strain=STRAIN), axis_name="replica"))
-    _, both = shear(batch.flow, batch.state)
-    assert_agree(replica(both, 0), measured[1])
-    assert both.force_ratio.shape == both.status.shape == (2,)
-    assert both.contact_stress.shape == (2, 2, 2)
-    assert_agree(replica(both, 1), sample(FLOWS[1], replica(batch.state, 1), STRAIN)[1])
 
 
 def test_lax_map_applies_with_a_traced_strain(batch, measured) -> None:
@@ -195,22 +184,6 @@ def test_float32_is_refused_where_it_cannot_resolve_the_time_step(state) -> None
         assert 1e-5 < least < 1e-4
         check_precision(replace(FLOWS[0], timestep=least), single)
     check_precision(replace(FLOWS[0], timestep=1e-5), state)  # float64 resolves it
-
-
-@pytest.mark.slow
-def test_float32_measures_what_float64_does_at_a_time_step_it_resolves(state) -> None:
-    # A tenth of a per cent: a hundred steps in which rounding has little time to grow.
-    flow = replace(FLOWS[0], timestep=1e-4)
-    _, double = sample(flow, state, 1e-2)
-    with jax.enable_x64(False), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "JAX computes in single precision")
-        _, single = sample(flow, in_float32(state), 1e-2)
-    assert single.pressure.dtype == jnp.float32
-    assert single.status == Status.ok
-    assert float(single.averages["kinetic_pressure"]) == pytest.approx(
-        float(double.averages["kinetic_pressure"]), rel=1e-3
-    )
-    assert float(np.sum(single.tally.steps)) == 100
 
 
 @pytest.mark.parametrize(("name", "value"), [("packing_fraction", 0.601), ("polydispersity", 0.2)])

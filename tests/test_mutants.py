@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mistakes import MISTAKES, QUICK, Mistake
+from benchmarks.mistakes import MISTAKES, Mistake
 from benchmarks.mutants import failed_tests
 
 ROOT = Path(__file__).parents[1]
@@ -27,12 +27,6 @@ def test_a_mistake_is_one_word_of_a_line_that_its_file_has_once(mistake: Mistake
 def test_a_line_that_has_changed_is_named() -> None:
     with pytest.raises(ValueError, match=f"{MISTAKES[0].name}' 0 times"):
         MISTAKES[0].made_in("")
-
-
-def test_names_are_unique_and_quick_ones_among_them() -> None:
-    names = [one.name for one in MISTAKES]
-    assert len(set(names)) == len(names)
-    assert set(QUICK) <= set(names)
 
 
 def test_failed_tests_are_those_of_the_summary() -> None:

@@ -80,15 +80,6 @@ def operator_and_approach(network) -> tuple[np.ndarray, np.ndarray]:
     return matrix[np.ix_(used, used)], np.asarray(network.contacts.approach)[used]
 
 
-@pytest.mark.slow
-def test_collection_is_the_same_twice(networks, monkeypatch):
-    """Of the flows, which take long, the two that differ in packing fraction and restitution."""
-    monkeypatch.setattr(module, "FLOWS", module.FLOWS[-2:])
-    again = collection(quick=True)
-    assert len(again) == len(networks) - 3
-    jax.tree.map(np.testing.assert_array_equal, again, {group: networks[group] for group in again})
-
-
 def test_networks_are_padded_and_consistent(networks):
     for members in networks.values():
         for contacts, _, masses, _ in members:
@@ -99,7 +90,6 @@ def test_networks_are_padded_and_consistent(networks):
             np.testing.assert_allclose(contacts.inverse_mass_j, np.where(used, 1 / masses[contacts.j], 0), rtol=1e-12)
 
 
-@pytest.mark.kernels
 def test_exact_solution_is_the_projection_of_the_velocities(networks, exact_of):
     """By its definition, for velocities of the grains that the approach follows from: v₀ after, from v before, is the
     projection on the cone of the velocities that let no contact approach where v₀ is in it and v − v₀ is orthogonal to
@@ -120,20 +110,17 @@ def test_exact_solution_is_the_projection_of_the_velocities(networks, exact_of):
     assert compared > 25
 
 
-@pytest.mark.kernels
 def test_exact_solution_satisfies_the_contact_law_to_rounding(feasible, exact_of):
     for network in feasible:
         assert exact_of(network).residual < 1e-11
 
 
-@pytest.mark.kernels
 def test_exact_solution_tells_what_has_none(networks, exact_of):
     for members in networks.values():
         for network in members:
             assert exact_of(network).feasible == network.feasible
 
 
-@pytest.mark.kernels
 def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_of):
     for network in feasible:
         solution, reference = solution_of(network, 1e-10, 20_000), exact_of(network)
@@ -142,7 +129,6 @@ def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_
         assert error < 1e-12 * energy(network, reference.changes)
 
 
-@pytest.mark.kernels
 def test_gauss_seidel_converges_to_the_exact_velocities(networks, exact_of):
     for group in ("flow ν 0.8, α 0", "flow ν 0.82, α 0.9", "flow ν 0.6, α 0.5", SIZE_RATIO, HEXAGONAL):
         for network in networks[group]:
@@ -154,7 +140,6 @@ def test_gauss_seidel_converges_to_the_exact_velocities(networks, exact_of):
             )
 
 
-@pytest.mark.kernels
 def test_scaling_by_the_diagonal_diverges_where_it_does_not_bound(feasible, solution_of, exact_of):
     """Where λmax(diag(W)⁻¹ W) > 2 on the contacts that push, the solution repels Jacobi with diag(W).
 

@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,26 +11,6 @@ from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.files import read_cached, write_cached
 
 PACKAGE = Path(jaxgran.__file__).parent
-PROGRAM = """
-import jax, jax.numpy as jnp
-jax.config.update("jax_enable_x64", True)
-import jaxgran as jg
-flow = jg.ShearFlow(grains=16, restitution=0.5, packing_fraction=0.3, timestep=1e-3)
-grains = jg.Grains(jnp.full(16, 0.5), jnp.ones(16))
-places = jnp.stack(jnp.meshgrid(jnp.arange(4.0), jnp.arange(4.0)), axis=-1).reshape(-1, 2) * 1.7
-places = places.at[1, 0].add(-0.75)  # overlaps its neighbour by 0.05
-state = jg.State(grains, places, jnp.zeros((16, 2)).at[1, 0].set(-1.0), jnp.asarray(6.8), jnp.asarray(0.0))
-_, tally = jg.advance(flow, state, jnp.int32(1))
-print(jg.Status(int(tally.outcome)).name, float(tally.overlap))
-"""
-
-
-def outcome(package: Path, cache: Path) -> tuple[str, str]:
-    """Status and overlap of one step with a copy of the package, and what it says on standard error."""
-    environment = os.environ | {"PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(cache), "NUMBA_OPT": "0"}
-    ran = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, cwd=package)
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout, ran.stderr
 
 
 @pytest.fixture
@@ -65,7 +43,7 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
         assert ffi.object_file() != kept
         path.write_bytes(content)
     assert ffi.object_file() == kept
-    compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba").glob("*.py")}
+    compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
     imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
     assert compiled_here | imported <= set(sources)
 
@@ -114,28 +92,6 @@ def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
 
 
 def test_a_cache_that_cannot_be_written_is_an_error_of_the_file_system(tmp_path: Path) -> None:
-    """The numba engine makes a warning of it: see the slow test."""
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OSError):
         write_cached(tmp_path / "file" / "numba" / "code.o", b"code", 1)
-
-
-@pytest.mark.slow
-def test_a_changed_constant_and_a_changed_function_take_effect(copy: Path, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    before, _ = outcome(copy, cache)
-    assert before.startswith("deep_overlap ")
-    changed(copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
-    after, _ = outcome(copy, cache)
-    assert after == before.replace("deep_overlap", "ok")
-    changed(copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
-    status, overlap = outcome(copy, cache)[0].split()
-    assert status == "ok" and float(overlap) == 2 * float(before.split()[1])
-
-
-@pytest.mark.slow
-def test_a_process_without_a_cache_compiles_for_itself(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    found, told = outcome(PACKAGE.parent, tmp_path / "file")
-    assert found.startswith("deep_overlap ")
-    assert "the numba engine is compiled anew in every process" in told and "cannot be written" in told

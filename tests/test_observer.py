@@ -148,34 +148,14 @@ def test_callback_is_told_of_every_block_and_may_end_the_sample(flowing) -> None
     np.testing.assert_allclose(told_end.velocities, end.velocities, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_callback_and_observable_together_find_what_the_observable_finds_alone(flowing, observed) -> None:
-    _, told = sample(FLOW, flowing(0.7), STRAIN, observe=observe, callback=lambda *_: None)
-    np.testing.assert_array_equal(told.own["one"], observed[1].own["one"])
-    np.testing.assert_allclose(told.own["stress"], observed[1].own["stress"], rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize("axis_name", [pytest.param("replica", marks=pytest.mark.slow), None])
-def test_transformations_apply(flowing, axis_name) -> None:
+def test_lax_map_applies(flowing) -> None:
     states = jax.tree.map(lambda *x: jnp.stack(x), flowing(0.7), flowing(0.7, 1))
 
     def shear(states):
-        if axis_name is None:
-            return jax.lax.map(lambda state: sample(FLOW, state, STRAIN, observe=observe), states)
-        return jax.vmap(lambda state: sample(FLOW, state, STRAIN, observe=observe), axis_name=axis_name)(states)
+        return jax.lax.map(lambda state: sample(FLOW, state, STRAIN, observe=observe), states)
 
     _, both = jax.eval_shape(shear, states)
     assert both.own["stress"].shape == (2, BLOCKS, 2, 2)
-
-
-@pytest.mark.slow
-def test_a_batch_observes_what_each_of_it_observes(flowing) -> None:
-    states = jax.tree.map(lambda *x: jnp.stack(x), flowing(0.7), flowing(0.7, 1))
-    shear = jax.jit(jax.vmap(lambda state: sample(FLOW, state, STRAIN, observe=observe), axis_name="replica"))
-    _, both = shear(states)
-    np.testing.assert_array_equal(both.own["one"], both.tally.steps)
-    _, single = sample(replace(FLOW, engine="jax"), flowing(0.7), STRAIN, observe=observe)
-    np.testing.assert_allclose(both.own["stress"][0], single.own["stress"], rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize(

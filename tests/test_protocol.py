@@ -166,13 +166,12 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert record == []
 
 
-@pytest.mark.slow
 def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
     monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
-    flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3, 2e-4, 1e-5)]
+    flows = [ShearFlow(32, 0.5, 0.7, dt) for dt in (1e-2, 1e-3)]
     keys = jax.random.split(jax.random.PRNGKey(5), len(flows))
     together = prepare_batch(stack(flows), keys, equilibrate=0.1)
     for k, flow in enumerate(flows):

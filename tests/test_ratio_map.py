@@ -123,14 +123,6 @@ def test_every_step_of_every_replica_is_reported(results, reported) -> None:
     assert_every_step_is_reported(reported)
 
 
-@pytest.mark.slow
-def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
-    """A map with a worker is in the tests of faults too."""
-    told: list[float] = []
-    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
-    assert_every_step_is_reported(told)
-
-
 @pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
 def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_steps(
     settings, second: Status, monkeypatch: pytest.MonkeyPatch
@@ -244,7 +236,6 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
 
 
-@pytest.mark.slow
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
     both = dict(replicas(some, batch=8))

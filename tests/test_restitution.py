@@ -21,12 +21,8 @@ SEEN = {
 }
 
 
-ALL = [(restitution, how) for restitution in (0.3, RESTITUTION, 0.95) for how in SEEN]
-QUICK = {(0.3, "velocities with 5 % of noise"), (RESTITUTION, "positions alone"), (0.95, "exactly")}
-
-
 @pytest.mark.parametrize(
-    ("restitution", "how"), [case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow) for case in ALL]
+    ("restitution", "how"), list(zip((0.95, 0.3, RESTITUTION, RESTITUTION, 0.3), SEEN, strict=True))
 )
 def test_restitution_is_found_again(restitution: float, how: str) -> None:
     fit = fit_restitution(SEEN[how](tracks(restitution)))

@@ -24,7 +24,7 @@ def test_law_without_noise_is_found() -> None:
     np.testing.assert_allclose(law.friction(number), power(number, FRICTION), rtol=1e-5)
 
 
-@pytest.mark.parametrize("correlation", [pytest.param(0.0, marks=pytest.mark.slow), 0.9, -0.9])
+@pytest.mark.parametrize("correlation", [0.9, -0.9])
 def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(
     correlation: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

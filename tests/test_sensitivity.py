@@ -1,7 +1,5 @@
 """Growth of the derivatives of a flow."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,6 @@ def flow_of(restitution) -> ShearFlow:
     return ShearFlow(GRAINS, restitution, 0.6, 1e-3, tolerance=1e-12, max_iterations=100_000)
 
 
-@pytest.mark.slow
 def test_growth_is_that_of_two_neighbouring_runs(flowing, run) -> None:
     """At fixed time steps, over a strain in which no contact changes its step."""
     state, steps, change = flowing(0.6), 60, 1e-9
@@ -29,16 +26,6 @@ def test_growth_is_that_of_two_neighbouring_runs(flowing, run) -> None:
     assert grown.derivative[-1] == pytest.approx(np.sqrt(np.mean(squares)) / (2 * change), rel=1e-4)
     np.testing.assert_allclose(grown.strain, [0.02, 0.04, 0.06])
     assert np.all(grown.status <= 3) and np.all(np.isfinite(grown.derivative))
-
-
-@pytest.mark.slow
-def test_unit_of_time_does_not_matter(flowing) -> None:
-    state = flowing(0.6)
-    slow = replace(state, velocities=state.velocities / 50)
-    flow = flow_of(0.6)
-    one = growth(flow, state, 0.06, 3, moving_contacts=False)
-    other = growth(replace(flow, shear_rate=0.02, timestep=0.05), slow, 0.06, 3, moving_contacts=False)
-    np.testing.assert_allclose(other.derivative, one.derivative, rtol=1e-6)
 
 
 def test_exponent_of_exponential_growth_is_found_within_its_error() -> None:

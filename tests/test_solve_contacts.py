@@ -49,7 +49,6 @@ def by_nnls(problem: DelassusProblem) -> np.ndarray:
     return nnls(lower.T, -np.linalg.solve(lower, np.asarray(problem.approach)))[0]
 
 
-@pytest.mark.kernels
 @settings(max_examples=10)
 @given(seeds, st.integers(2, MAX_DISCS), restitutions)
 def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restitution):
@@ -67,7 +66,6 @@ def test_network_and_its_matrix_have_the_exact_velocities(seed, discs, restituti
         assert np.all(np.asarray(solution.impulses)[~used] == 0)
 
 
-@pytest.mark.kernels
 @given(seeds, restitutions)
 def test_any_matrix_has_the_impulses_of_non_negative_least_squares(seed, restitution):
     problem = matrix_problem(seed)

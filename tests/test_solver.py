@@ -15,8 +15,6 @@ from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
-pytestmark = pytest.mark.kernels
-
 EPS = np.finfo(float).eps
 METHODS = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]
 PRECISE = METHODS[:3]  # the last is too slow to reach 1e-12 on all networks

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from benchmarks import networks
-from benchmarks.collection import Entry, load
+from benchmarks.collection import Entry
 from benchmarks.collection.certificates import delassus, obstructed, solved
 from benchmarks.collection.compare import Answer
 from benchmarks.collection.problems import compact
@@ -20,11 +20,9 @@ from benchmarks.solvers import groups, measure
 from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
 from benchmarks.solvers.forms import in_impulses, in_velocities, weighted
 from benchmarks.solvers.measure import TARGETS, Row, measured
-from benchmarks.solvers.numba_engine import by_cluster
-from benchmarks.solvers.roster import Solver, own, peers
-from benchmarks.solvers.run import agreement, compile_for, warm_summary
+from benchmarks.solvers.roster import Solver, own
+from benchmarks.solvers.run import agreement, warm_summary
 from benchmarks.solvers.warm import WarmRow, swept_from
-from jaxgran.sampling.budget import RESIDUAL_FACTOR
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -63,62 +61,10 @@ def test_solution_is_optimal_in_both_forms(entries):
         np.testing.assert_allclose((g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12)
 
 
-@pytest.mark.slow  # compiles for 13 s
-def test_machine_code_alone_solves_all(entries):
-    for entry in entries[:4]:
-        answer = by_cluster(entry, 1e-10)()
-        assert measure.velocity_error(entry, entry.matrix, answer.impulses) < 1e-8 and answer.products >= 1
-    assert by_cluster(entries[4], 1e-6)() is None
-
-
 def test_start_at_the_solution_needs_one_sweep(entries):
     entry = entries[1]
     assert swept_from(entry, 1e-6, entry.solution.impulses)().products == 1
     assert swept_from(entry, 1e-6)().products > 50
-
-
-@pytest.mark.slow
-def test_peers_and_ours_find_the_same_velocities(entries):
-    """Each that is installed; all know that a full row has no solution, apart from those that only iterate."""
-    pytest.importorskip("pinocchio")
-    pytest.importorskip("proxsuite")
-    solvers = {name: own()[name] for name in ("numba engine", "barzilai-borwein")} | peers()
-    finest: dict = {}
-    compile_for(entries, solvers)
-    rows = measured(
-        solvers, entries, lambda name, entry, runs: finest.setdefault(entry.name, {}).update({name: runs[-1]})
-    )
-    assert {row.outcome for row in rows} <= {"ok", "missed"}
-    for entry in entries[:4]:
-        good = {name: run for name, run in finest[entry.name].items() if run.residual <= TARGETS[-1]}
-        assert set(good) >= {
-            "numba engine",
-            "barzilai-borwein",
-            "Pinocchio ADMM",
-            "PIQP",
-            "ProxQP",
-            "OSQP",
-        }
-        for run in good.values():
-            assert measure.velocity_error(entry, entry.matrix, run.impulses) <= 1e-6
-    denying = {name for name, run in finest["jammed row"].items() if run.impulses is None}
-    assert denying >= {"numba engine", "barzilai-borwein", "PIQP", "ProxQP", "OSQP", "SciPy NNLS"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["numba engine", "barzilai-borwein"])
-def test_few_solves_of_flows_have_a_larger_error_of_the_stress_than_is_counted(name: str) -> None:
-    flows = [entry for entry in load() if entry.family in groups.FLOWS]
-    solver, ratios = {name: own()[name]}, []
-    compile_for(flows, solver)
-
-    def note(_: str, entry: Entry, runs: list[measure.Attempt]) -> None:
-        ratios.extend(measure.stress_error(entry, run.impulses) / run.tolerance for run in runs)
-
-    measured(solver, flows, note)
-    assert len(ratios) > 500
-    assert np.mean(np.array(ratios) <= RESIDUAL_FACTOR) >= 0.98
-    assert np.median(ratios) < 1
 
 
 def scripted(*residuals: float, seconds: float = 0.0):

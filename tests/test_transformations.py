@@ -57,8 +57,8 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
 }
 NOT_BACKWARD = {"advance", "sample", "snapshot_series", "cooling", "count_events", "pack"}
 NO_DERIVATIVE = {"count_events"}  # a whole number
-LONG = {"count_events", "pack", "restitution_from_stresses"}  # to trace
-LONG_WITH_TANGENTS = LONG | {"advance", "sample", "snapshot_series", "cooling"}
+# Those take long to trace with their tangents; the derivatives of an advance are in the tests of the gradients.
+LONG = {"count_events", "pack", "restitution_from_stresses", "advance", "sample", "snapshot_series", "cooling"}
 
 REFUSED: dict[str, Callable[[Any, State], Any]] = {
     "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
@@ -110,12 +110,7 @@ def test_every_public_name_is_among_these() -> None:
     assert {*TRANSFORMED, *REFUSED, *WITHOUT_ARRAYS} == set(jg.__all__)
 
 
-def quick(but: set[str]) -> list:
-    """The names; some of them in the slow tests."""
-    return [pytest.param(name, marks=pytest.mark.slow) if name in but else name for name in TRANSFORMED]
-
-
-@pytest.mark.parametrize("name", quick(but=LONG))
+@pytest.mark.parametrize("name", TRANSFORMED)
 def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
     numbers = jnp.asarray([X, X])
 
@@ -129,7 +124,7 @@ def test_jit_vmap_and_lax_map_apply(name: str, state: State) -> None:
     assert shapes(jax.vmap(one), numbers) == shapes(lambda x: jax.lax.map(one, x), numbers) == batch
 
 
-@pytest.mark.parametrize("name", quick(but=LONG_WITH_TANGENTS))
+@pytest.mark.parametrize("name", sorted(TRANSFORMED.keys() - LONG))
 def test_derivatives_in_forward_mode_apply(name: str, state: State) -> None:
     values, changes = jax.eval_shape(lambda x: jax.jvp(lambda y: TRANSFORMED[name](y, state), (x,), (1.0,)), X)
     assert jax.tree.map(lambda x: x.shape, values) == jax.tree.map(lambda x: x.shape, changes)

@@ -20,7 +20,7 @@ from jaxgran.maps.results import read_dataset
 from jaxgran.model.display import with_error
 
 pytestmark = [
-    pytest.mark.slow,  # all is compiled anew: 25 seconds of one core, in .ci/run
+    pytest.mark.environment,
     pytest.mark.skipif(os.name != "posix", reason="users are those of POSIX"),
     pytest.mark.skipif(not (find_spec("hatchling") and find_spec("pip")), reason="hatchling or pip is not installed"),
 ]
