@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiled_programs import exact_order
-from flows import OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
+from flows import EXACT, OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov
 from jaxgran.dynamics import collision
 from jaxgran.dynamics.collision import contact_capacities, contacts_now
-from jaxgran.dynamics.jax_engine import advance
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.model.cell import displacement, remap_tilt
 from jaxgran.model.status import Status
 
@@ -60,8 +61,8 @@ def test_all_methods_give_the_same_trajectory(run, flowing, packing_fraction):
     flow, state = flow_of(packing_fraction), flowing(packing_fraction)
     one, tally = run(flow, state, 100)
     assert tally.status == Status.ok and tally.solves > 5
-    for solver in ("nesterov", "jacobi"):
-        two, other = run(replace(flow, solver=solver), state, 100)
+    for method in (Nesterov, Jacobi):
+        two, other = run(flow, state, 100, solver=method(EXACT.tolerance, EXACT.max_steps))
         assert_same_state(one, two, 1e-8)
         assert_same_tally(tally, other, 1e-8, but=("loaded_contacts",))
 
@@ -93,11 +94,11 @@ def test_change_of_a_number_compiles_nothing(run, flowing):
         {"packing_fraction": 0.59},
         {"timestep": 1e-5},
         {"shear_rate": 2.0},
-        {"tolerance": 1e-3},
-        {"max_iterations": 7},
         {"polydispersity": 0.1},
     ):
         run(flow_of(**change), state, 5)
+    for solver in (BarzilaiBorwein(tolerance=1e-3), BarzilaiBorwein(max_steps=7)):
+        run(flow_of(), state, 5, solver=solver)
     assert run.compiled.traces == before
 
 
@@ -126,7 +127,7 @@ def test_deep_overlap_is_reported(engine_run, scene):
 
 
 def test_cap_of_iterations_is_reported(engine_run, flowing):
-    state, tally = engine_run(flow_of(0.75, restitution=0.1, max_iterations=1), flowing(0.75), 100)
+    state, tally = engine_run(flow_of(0.75, restitution=0.1), flowing(0.75), 100, BarzilaiBorwein(1e-12, 1))
     assert tally.status == Status.iteration_limit
     assert 0 < tally.unconverged <= tally.solves
     assert np.all(np.isfinite(state.velocities))
@@ -142,7 +143,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
     state = flowing(0.6)
     heap = replace(state, positions=2 + 0.1 * state.positions)
     assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * pytest.GRAINS
-    _, tally = engine_run(flow_of(max_iterations=100), heap, 3)
+    _, tally = engine_run(flow_of(), heap, 3, BarzilaiBorwein(1e-12, 100))
     assert tally.status == Status.capacity
 
 
@@ -150,7 +151,7 @@ def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     """A ladder of buffers that ends too early drops contacts, and says so."""
     state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
     monkeypatch.setattr(collision, "contact_capacities", lambda grains: (2,))
-    _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
+    _, tally = jax.jit(lambda flow, state: advance_by_jax(flow, EXACT, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 
 
@@ -183,6 +184,10 @@ def replica(tree, index: int):
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
+def exact_advance(flow, state, steps):
+    return advance_by_jax(flow, EXACT, state, steps)
+
+
 # One after the other, replicas do not meet; the quick tests of the numba engine state that they are single runs
 ways = pytest.mark.parametrize("way", ["vmap", pytest.param("map", marks=pytest.mark.slow)])
 
@@ -197,7 +202,7 @@ def few_buffers():
 
 @pytest.fixture(scope="module")
 def traced_batch(replicas, few_buffers):
-    batch = jax.vmap(advance, in_axes=(0, 0, None), axis_name="replica")
+    batch = jax.vmap(exact_advance, in_axes=(0, 0, None), axis_name="replica")
     return jax.jit(batch).trace(*replicas, jnp.int32(0))
 
 
@@ -205,7 +210,9 @@ def traced_batch(replicas, few_buffers):
 def batches(traced_batch):
     """The two ways to advance a batch: all replicas at once, and one after the other."""
     together = traced_batch.lower().compile(exact_order())
-    in_turn = jax.jit(lambda flows, states, steps: jax.lax.map(lambda each: advance(*each, steps), (flows, states)))
+    in_turn = jax.jit(
+        lambda flows, states, steps: jax.lax.map(lambda each: exact_advance(*each, steps), (flows, states))
+    )
     return {"vmap": together, "map": in_turn}
 
 
@@ -253,7 +260,7 @@ def equations_of(jaxpr) -> list:
 
 def test_control_flow_of_a_batch_stays_control_flow(traced_batch, flowing):
     """A branch or loop on a predicate that differs between replicas would pay for all branches, for all replicas."""
-    single = jax.make_jaxpr(advance)(flow_of(), flowing(0.6), jnp.int32(0))
+    single = jax.make_jaxpr(exact_advance)(flow_of(), flowing(0.6), jnp.int32(0))
     batch, alone = equations_of(traced_batch.jaxpr.jaxpr), equations_of(single.jaxpr)
     for name in ("cond", "while"):
         found = [equation for equation in batch if equation.primitive.name == name]
@@ -268,7 +275,8 @@ def test_control_flow_of_a_batch_stays_control_flow(traced_batch, flowing):
 
 
 def test_single_precision_stays_single(flowing):
-    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(tolerance=1e-4), flowing(0.6)))
-    state, tally = jax.eval_shape(advance, replace(flow, max_iterations=jnp.int32(99)), state, jnp.int32(3))
+    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(), flowing(0.6)))
+    solver = BarzilaiBorwein(jnp.float32(1e-4), jnp.int32(99))
+    state, tally = jax.eval_shape(advance_by_jax, flow, solver, state, jnp.int32(3))
     numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert set(numbers) == {jnp.dtype("float32")}

@@ -9,8 +9,9 @@ from scipy.spatial import cKDTree
 
 from jaxgran.contact import near_pairs
 from jaxgran.contact.cell_list import _cells_per_side, cell_list_pairs, set_bit
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import collision
-from jaxgran.dynamics.jax_engine import advance
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.model.cell import cell_side, wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -166,12 +167,17 @@ def test_a_flow_is_the_same_with_cell_lists_as_with_all_pairs(monkeypatch):
     lattice = jnp.stack(jnp.meshgrid(along, along), axis=-1).reshape(count, 2)
     velocities = jax.random.normal(key, (count, 2))
     state = State(grains, lattice, velocities - velocities.mean(axis=0, keepdims=True), side, jnp.asarray(0.3))
-    flow = ShearFlow(grains=count, restitution=0.7, packing_fraction=0.6, timestep=1e-3, tolerance=1e-8)
+    flow = ShearFlow(grains=count, restitution=0.7, packing_fraction=0.6, timestep=1e-3)
+    solver = BarzilaiBorwein(tolerance=1e-8)
     monkeypatch.setattr(collision, "contact_capacities", lambda grains: (3 * grains,))  # quicker to compile
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        by_cells, tally = jax.jit(lambda start, steps: advance(flow, start, steps))(state, jnp.int32(100))
+        by_cells, tally = jax.jit(lambda start, steps: advance_by_jax(flow, solver, start, steps))(
+            state, jnp.int32(100)
+        )
         monkeypatch.setattr(near_pairs, "ALL_PAIRS_LIMIT", count)
-        by_all, reference = jax.jit(lambda start, steps: advance(flow, start, steps))(state, jnp.int32(100))
+        by_all, reference = jax.jit(lambda start, steps: advance_by_jax(flow, solver, start, steps))(
+            state, jnp.int32(100)
+        )
     assert tally.status == reference.status == 0
     assert tally.collisions == reference.collisions > 0
     np.testing.assert_allclose(by_cells.velocities, by_all.velocities, rtol=0, atol=1e-9)

@@ -37,7 +37,7 @@ LAWS = {
 
 
 def flow_of(packing_fraction: float = 0.7, **change) -> ShearFlow:
-    return replace(ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3, tolerance=1e-10), **change)
+    return replace(ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), **change)
 
 
 @pytest.fixture(scope="module")
