@@ -4,9 +4,18 @@ from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
 from .caches import enable_cache
 from .contact.problem import ContactNetwork, DelassusProblem
+from .contact.projected_methods import (
+    BarzilaiBorwein,
+    Jacobi,
+    JacobiCount,
+    JacobiDiagonal,
+    Nesterov,
+    ProjectedMethod,
+)
 from .contact.residuals import ContactResiduals, contact_residuals
 from .contact.solve_contacts import ContactSolution, solve_contacts
 from .dynamics.advance import advance
+from .dynamics.engine import Jax, Numba, Pallas
 from .dynamics.jax_engine import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
@@ -42,6 +51,7 @@ from .sampling.steady_state import heated, prepare
 
 __version__: str
 __all__ = [
+    "BarzilaiBorwein",
     "Closure",
     "ContactNetwork",
     "ContactResiduals",
@@ -52,7 +62,15 @@ __all__ = [
     "FisherInformation",
     "Grains",
     "InputError",
+    "Jacobi",
+    "JacobiCount",
+    "JacobiDiagonal",
+    "Jax",
+    "Nesterov",
+    "Numba",
     "Page",
+    "Pallas",
+    "ProjectedMethod",
     "RestitutionFit",
     "Sample",
     "ShearFlow",

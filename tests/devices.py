@@ -16,12 +16,13 @@ elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))
 
+from jaxgran.dynamics.engine import Numerics  # noqa: E402
 from jaxgran.model.flow import ShearFlow  # noqa: E402
 from jaxgran.model.grains import Grains  # noqa: E402
 from jaxgran.model.state import State  # noqa: E402
 from jaxgran.sampling.batch import advance_batch  # noqa: E402
 
-like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), State(Grains(0, 0), 0, 0, 0, 0), 0)
+like = (ShearFlow(int(grains), 0.5, 0.6, 1e-3), Numerics(), State(Grains(0, 0), 0, 0, 0, 0), 0)
 with np.load(start) as arrays:
     leaves = [arrays[name] for name in arrays.files]
 state, tally = advance_batch(*jax.tree.unflatten(jax.tree.structure(like), leaves))

@@ -1,12 +1,13 @@
-"""Flows of the shared number of grains, and when two runs are the same."""
+"""Flows of ``GRAINS`` grains, the number that tests share, and when two runs are the same."""
 
 import numpy as np
-from shared_flows import GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 
+GRAINS = 32
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "status")
 
 OF_INSTANTS = tuple(name for name, row in TABLE.items() if row["kind"] == INSTANT)  # those of the end of an advance
@@ -15,9 +16,12 @@ OF_INSTANTS = tuple(name for name, row in TABLE.items() if row["kind"] == INSTAN
 OF_THE_SOLVER = ("residual_counts", "worst_residual", "complementarity", "iterations", "momentum_drift", "overlap")
 
 
+EXACT = BarzilaiBorwein(tolerance=1e-12, max_steps=100_000)  # contacts are solved to rounding
+
+
 def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
-    """A flow whose contacts are solved to rounding."""
-    numbers = {"restitution": 0.5, "timestep": 1e-3, "tolerance": 1e-12, "max_iterations": 100_000}
+    """A flow of the shared number of grains."""
+    numbers = {"restitution": 0.5, "timestep": 1e-3}
     return ShearFlow(GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
 
 

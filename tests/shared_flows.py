@@ -7,41 +7,50 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import EXACT, GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics import advance as public
-from jaxgran.dynamics.jax_engine import advance
+from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.pallas_engine import kernel
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.sampling.packing import pack
 
-GRAINS = 32
 ENGINES = ("numba", "pallas", "jax")
 
 
 @pytest.fixture(scope="session")
 def run():
-    """``run(flow, state, steps, free_flight=True)``: the advance by JAX alone, compiled."""
-    compiled = jax.jit(advance)
+    """``run(flow, state, steps, free_flight=True, solver=EXACT)``: the advance by JAX alone, compiled."""
+    compiled = jax.jit(advance_by_jax)
 
-    def call(flow: ShearFlow, state: State, steps: int, free_flight: bool = True):
-        return jax.block_until_ready(compiled(flow, state, jnp.int32(steps), jnp.asarray(free_flight)))
+    def call(flow: ShearFlow, state: State, steps: int, free_flight: bool = True, solver: ProjectedMethod = EXACT):
+        return jax.block_until_ready(compiled(flow, solver, state, jnp.int32(steps), jnp.asarray(free_flight)))
 
     return call
 
 
 @pytest.fixture(scope="session")
 def engines(run):
-    """``engines[name](flow, state, steps)``: the advance by an engine, compiled; Pallas is interpreted."""
+    """``engines[name](flow, state, steps, solver=EXACT)``: the advance by an engine, compiled; pallas interpreted."""
 
     def compiled(advance):
         call = jax.jit(advance)
-        return lambda flow, state, steps: jax.block_until_ready(call(flow, state, jnp.int32(steps)))
 
-    interpreted = partial(kernel.advance, interpret=True)
-    return {"numba": compiled(public.advance), "pallas": compiled(interpreted), "jax": run}
+        def run(flow: ShearFlow, state: State, steps: int, solver: ProjectedMethod = EXACT):
+            return jax.block_until_ready(call(flow, solver, state, jnp.int32(steps)))
+
+        return run
+
+    interpreted = partial(kernel.advance_by_pallas, interpret=True)
+    return {
+        "numba": compiled(lambda flow, solver, state, steps: advance(flow, state, steps, solver=solver)),
+        "pallas": compiled(interpreted),
+        "jax": lambda flow, state, steps, solver=EXACT: run(flow, state, steps, solver=solver),
+    }
 
 
 @pytest.fixture(scope="session", params=ENGINES)
@@ -52,7 +61,7 @@ def engine(request) -> str:
 
 @pytest.fixture(scope="session")
 def engine_run(engine, engines):
-    """``engine_run(flow, state, steps)``: the advance by each engine in turn."""
+    """``engine_run(flow, state, steps, solver=EXACT)``: the advance by each engine in turn."""
     return engines[engine]
 
 
@@ -81,7 +90,7 @@ def flowing(packed, run):
         velocities = np.random.default_rng(seed).normal(size=(GRAINS, 2)) / np.sqrt(masses)
         velocities -= np.sum(masses * velocities, axis=0) / np.sum(masses)
         flow = ShearFlow(GRAINS, 0.7, packing_fraction, 1e-3)
-        return run(flow, replace(state, velocities=jnp.asarray(velocities)), 1000)[0]
+        return run(flow, replace(state, velocities=jnp.asarray(velocities)), 1000, solver=BarzilaiBorwein())[0]
 
     return flow_state
 
@@ -113,11 +122,10 @@ def scene():
 
 @pytest.fixture(scope="session")
 def solved():
-    """``solved(network, tolerance, max_iterations, method, active, relaxation)``: the contact solve, compiled."""
-    compiled = jax.jit(solve, static_argnums=(1, 6))
+    """``solved(network, tolerance, max_steps, method, active)``: the contact solve, compiled."""
+    compiled = jax.jit(solve, static_argnums=1)
 
-    def call(network, tolerance=1e-12, max_iterations=100_000, method="barzilai-borwein", active=True, relaxation=1.8):
-        numbers = jnp.asarray(1.0), jnp.asarray(tolerance), jnp.asarray(max_iterations), jnp.asarray(relaxation)
-        return compiled(network, 60, *numbers, method, jnp.asarray(active))
+    def call(network, tolerance=1e-12, max_steps=100_000, method=BarzilaiBorwein, active=True):
+        return compiled(network, 60, jnp.asarray(1.0), method(tolerance, max_steps), jnp.asarray(active))
 
     return call

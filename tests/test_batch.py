@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shared_flows import GRAINS
+from flows import GRAINS
 
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import own_grains
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import advance_batch, stack
+from jaxgran.sampling.batch import advance_batch, for_replicas, stack
 
 PROGRAM = Path(__file__).with_name("devices.py")
 RESTITUTIONS = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)  # more than four devices, and not a multiple
@@ -39,8 +40,9 @@ def batch(tmp_path: Path) -> Path:
     state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-3) for alpha in RESTITUTIONS])
     assert jax.device_count() == 1
-    _save(tmp_path / "start.npz", (flow, state, np.asarray(STEPS, np.int32)))
-    end, tally = advance_batch(flow, state, jnp.asarray(STEPS, jnp.int32))
+    numerics = for_replicas(Numerics(), len(STEPS))
+    _save(tmp_path / "start.npz", (flow, numerics, state, np.asarray(STEPS, np.int32)))
+    end, tally = advance_batch(flow, numerics, state, jnp.asarray(STEPS, jnp.int32))
     assert np.all(np.asarray(tally.collisions)[np.asarray(STEPS) > 0] > 0)
     _save(tmp_path / "one device.npz", (end, tally))
     return tmp_path

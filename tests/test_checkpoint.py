@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from synthetic import one_sentence, random_replica
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
+from jaxgran.dynamics.engine import Jax
 from jaxgran.io.atomic import write_arrays
 from jaxgran.maps import checkpoint
 from jaxgran.maps.checkpoint import Checkpoint
@@ -21,6 +23,7 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 
+LOOSE = BarzilaiBorwein(tolerance=1e-3)
 SETTINGS = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0)
 
 
@@ -81,7 +84,7 @@ def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"tolerance": 1e-3}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}, {"engine": "jax"}]
+    "change", [{"solver": LOOSE}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}, {"engine": Jax()}]
 )
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
@@ -118,7 +121,7 @@ def test_damaged_parameters_are_known_from_the_names_of_the_batches(output: Path
     file = output.with_name("map.nc.unfinished") / "map.nc"
     file.write_bytes(b"half")
     with pytest.raises(InputError, match="damaged: remove the folder") as refused:
-        Checkpoint(output, replace(SETTINGS, tolerance=1e-3), resume=True)
+        Checkpoint(output, replace(SETTINGS, solver=LOOSE), resume=True)
     assert one_sentence(str(refused.value))
     for damaged in (["map.nc"], []):
         resumed = Checkpoint(output, SETTINGS, resume=True)
@@ -130,7 +133,7 @@ def test_damaged_parameters_are_known_from_the_names_of_the_batches(output: Path
 def test_what_a_finished_map_has_left_is_no_part_of_the_next_one(output: Path) -> None:
     cut_off(output)
     (output.with_name("map.nc.unfinished") / "map.nc").unlink()  # killed while it removed its folder
-    other = replace(SETTINGS, tolerance=1e-3)
+    other = replace(SETTINGS, solver=LOOSE)
     first = Checkpoint(output, other, resume=False)
     assert first.done == {}
     first.add(batches()[0])
@@ -145,7 +148,7 @@ def test_batches_of_another_map_are_never_taken_for_those_of_this_one(output: Pa
     folder = output.with_name("map.nc.unfinished")
     done = {path.name: path.read_bytes() for path in folder.glob("done-*.nc")}
     shutil.rmtree(folder)
-    other = Checkpoint(output, replace(SETTINGS, tolerance=1e-3), resume=False)
+    other = Checkpoint(output, replace(SETTINGS, solver=LOOSE), resume=False)
     assert other.journal_path([(0, 0)]) != Checkpoint(output.with_name("b.nc"), SETTINGS, False).journal_path([(0, 0)])
     for name, content in done.items():
         (folder / name).write_bytes(content)

@@ -42,6 +42,7 @@ from jaxgran.cli import app
 from jaxgran.cli import map as map_module
 from jaxgran.cli.arguments import number_list
 from jaxgran.cli.tables import print_table
+from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
@@ -750,7 +751,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     words = ("--seeds", "2", "--seed", "7", "--tolerance", "1e-6", "--solver", "jacobi", "--activation", "touching")
     assert jaxgran(tmp_path, *flow, *words).status == 0
     (one,) = asked
-    assert (one.seeds, one.first_seed, one.tolerance, one.solver, one.activation) == (2, 7, 1e-6, "jacobi", "touching")
+    assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
     outcome = jaxgran(tmp_path, *flow, "--seeds", "2", "--movie", "flow.gif")
     assert_one_sentence(outcome)
     assert "leave out --seeds" in outcome.err

@@ -1,20 +1,18 @@
-"""The advance over many steps: exact flight, the same trajectory by every route, statuses, batches."""
+"""The advance over many steps: exact flight, the same trajectory by every route, statuses, batch_advance."""
 
 from dataclasses import replace
-from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
-from jax.extend.core import jaxprs_in_params
+from flows import EXACT, GRAINS, OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
 from oracles import gaps_of
-from shared_flows import GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi
 from jaxgran.dynamics import collision
 from jaxgran.dynamics.collision import contact_capacities, contacts_now
-from jaxgran.dynamics.jax_engine import advance
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.model.cell import displacement, remap_tilt
 from jaxgran.model.status import Status
 
@@ -58,7 +56,7 @@ def test_jacobi_gives_the_same_trajectory(run, flowing):
     flow, state = flow_of(0.75), flowing(0.75)
     one, tally = run(flow, state, 100)
     assert tally.status == Status.ok and tally.solves > 5
-    two, other = run(replace(flow, solver="jacobi"), state, 100)
+    two, other = run(flow, state, 100, solver=Jacobi(EXACT.tolerance, EXACT.max_steps))
     assert_same_state(one, two, 1e-8)
     assert_same_tally(tally, other, 1e-8, but=("loaded_contacts",))
 
@@ -82,7 +80,7 @@ def test_no_steps_change_nothing(engine, engine_run, flowing):
 
 def test_change_of_a_number_compiles_nothing():
     traces = []
-    function = jax.jit(lambda flow: traces.append(flow) or flow.timestep)
+    function = jax.jit(lambda flow, solver: traces.append(flow) or flow.timestep)
     for change in (
         {},
         {"restitution": 0.9},
@@ -90,11 +88,11 @@ def test_change_of_a_number_compiles_nothing():
         {"packing_fraction": 0.59},
         {"timestep": 1e-5},
         {"shear_rate": 2.0},
-        {"tolerance": 1e-3},
-        {"max_iterations": 7},
         {"polydispersity": 0.1},
     ):
-        function(flow_of(**change))
+        function(flow_of(**change), EXACT)
+    for solver in (BarzilaiBorwein(tolerance=1e-3), BarzilaiBorwein(max_steps=7)):
+        function(flow_of(), solver)
     assert len(traces) == 1
 
 
@@ -123,7 +121,7 @@ def test_deep_overlap_is_reported(engine_run, scene):
 
 
 def test_cap_of_iterations_is_reported(engine_run, flowing):
-    state, tally = engine_run(flow_of(0.75, restitution=0.1, max_iterations=1), flowing(0.75), 100)
+    state, tally = engine_run(flow_of(0.75, restitution=0.1), flowing(0.75), 100, BarzilaiBorwein(1e-12, 1))
     assert tally.status == Status.iteration_limit
     assert 0 < tally.unconverged <= tally.solves
     assert np.all(np.isfinite(state.velocities))
@@ -139,7 +137,7 @@ def test_pairs_that_the_lists_cannot_hold_are_reported(engine_run, flowing):
     state = flowing(0.6)
     heap = replace(state, positions=2 + 0.1 * state.positions)
     assert np.sum(gaps_of(heap.positions, heap.grains.radii, heap.side, heap.tilt) < 0) > 4 * GRAINS
-    _, tally = engine_run(flow_of(max_iterations=100), heap, 3)
+    _, tally = engine_run(flow_of(), heap, 3, BarzilaiBorwein(1e-12, 100))
     assert tally.status == Status.capacity
 
 
@@ -147,7 +145,7 @@ def test_contacts_that_a_buffer_cannot_hold_are_reported(flowing, monkeypatch):
     """A ladder of buffers that ends too early drops contacts, and says so."""
     state, flow = flowing(0.82), flow_of(0.82, restitution=0.1)  # compiled before the ladder is cut
     monkeypatch.setattr(collision, "contact_capacities", lambda grains: (2,))
-    _, tally = jax.jit(lambda flow, state: advance(flow, state, jnp.int32(200)))(flow, state)
+    _, tally = jax.jit(lambda flow, state: advance_by_jax(flow, EXACT, state, jnp.int32(200)))(flow, state)
     assert tally.status == Status.capacity
 
 
@@ -180,8 +178,8 @@ def replica(tree, index: int):
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-# One after the other, replicas do not meet; the quick tests of the numba engine state that they are single runs
-ways = pytest.mark.parametrize("way", ["vmap"])
+def exact_advance(flow, state, steps):
+    return advance_by_jax(flow, EXACT, state, steps)
 
 
 @pytest.fixture(scope="module")
@@ -194,29 +192,26 @@ def few_buffers():
 
 @pytest.fixture(scope="module")
 def traced_batch(replicas, few_buffers):
-    batch = jax.vmap(advance, in_axes=(0, 0, None), axis_name="replica")
+    batch = jax.vmap(exact_advance, in_axes=(0, 0, None), axis_name="replica")
     return jax.jit(batch).trace(*replicas, jnp.int32(0))
 
 
 @pytest.fixture(scope="module")
-def batches(traced_batch):
-    """The two ways to advance a batch: all replicas at once, and one after the other."""
+def batch_advance(traced_batch):
+    """The advance of all replicas at once; one after the other, they do not meet."""
     # Sums of loops by the older emitter depend on what else is in an array; users have the newer one.
-    together = traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})
-    in_turn = jax.jit(lambda flows, states, steps: jax.lax.map(lambda each: advance(*each, steps), (flows, states)))
-    return {"vmap": together, "map": in_turn}
+    return traced_batch.lower().compile({"xla_cpu_use_fusion_emitters": True})
 
 
 @pytest.fixture(scope="module")
-def healthy(replicas, batches):
-    """``healthy(way)``: states and tallies of the replicas after 200 steps."""
-    return cache(lambda way: batches[way](*replicas, jnp.int32(200)))
+def healthy(replicas, batch_advance):
+    """States and tallies of the replicas after 200 steps."""
+    return batch_advance(*replicas, jnp.int32(200))
 
 
-@ways
-def test_batch_advances_as_single_runs_do(run, replicas, batches, way):
+def test_batch_advances_as_single_runs_do(run, replicas, batch_advance):
     flows, states = replicas
-    after, tallies = batches[way](flows, states, jnp.int32(100))
+    after, tallies = batch_advance(flows, states, jnp.int32(100))
     for index in range(3):
         flow = jax.tree.map(lambda leaf, index=index: leaf[index].item(), flows)
         single, tally = run(flow, replica(states, index), 100)
@@ -225,22 +220,20 @@ def test_batch_advances_as_single_runs_do(run, replicas, batches, way):
         assert_same_tally(replica(tallies, index), tally, 1e-10)
 
 
-@ways
-def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batches, healthy, way):
+def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batch_advance, healthy):
     others = stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
-    changed = batches[way](replicas[0], others, jnp.int32(200))
-    assert_identical(replica(healthy(way), 0), replica(changed, 0))
+    changed = batch_advance(replicas[0], others, jnp.int32(200))
+    assert_identical(replica(healthy, 0), replica(changed, 0))
 
 
-@ways
 @pytest.mark.parametrize("field", ["positions", "velocities"])
-def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batches, healthy, field, way):
+def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batch_advance, healthy, field):
     flows, states = replicas
     spoilt = replace(states, **{field: getattr(states, field).at[1, 0, 0].set(jnp.nan)})
-    result = batches[way](flows, spoilt, jnp.int32(200))
+    result = batch_advance(flows, spoilt, jnp.int32(200))
     np.testing.assert_array_equal(result[1].status, [Status.ok, Status.nonfinite, Status.ok])
     for index in (0, 2):
-        assert_identical(replica(result, index), replica(healthy(way), index))
+        assert_identical(replica(result, index), replica(healthy, index))
 
 
 def equations_of(jaxpr) -> list:
@@ -251,7 +244,7 @@ def equations_of(jaxpr) -> list:
 
 def test_control_flow_of_a_batch_stays_control_flow(traced_batch, flowing):
     """A branch or loop on a predicate that differs between replicas would pay for all branches, for all replicas."""
-    single = jax.make_jaxpr(advance)(flow_of(), flowing(0.6), jnp.int32(0))
+    single = jax.make_jaxpr(exact_advance)(flow_of(), flowing(0.6), jnp.int32(0))
     batch, alone = equations_of(traced_batch.jaxpr.jaxpr), equations_of(single.jaxpr)
     for name in ("cond", "while"):
         found = [equation for equation in batch if equation.primitive.name == name]
@@ -266,7 +259,8 @@ def test_control_flow_of_a_batch_stays_control_flow(traced_batch, flowing):
 
 
 def test_single_precision_stays_single(flowing):
-    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(tolerance=1e-4), flowing(0.6)))
-    state, tally = jax.eval_shape(advance, replace(flow, max_iterations=jnp.int32(99)), state, jnp.int32(3))
+    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(), flowing(0.6)))
+    solver = BarzilaiBorwein(jnp.float32(1e-4), jnp.int32(99))
+    state, tally = jax.eval_shape(advance_by_jax, flow, solver, state, jnp.int32(3))
     numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert set(numbers) == {jnp.dtype("float32")}

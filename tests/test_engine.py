@@ -1,33 +1,35 @@
 """An engine has a name: it runs what it can, refuses in a sentence what it cannot, and stands in what it has made."""
 
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import xarray as xr
-from shared_flows import GRAINS
+from flows import GRAINS
 from synthetic import one_sentence
 
 import jaxgran as jg
-from jaxgran.dynamics import jax_engine
-from jaxgran.dynamics.engine import _warn_once, select_engine, solver_in_use
-from jaxgran.dynamics.tally import empty_tally
+from jaxgran.contact.projected_methods import solver_name
+from jaxgran.dynamics import advance
+from jaxgran.dynamics.engine import Numerics, _warn_once, select_engine, solver_in_use
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.results import choices_of, differences, read_dataset, write_dataset
+from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.sampling import batch
-from jaxgran.sampling.batch import stack
 
 STEPS = jnp.int32(100)
 SETTINGS = MapSettings((0.5, 0.9), (0.6,), grains=64, seeds=1, strain=2.0)
 
 
-def of(engine: str = "auto", **others) -> jg.ShearFlow:
-    return jg.ShearFlow(GRAINS, 0.5, 0.7, 1e-3, engine=engine, **others)
+def of(**others) -> jg.ShearFlow:
+    return jg.ShearFlow(GRAINS, 0.5, 0.7, 1e-3, **others)
+
+
+def selected(state=None, option="", **numerics) -> str:
+    return select_engine(of(), Numerics(**numerics), state, option).name
 
 
 def single(state: jg.State) -> jg.State:
@@ -50,14 +52,14 @@ def refusal(call) -> str:
 
 def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> None:
     state = flowing(0.7)
-    assert select_engine(of()) == select_engine(of(), state) == "numba"
-    assert select_engine(of(solver="nesterov"), state) == "jax"
-    assert select_engine(of(), single(state)) == "jax"
-    assert select_engine(of(), state, "events") == "jax"
+    assert selected() == selected(state) == selected(state, solver=jg.BarzilaiBorwein(1e-9, 7)) == "numba"
+    assert selected(state, solver=jg.Nesterov()) == "jax"
+    assert selected(single(state)) == "jax"
+    assert selected(state, "events") == "jax"
     found = []
     batch = jax.tree.map(lambda x: x[None], state)
-    jax.vmap(lambda one: found.append(select_engine(of(), one)), axis_name=AXIS)(batch)
-    jax.vmap(lambda one: found.append(select_engine(of(), one)))(batch)
+    jax.vmap(lambda one: found.append(selected(one)), axis_name=AXIS)(batch)
+    jax.vmap(lambda one: found.append(selected(one)))(batch)
     assert found == ["jax", "numba"]
 
 
@@ -70,74 +72,77 @@ def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
 def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None:
     _warn_once.cache_clear()
     state = single(flowing(0.7))
-    assert select_engine(of(), state) == "jax"  # in a session of double precision it was asked for
+    assert selected(state) == "jax"  # in a session of double precision it was asked for
     with jax.enable_x64(False):
-        assert select_engine(of("jax"), state) == select_engine(of(solver="jacobi"), state) == "jax"
+        assert selected(state, engine=jg.Jax()) == selected(state, solver=jg.Jacobi()) == "jax"
         with pytest.warns(match=r"^JAX computes in single precision.*jax_enable_x64"):
-            assert select_engine(of(), state) == "jax"
-        assert select_engine(of(), state) == "jax"
+            assert selected(state) == "jax"
+        assert selected(state) == "jax"
 
 
 def test_jax_takes_whatever_it_is_asked_for(flowing) -> None:
     for state in (flowing(0.7), single(flowing(0.7))):
-        for solver in ("barzilai-borwein", "jacobi"):
-            assert select_engine(of("jax", solver=solver), state, "events") == "jax"
+        for solver in (jg.BarzilaiBorwein(), jg.Jacobi()):
+            assert selected(state, "events", solver=solver, engine=jg.Jax()) == "jax"
 
 
 IMPOSSIBLE = {
     "thread block on a processor": (
-        lambda state: jg.advance(of("pallas"), state, STEPS),
+        lambda state: jg.advance(of(), state, STEPS, engine=jg.Pallas()),
         "on a CPU, not pallas: it is made for NVIDIA GPUs",
     ),
     "another solver": (
-        lambda state: jg.advance(of("numba", solver="jacobi"), state, STEPS),
+        lambda state: jg.advance(of(), state, STEPS, engine=jg.Numba(), solver=jg.Jacobi()),
         "with the solver jacobi, not numba",
     ),
     "single precision": (
-        lambda state: jg.advance(of("numba"), single(state), STEPS),
+        lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
         "in float32, not numba: it computes in float64",
     ),
     "a named axis": (
-        lambda state: jax.vmap(lambda one: jg.advance(of("numba"), one, STEPS), axis_name=AXIS)(
+        lambda state: jax.vmap(lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba()), axis_name=AXIS)(
             jax.tree.map(lambda x: x[None], state)
         ),
         "in a vmap with the axis name 'replica', not numba",
     ),
     "every step": (
-        lambda state: jg.advance(of("numba"), state, STEPS, free_flight=False),
+        lambda state: jg.advance(of(), state, STEPS, free_flight=False, engine=jg.Numba()),
         "with free_flight=False, not numba",
     ),
     "moving contacts": (
-        lambda state: jg.advance(of("numba"), state, STEPS, moving_contacts=True),
+        lambda state: jg.advance(of(), state, STEPS, moving_contacts=True, engine=jg.Numba()),
         "with moving_contacts, not numba",
     ),
     "derivatives in reverse mode": (
         lambda state: jax.grad(
             lambda alpha: jnp.sum(
-                jg.advance(replace(of("numba"), restitution=alpha), state, STEPS, events=50)[0].velocities ** 2
+                jg.advance(replace(of(), restitution=alpha), state, STEPS, events=50, engine=jg.Numba())[0].velocities
+                ** 2
             )
         )(0.5),
         "with events, not numba: only the engine jax does that",
     ),
     "an observable": (
-        lambda state: jg.sample(of("numba", solver="jacobi"), state, 0.1, observe=lambda seen: seen.state.side),
+        lambda state: jg.sample(
+            of(), state, 0.1, observe=lambda seen: seen.state.side, engine=jg.Numba(), solver=jg.Jacobi()
+        ),
         "with the solver jacobi, not numba",
     ),
     "an observable, block by block": (
         lambda state: jg.sample(
-            of("pallas"), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False
+            of(), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False, engine=jg.Pallas()
         ),
         "on a CPU, not pallas",
     ),
-    "a sample": (lambda state: jg.sample(of("pallas"), state, 0.1), "on a CPU, not pallas"),
-    "a preparation": (lambda _: jg.prepare(of("pallas"), jax.random.key(0)), "on a CPU, not pallas"),
-    "snapshots": (lambda state: jg.snapshot_series(of("pallas"), state, 0.1, 2), "on a CPU, not pallas"),
+    "a sample": (lambda state: jg.sample(of(), state, 0.1, engine=jg.Pallas()), "on a CPU, not pallas"),
+    "a preparation": (lambda _: jg.prepare(of(), jax.random.key(0), engine=jg.Pallas()), "on a CPU, not pallas"),
+    "snapshots": (lambda state: jg.snapshot_series(of(), state, 0.1, 2, engine=jg.Pallas()), "on a CPU, not pallas"),
     "free cooling": (
-        lambda state: jg.cooling(of("pallas", shear_rate=0.0), state, [0.1]),
+        lambda state: jg.cooling(of(shear_rate=0.0), state, [0.1], engine=jg.Pallas()),
         "on a CPU, not pallas",
     ),
     "a map": (
-        lambda _: jg.ratio_map([0.5], [0.6], engine="numba", solver="nesterov"),
+        lambda _: jg.ratio_map([0.5], [0.6], engine=jg.Numba(), solver=jg.Nesterov()),
         "with the solver nesterov, not numba",
     ),
 }
@@ -147,33 +152,30 @@ IMPOSSIBLE = {
 def test_an_engine_that_cannot_do_what_is_asked_says_so(case: str, flowing) -> None:
     call, words = IMPOSSIBLE[case]
     sentence = refusal(lambda: call(flowing(0.7)))
-    assert sentence.startswith(f"engine must be auto or jax {words}")
+    assert sentence.startswith(f"engine must be jax or chosen automatically {words}")
 
 
 # What runs
 
 
 def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
-    state, advance = flowing(0.7), jax.jit(jg.advance)
-    assert_same_bits(advance(of("numba"), state, STEPS), advance(of(), state, STEPS))
+    state, (numba, auto) = flowing(0.7), (jax.jit(partial(jg.advance, engine=one)) for one in (jg.Numba(), None))
+    assert_same_bits(numba(of(), state, STEPS), auto(of(), state, STEPS))
 
 
 def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
-    monkeypatch.setattr(jax_engine, "advance", lambda *arguments: arguments)
-    for flow in (of("jax"), of(solver="jacobi"), of("jax", solver="jacobi")):
-        assert jg.advance(flow, flowing(0.7), STEPS) == (flow, flowing(0.7), STEPS, True, None, False)
+    monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments: arguments)
+    for numerics in ({"engine": jg.Jax()}, {"solver": jg.Jacobi()}, {"engine": jg.Jax(), "solver": jg.Jacobi()}):
+        solver = numerics.get("solver", jg.BarzilaiBorwein())
+        arguments = jg.advance(of(), flowing(0.7), STEPS, **numerics)
+        assert arguments == (of(), solver, flowing(0.7), STEPS, True, None, False)
 
 
 def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) -> None:
-    states = jax.tree.map(lambda x: jnp.stack([x, x]), flowing(0.7))
-
-    def lockstep(flow, state, steps):
-        tally = empty_tally(state.side.dtype)
-        return state, replace(tally, steps=jnp.full_like(tally.steps, in_batch()))
-
-    for engine, together in {"auto": False, "numba": False, "jax": True}.items():
-        _, tally = batch.batch_program(lockstep)(stack([of(engine)] * 2), states, jnp.ones(2, jnp.int32))
-        np.testing.assert_array_equal(tally.steps, together)
+    program = batch.batch_program(lambda x: jnp.full_like(x, in_batch()))
+    for engine, together in ((None, False), (jg.Numba(), False), (jg.Jax(), True)):
+        found = program(jnp.ones(2), lockstep=batch.in_lockstep(engine))
+        np.testing.assert_array_equal(found, together)
 
 
 # What stands in a dataset
@@ -183,24 +185,26 @@ def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) ->
     ("asked", "engine", "solver"),
     [
         ({}, "numba", "gauss-seidel, barzilai-borwein where stiff"),
-        ({"engine": "numba"}, "numba", "gauss-seidel, barzilai-borwein where stiff"),
-        ({"engine": "jax"}, "jax", "barzilai-borwein"),
-        ({"solver": "nesterov"}, "jax", "nesterov"),
-        ({"engine": "jax", "solver": "jacobi"}, "jax", "jacobi"),
+        ({"engine": jg.Numba()}, "numba", "gauss-seidel, barzilai-borwein where stiff"),
+        ({"engine": jg.Jax()}, "jax", "barzilai-borwein"),
+        ({"solver": jg.Nesterov(tolerance=1e-6)}, "jax", "nesterov"),
+        ({"engine": jg.Jax(), "solver": jg.Jacobi(relaxation=1.5)}, "jax", "jacobi"),
     ],
 )
 def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: str, solver: str) -> None:
     settings = replace(SETTINGS, **asked)
     data = map_dataset(settings, {}, {})
     assert (data.attrs["engine"], data.attrs["solver"]) == (engine, solver)
-    assert (data.attrs["engine_requested"], data.attrs["solver_requested"]) == (settings.engine, settings.solver)
+    requested = "auto" if settings.engine is None else settings.engine.name, solver_name(settings.solver)
+    assert (data.attrs["engine_requested"], data.attrs["solver_requested"]) == requested
+    assert (data.attrs["tolerance"], data.attrs["max_steps"]) == (settings.solver.tolerance, 5000)
     assert MapSettings(**choices_of(data)) == settings
 
 
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
-        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine="numba"))
+        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine=jg.Numba()))
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
         "float32",
         "jax",
@@ -209,15 +213,4 @@ def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
 
 
 def test_the_thread_block_solves_by_its_own_method() -> None:
-    assert solver_in_use("pallas", "barzilai-borwein") == "barzilai-borwein"
-
-
-def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path: Path) -> None:
-    settings = replace(SETTINGS, solver="nesterov")
-    data = map_dataset(settings, {}, {})
-    old = {name: x for name, x in data.attrs.items() if "_asked" not in name and name != "engine"}
-    few = data[["force_ratio", "force_ratio_stderr", "status"]]
-    write_dataset(xr.Dataset(few.data_vars, few.coords, old | {"solver": "nesterov"}), tmp_path / "old.nc")
-    again = read_dataset(tmp_path / "old.nc")
-    assert MapSettings(**choices_of(again)) == settings
-    assert differences(again) == []
+    assert solver_in_use(jg.Pallas(), jg.BarzilaiBorwein()) == "barzilai-borwein"

@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import EXACT, GRAINS
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from scipy.integrate import quad
-from shared_flows import GRAINS
 
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
 from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
 from jaxgran.model.checks import InputError
@@ -27,9 +28,9 @@ from jaxgran.sampling.observables import averages
 
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
 SMOOTH = {"gaussian": gaussian(0.25), "lucy": lucy(1.9)}  # e^-39 of the Gaussian is beyond half the side
-FLOW = ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-12, max_iterations=100_000)
+FLOW = ShearFlow(GRAINS, 0.3, 0.78, 1e-3)
 
-one_snapshot = jax.jit(snapshot)
+one_snapshot = jax.jit(partial(snapshot, solver=EXACT))
 every_kernel = pytest.mark.parametrize("name", KERNELS)
 smooth_kernels = pytest.mark.parametrize("name", SMOOTH)
 
@@ -307,7 +308,7 @@ def assert_same(one: Fields, other: Fields, tolerance: float) -> None:
 def test_two_discs_that_collide_have_known_fields(scene) -> None:
     """Head on along x at ±1 and drifting at (3, 2): between them, at the centre of mass."""
     state = scene([[8.5, 8.0], [7.5, 8.0]], [[2.0, 2.0], [4.0, 2.0]])
-    flow = ShearFlow(GRAINS, 0.5, 0.02, 1e-3, tolerance=1e-12)
+    flow = ShearFlow(GRAINS, 0.5, 0.02, 1e-3)
     seen, width = one_snapshot(flow, state), 0.3
     fields = fields_at(seen, jnp.full((40, 2), 8.0), gaussian(width))
     g = np.exp(-(0.5**2) / (2 * width**2)) / (2 * np.pi * width**2)
@@ -363,14 +364,14 @@ def test_momentum_through_a_plane_is_that_through_its_image(seen) -> None:
 @pytest.fixture(scope="module")
 def planes_in_time(flowing, run):
     """Flux through eight planes at every step, and y-momentum above each plane, beside blocks of ``advance``."""
-    flow, blocks, steps = replace(FLOW, tolerance=1e-8), 10, 300
+    flow, solver, blocks, steps = FLOW, BarzilaiBorwein(1e-8), 10, 300
     state = flowing(0.78)
     heights = (jnp.arange(8.0) + 0.5) / 8 * state.side
 
     @jax.jit
     def block(flow, state):
         def step(now, _):
-            seen = snapshot(flow, now)
+            seen = snapshot(flow, now, solver)
             above = (now.positions[:, 1][:, None] >= heights[None, :]).astype(heights.dtype)
             held = (now.grains.masses * now.velocities[:, 1]) @ above
             return flown(collided(seen), flow.shear_rate, flow.timestep), (plane_flux(seen, heights), held)
@@ -379,7 +380,7 @@ def planes_in_time(flowing, run):
 
     flux, held, stress = [], [], []
     for _ in range(blocks):
-        _, tally = run(flow, state, steps)
+        _, tally = run(flow, state, steps, solver=solver)
         state, (through, inside) = block(flow, state)
         found = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, GRAINS, 1.0)
         flux.append(through)

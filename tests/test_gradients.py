@@ -7,18 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import EXACT, GRAINS
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 from jax import lax
 from oracles import MAX_DISCS, delassus, padded_network, random_network
-from shared_flows import GRAINS
 
 from jaxgran.analysis.sensitivity import margins
 from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics import collision as collision_module
-from jaxgran.dynamics.jax_engine import advance, count_events
+from jaxgran.dynamics.jax_engine import advance_by_jax, count_events
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
@@ -41,8 +42,7 @@ def impulses_of(approach, angles, inverse_masses, network: Contacts):
         inverse_mass_i=jnp.where(network.used, inverse_masses[network.i], 0),
         inverse_mass_j=jnp.where(network.used, inverse_masses[network.j], 0),
     )
-    numbers = (jnp.asarray(1.0), jnp.asarray(1e-13), jnp.asarray(100_000), jnp.asarray(1.8))
-    return solve(turned, MAX_DISCS, *numbers, "barzilai-borwein", jnp.asarray(True)).impulses
+    return solve(turned, MAX_DISCS, jnp.asarray(1.0), BarzilaiBorwein(1e-12, 100_000), jnp.asarray(True)).impulses
 
 
 @jax.jit
@@ -131,8 +131,8 @@ def test_velocities_are_differentiable_where_impulses_are_not_unique():
     def after(velocities):
         approach = jnp.sum(empty.normals * (velocities[empty.i] - velocities[empty.j]), axis=-1)
         network = replace(empty, approach=jnp.where(empty.used, approach, 0))
-        numbers = (jnp.asarray(1.0), jnp.asarray(1e-13), jnp.asarray(1_000_000), jnp.asarray(1.8))
-        impulses = solve(network, MAX_DISCS, *numbers, "nesterov", jnp.asarray(True)).impulses
+        solver = Nesterov(1e-12, 1_000_000)
+        impulses = solve(network, MAX_DISCS, jnp.asarray(1.0), solver, jnp.asarray(True)).impulses
         return velocities + grain_impulses(network, impulses, MAX_DISCS)
 
     inwards = np.zeros((MAX_DISCS, 2))
@@ -155,11 +155,11 @@ def parameters(flow: ShearFlow, state: State) -> dict:
     return numbers | own | {"positions": state.positions, "velocities": state.velocities}
 
 
-def differentiable(*arguments):
+def differentiable(flow, *arguments):
     """The advance with one size of the contact buffer in place of five: each is compiled with its derivatives."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(collision_module, "contact_capacities", lambda grains: (3 * grains,))
-        return advance(*arguments)
+        return advance_by_jax(flow, EXACT, *arguments)
 
 
 def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
@@ -172,7 +172,7 @@ def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, Sta
 @pytest.fixture(scope="module")
 def tilting(flowing, run) -> tuple[ShearFlow, State]:
     """A flow whose tilt is about to be remapped, in which outer lists are built anew."""
-    flow = ShearFlow(GRAINS, 0.6, 0.7, 5e-3, tolerance=1e-12, max_iterations=100_000)
+    flow = ShearFlow(GRAINS, 0.6, 0.7, 5e-3)
     state = replace(flowing(0.7), tilt=jnp.asarray(0.45))
     end, tally = run(flow, state, STEPS)
     assert end.tilt < 0 and tally.collisions > 20
@@ -182,7 +182,7 @@ def tilting(flowing, run) -> tuple[ShearFlow, State]:
 @pytest.fixture(scope="module")
 def events_of(tilting):
     """``events_of(steps)``: how many events that many steps of the flow have."""
-    compiled = jax.jit(count_events)
+    compiled = jax.jit(partial(count_events, solver=EXACT))
     return lambda steps: int(compiled(*tilting, jnp.int32(steps)))
 
 
@@ -272,7 +272,7 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     """Where the left of two equal discs, the other at rest, is a time after it hits: head on, at rest in the shear."""
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
-    flow = ShearFlow(GRAINS, 0.5, 0.02, dt, tolerance=1e-12)
+    flow = ShearFlow(GRAINS, 0.5, 0.02, dt)
     end, _ = differentiable(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]
 
@@ -299,14 +299,14 @@ def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
     both sides differ, and the one returned is one of them.
     """
     touching = scene([[3.0, 4.0], [4.0, 4.0], [4.0, 3.0]], [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    flow = ShearFlow(GRAINS, 0.0, 0.02, 1e-6, tolerance=1e-12)
+    flow = ShearFlow(GRAINS, 0.0, 0.02, 1e-6)
 
     @jax.jit
     def pushed(slant):
         """Velocity of the third disc along y, where the first one comes at a slant."""
         turn = jnp.stack([jnp.cos(slant), -jnp.sin(slant)])
         state = replace(touching, positions=touching.positions.at[0].set(touching.positions[1] - turn))
-        return advance(flow, state, jnp.int32(2))[0].velocities[2, 1]
+        return advance_by_jax(flow, EXACT, state, jnp.int32(2))[0].velocities[2, 1]
 
     at, step = jnp.asarray(0.0), 1e-4
     returned = jax.jit(jax.jacfwd(pushed))(at)
@@ -316,7 +316,7 @@ def test_a_point_without_a_derivative_is_reported_and_not_averaged_over(scene):
 
     def nearest(third) -> float:
         state = replace(touching, positions=touching.positions.at[2].set(jnp.asarray(third)))
-        series = jax.tree.map(lambda x: x[None], snapshot(flow, state))
+        series = jax.tree.map(lambda x: x[None], snapshot(flow, state, EXACT))
         return float(margins(flow.activation_fraction, series).pressing[0])
 
     angle = np.pi / 3

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shared_flows import GRAINS
+from flows import GRAINS
 
 from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.model.flow import ShearFlow

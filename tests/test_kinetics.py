@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from flows import GRAINS
 from scipy.special import ndtr
-from shared_flows import GRAINS
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
 from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_contact, velocity_distribution

@@ -13,14 +13,15 @@ import jax.numpy as jnp
 import numba
 import numpy as np
 import pytest
+from flows import EXACT, GRAINS
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
-from shared_flows import GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics import collision, jax_engine
+from jaxgran.dynamics import collision
 from jaxgran.dynamics import engine as engine_module
-from jaxgran.dynamics.engine import MOST_GRAINS, select_engine
+from jaxgran.dynamics.engine import MOST_GRAINS, Jax, Numba, Numerics, Pallas, select_engine
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, find_near_pairs, skin_loss
@@ -33,6 +34,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
+LOOSE = BarzilaiBorwein(1e-6, 10**6)
 COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
@@ -41,10 +43,8 @@ def native_run(request, engines):
     return engines[request.param]
 
 
-def of(packing_fraction, restitution=0.5, timestep=1e-3, tolerance=1e-12, **others) -> ShearFlow:
-    return ShearFlow(
-        GRAINS, restitution, packing_fraction, timestep, tolerance=tolerance, max_iterations=10**6, **others
-    )
+def of(packing_fraction, restitution=0.5, timestep=1e-3, **others) -> ShearFlow:
+    return ShearFlow(GRAINS, restitution, packing_fraction, timestep, **others)
 
 
 def assert_same(ours, plain, side: float, atol: float) -> None:
@@ -55,8 +55,8 @@ def assert_same(ours, plain, side: float, atol: float) -> None:
     apart -= np.stack([rows * float(expected.tilt) * side, rows * side], axis=-1)
     apart[:, 0] -= np.round(apart[:, 0] / side) * side
     np.testing.assert_allclose(apart, 0, atol=atol)
-    turned = float(state.tilt - expected.tilt)
-    assert abs(turned - round(turned)) < 1e-9
+    strain = float(state.tilt - expected.tilt)
+    assert abs(strain - round(strain)) < 1e-9
     for name in COUNTS:
         assert getattr(tally, name) == getattr(sums, name), name
     for name, value in vars(tally).items():
@@ -117,8 +117,8 @@ def test_results_do_not_depend_on_the_order_of_the_grains(rows) -> None:
         jnp.asarray(1.5 * rows),
         jnp.asarray(0.0),
     )
-    flow = ShearFlow(count, 0.9, 0.4, 1e-3, tolerance=1e-12)
-    advance = jax.jit(advance_module.advance)
+    flow = ShearFlow(count, 0.9, 0.4, 1e-3)
+    advance = jax.jit(partial(advance_module.advance, solver=EXACT))
     shuffled = rng.permutation(count)
     after, tally = advance(flow, state, jnp.int32(100))
     other, sums = advance(flow, jax.tree.map(lambda x: x[shuffled] if x.ndim else x, state), jnp.int32(100))
@@ -134,7 +134,7 @@ def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
     velocities[:, 0] = -0.1 * np.sin(2 * np.pi * np.arange(GRAINS) / GRAINS)
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5 * (1 + 1e-3))), jnp.ones(GRAINS))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, GRAINS, 0.0)))
-    after, tally = native_run(replace(of(0.7, 0.0, shear_rate=0.0), tolerance=1e-6), state, 1)
+    after, tally = native_run(of(0.7, 0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6))
     assert tally.status == Status.ok and tally.loaded_contacts >= GRAINS / 2
     np.testing.assert_allclose(after.velocities, 0, atol=1e-5)
 
@@ -149,8 +149,8 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     masses = np.where(np.arange(GRAINS) % 2, heaviest, 1.0)
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.asarray(masses))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 60.0, 0.0)))
-    flow = of(0.01, 0.0, tolerance=1e-9, shear_rate=0.0)
-    ours, plain = native_run(flow, state, 1), run(flow, state, 1)
+    flow, solver = of(0.01, 0.0, shear_rate=0.0), BarzilaiBorwein(1e-9, 10**6)
+    ours, plain = native_run(flow, state, 1, solver), run(flow, state, 1, solver=solver)
     assert ours[1].status == plain[1].status == Status.ok
     assert ours[1].iterations > cluster_solver.SWEEPS
     np.testing.assert_allclose(ours[0].velocities, plain[0].velocities, atol=1e-7)
@@ -168,7 +168,12 @@ def gpu(monkeypatch, engines):
     device = Device()
     monkeypatch.setattr(jax, "devices", lambda *_: [device])
     monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
-    monkeypatch.setattr(kernel, "advance", engines["pallas"])
+    interpreted = engines["pallas"]
+
+    def advance_by_pallas(flow, solver, state, steps):
+        return interpreted(flow, state, steps, solver)
+
+    monkeypatch.setattr(kernel, "advance_by_pallas", advance_by_pallas)
     monkeypatch.setattr(kernel, "jax", SimpleNamespace(jit=lambda compiled: compiled))
     yield monkeypatch
     _forget()
@@ -181,27 +186,29 @@ def _forget() -> None:
 
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
-    flow, state = of(0.6, tolerance=1e-4), flowing(0.6)
-    assert select_engine(flow, state) == select_engine(replace(flow, engine="pallas"), state) == "pallas"
-    refused = {"the solver nesterov": {"solver": "nesterov"}, "more than 1024 grains": {"grains": MOST_GRAINS + 1}}
-    for words, change in refused.items():
-        assert select_engine(replace(flow, **change), state) == "jax"
-        with pytest.raises(InputError, match=f"engine must be auto or jax with {words}, not pallas: "):
-            select_engine(replace(flow, engine="pallas", **change), state)
-    with pytest.raises(InputError, match="engine must be auto or jax on a GPU, not numba: it is made for proc"):
-        select_engine(replace(flow, engine="numba"), state)
+    flow, state = of(0.6), flowing(0.6)
+    for requested in (None, Pallas()):
+        assert select_engine(flow, Numerics(engine=requested), state) == Pallas()
+    large = replace(flow, grains=MOST_GRAINS + 1)
+    refused = {"the solver nesterov": (flow, Nesterov()), "more than 1024 grains": (large, BarzilaiBorwein())}
+    for words, (other, solver) in refused.items():
+        assert select_engine(other, Numerics(solver), state) == Jax()
+        with pytest.raises(InputError, match=f"engine must be jax or chosen automatically with {words}, not pallas: "):
+            select_engine(other, Numerics(solver, Pallas()), state)
+    with pytest.raises(InputError, match="automatically on a GPU, not numba: it is made for proc"):
+        select_engine(flow, Numerics(engine=Numba()), state)
 
 
 def broken(*_):
     raise RuntimeError("no such\ninstruction")
 
 
-def unsolved(advance, flow, state, steps):
-    return advance(replace(flow, max_iterations=1), state, steps)
+def unsolved(advance, flow, solver, state, steps):
+    return advance(flow, replace(solver, max_steps=1), state, steps)
 
 
-def late(advance, flow, state, steps):
-    return advance(replace(flow, timestep=0.1), state, steps)
+def late(advance, flow, solver, state, steps):
+    return advance(replace(flow, timestep=0.1), solver, state, steps)
 
 
 @pytest.mark.parametrize(
@@ -213,13 +220,13 @@ def late(advance, flow, state, steps):
     ],
 )
 def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, failure, said) -> None:
-    gpu.setattr(kernel, "advance", partial(failure, kernel.advance))
+    gpu.setattr(kernel, "advance_by_pallas", partial(failure, kernel.advance_by_pallas))
     flow, state = of(0.6), flowing(0.6)
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
-        assert select_engine(flow, state) == "jax"
-    assert select_engine(flow, state) == "jax"  # and says so once
-    with pytest.raises(InputError, match=f"engine must be auto or jax here, not pallas: .*{said}"):
-        select_engine(replace(flow, engine="pallas"), state)
+        assert select_engine(flow, Numerics(), state) == Jax()
+    assert select_engine(flow, Numerics(), state) == Jax()  # and says so once
+    with pytest.raises(InputError, match=f"automatically here, not pallas: .*{said}"):
+        select_engine(flow, Numerics(engine=Pallas()), state)
 
 
 def without_a_gpu() -> AbstractContextManager:
@@ -240,8 +247,12 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
         return jax.ShapeDtypeStruct((replicas, *shape), dtype)
 
     state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
-    way = advance_module.pallas if count == 16 else kernel.advance  # the former is traced with the plain advance
-    advance = jax.vmap(partial(way, ShearFlow(count, 0.5, 0.6, 1e-3)), (0, None), axis_name=AXIS)
+    way = (
+        advance_module.advance_by_pallas if count == 16 else kernel.advance_by_pallas
+    )  # the former is traced with the plain advance
+    advance = jax.vmap(
+        partial(way.advance_by_pallas, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS
+    )
     with without_a_gpu():
         traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
         text = traced.lower(lowering_platforms=("cuda",)).as_text()
@@ -256,18 +267,18 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
 @pytest.fixture(scope="module")
 def grid_run():
     """``grid_run(flow, states, steps)``: three replicas in a grid, in single precision."""
-    interpreted = jax.vmap(partial(kernel.advance, interpret=True), (None, 0, 0), axis_name=AXIS)
+    interpreted = jax.vmap(partial(kernel.advance_by_pallas, interpret=True), (None, None, 0, 0), axis_name=AXIS)
     advance = jax.jit(interpreted)
 
     def run(flow, states, steps):
         stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *states)
-        return jax.tree.map(np.asarray, advance(flow, stacked, np.asarray(steps, np.int32)))
+        return jax.tree.map(np.asarray, advance(flow, LOOSE, stacked, np.asarray(steps, np.int32)))
 
     return run
 
 
 def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing, grid_run) -> None:
-    flow, state = of(0.78, tolerance=1e-6), flowing(0.78)
+    flow, state = of(0.78), flowing(0.78)
     lost, steps = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan)), [40, 40, 0]
     after, tally = grid_run(flow, (state, lost, state), steps)
     assert tally.status.tolist() == [Status.ok, Status.nonfinite, Status.ok]
@@ -282,7 +293,7 @@ def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_r
     places = 1.05 * np.stack(np.divmod(np.arange(GRAINS), row), axis=-1) + 0.5
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.ones(GRAINS))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, rng.normal(size=places.shape), 1.05 * row, 0.0)))
-    assert native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3)[1].outcome == Status.deep_overlap
+    assert native_run(ShearFlow(GRAINS, 0.5, 0.7, 0.05), state, 3, BarzilaiBorwein())[1].outcome == Status.deep_overlap
 
 
 def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
@@ -299,9 +310,9 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
 
 
 def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run, engines) -> None:
-    flow, state = of(0.7, tolerance=1e-6), flowing(0.7)
+    flow, state = of(0.7), flowing(0.7)
     after, tally = jax.tree.map(lambda x: x[0], grid_run(flow, (state, state, state), [100, 0, 0]))
-    expected, sums = engines["pallas"](flow, state, 100)
+    expected, sums = engines["pallas"](flow, state, 100, LOOSE)
     assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
     np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
@@ -310,25 +321,25 @@ def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run,
 def test_transformations_apply(flowing) -> None:
     flow, states = of(0.6), [flowing(0.6, seed) for seed in (0, 1)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    one = jax.jit(lambda state: advance_module.advance(flow, state, jnp.int32(50)))
+    one = jax.jit(lambda state: advance_module.advance(flow, state, jnp.int32(50), solver=EXACT))
     for many in (jax.vmap(one), lambda batch: jax.lax.map(one, batch)):
         for k, found in enumerate(states):
             jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found))
 
 
-@pytest.mark.parametrize("engine", ["auto", "numba"])
+@pytest.mark.parametrize("engine", [None, Numba()])
 def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) -> None:
     state = flowing(0.6)
 
-    def plain(flow, state, steps):
+    def plain(flow, solver, state, steps):
         return replace(state, velocities=flow.restitution * state.velocities), empty_tally(state.side.dtype)
 
-    monkeypatch.setattr(jax_engine, "advance", plain)
+    monkeypatch.setattr(advance_module, "advance_by_jax", plain)
 
     @jax.jit
     def velocities(alpha):
-        flow = replace(of(0.6, engine=engine), restitution=alpha)
-        return advance_module.advance(flow, state, jnp.int32(30))[0].velocities
+        flow = replace(of(0.6), restitution=alpha)
+        return advance_module.advance(flow, state, jnp.int32(30), engine=engine)[0].velocities
 
     np.testing.assert_array_equal(jax.jvp(velocities, (0.5,), (1.0,))[1], state.velocities)
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
@@ -360,7 +371,7 @@ def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass,
         Grains(jnp.asarray(np.full(GRAINS, radius)), jnp.asarray(np.full(GRAINS, mass))),
         *(jnp.asarray(x, float) for x in arrays),
     )
-    after, tally = native_run(replace(of(0.6, shear_rate=shear_rate), max_iterations=100), state, 20)
+    after, tally = native_run(of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100))
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
 

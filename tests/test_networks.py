@@ -11,13 +11,12 @@ from benchmarks.exact_contacts import exact, incidence
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
 from jaxgran.contact.delassus import spectral_bound
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, JacobiCount, JacobiDiagonal, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics import collision
-from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 
-DEFAULT = ShearFlow(16, 0.5, 0.5, 1e-3).solver
-BOUNDED = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]
+BOUNDED = [Nesterov, BarzilaiBorwein, Jacobi, JacobiCount]
 SIZE_RATIO, MASS_RATIO, HEXAGONAL = "size ratio 10", "mass ratio 10⁴", "hexagonal cluster"
 compiled_bound = jax.jit(spectral_bound, static_argnums=1)
 
@@ -40,12 +39,12 @@ def feasible(networks):
 
 @pytest.fixture(scope="module")
 def solution_of():
-    """``solution_of(network, tolerance, cap, method, relaxation)``: the contact solve, compiled."""
-    compiled = jax.jit(solve, static_argnums=(1, 6))
+    """``solution_of(network, tolerance, max_steps, method)``: the contact solve, compiled."""
+    compiled = jax.jit(solve, static_argnums=1)
 
-    def call(network, tolerance=1e-4, cap=5000, method=DEFAULT, relaxation=1.8):
-        numbers = jnp.asarray(1.0), jnp.asarray(tolerance), jnp.asarray(cap), jnp.asarray(relaxation)
-        return compiled(network.contacts, network.grains, *numbers, method, jnp.asarray(True))
+    def call(network, tolerance=1e-4, max_steps=5000, method=BarzilaiBorwein):
+        solver = method(tolerance, max_steps)
+        return compiled(network.contacts, network.grains, jnp.asarray(1.0), solver, jnp.asarray(True))
 
     return call
 
@@ -157,7 +156,10 @@ def test_scaling_by_the_diagonal_diverges_where_it_does_not_bound(feasible, solu
             continue
         if np.linalg.eigvalsh(matrix[np.ix_(pushing, pushing)])[-1] > 2.1:
             assert solution_of(network, 1e-8, 20_000).status == Status.ok
-            assert solution_of(network, 1e-8, 5000, "jacobi-diagonal", 1.0).status == Status.iteration_limit
+            assert (
+                solution_of(network, 1e-8, 5000, partial(JacobiDiagonal, relaxation=1.0)).status
+                == Status.iteration_limit
+            )
             repelled += 1
     assert repelled >= 3  # how many there are depends on the last bits of the flows that the networks are from
 
@@ -176,14 +178,14 @@ def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasi
             iterates.append(impulses)
         assert np.all(np.diff(objectives) <= 1e-14 * abs(objectives[-1]))
         for cap in range(1, 31) if number % 8 == 0 else ():
-            found = np.asarray(solution_of(network, 1e-12, cap, "jacobi", 1.99).impulses)[used]
+            found = np.asarray(solution_of(network, 1e-12, cap, partial(Jacobi, relaxation=1.99)).impulses)[used]
             best = iterates[int(np.argmin(residuals[:cap]))]
             np.testing.assert_allclose(found, best, rtol=0, atol=1e-9 * max(np.max(best), 1e-3))
 
 
 def test_iterations_on_chains_grow_no_faster_than_their_length(solution_of):
     """A shock must travel along the chain; diffusion would take the square of the length."""
-    products = [int(solution_of(chain(discs), 1e-6, method="nesterov").iterations) for discs in CHAINS]
+    products = [int(solution_of(chain(discs), 1e-6, method=Nesterov).iterations) for discs in CHAINS]
     exponent = np.polyfit(np.log(CHAINS), np.log(products), 1)[0]
     assert exponent < 1.2
     sweeps = [int(gauss_seidel(chain(n).contacts, chain(n).grains, 1e-6, 100_000).iterations) for n in CHAINS[:4]]
@@ -210,7 +212,7 @@ def test_infeasible_networks_are_flagged_and_finite(networks, solution_of, metho
         assert np.all(np.isfinite(solution.impulses)) and np.all(np.isfinite(solution.response))
 
 
-@pytest.mark.parametrize("method", ["nesterov", "barzilai-borwein"])
+@pytest.mark.parametrize("method", [Nesterov, BarzilaiBorwein])
 @pytest.mark.parametrize("group", [SIZE_RATIO, MASS_RATIO])
 def test_fast_methods_converge_at_large_ratios_of_size_and_mass(networks, solution_of, method, group):
     for network in networks[group]:

@@ -1,15 +1,15 @@
 """Observables of one's own: every time step counts once, forces exactly, and looking changes nothing."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shared_flows import GRAINS
+from flows import GRAINS
 from synthetic import one_sentence
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import collision, observed_advance
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
@@ -57,13 +57,13 @@ def test_looking_changes_nothing(observed, plain_sample) -> None:
     same(observed[0].velocities, plain_sample[0].velocities)
     jax.tree.map(same, observed[1].tally, plain_sample[1].tally)
     np.testing.assert_array_equal(observed[1].tally.solves, plain_sample[1].tally.solves)
-    assert plain_sample[1].own is None
+    assert plain_sample[1].observed_sums is None
 
 
 def test_every_step_counts_once_in_every_block(observed) -> None:
     measured = observed[1]
-    np.testing.assert_array_equal(measured.own["one"], measured.tally.steps)
-    np.testing.assert_array_equal(measured.own["inside"], measured.tally.steps)
+    np.testing.assert_array_equal(measured.observed_sums["one"], measured.tally.steps)
+    np.testing.assert_array_equal(measured.observed_sums["inside"], measured.tally.steps)
 
 
 def test_forces_are_averaged_exactly(observed, plain_sample) -> None:
@@ -85,7 +85,7 @@ def test_velocities_are_averaged_up_to_the_strain_of_a_flight(observed, plain_sa
 
 def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
     length, error = observed[1].observed(lambda mean: {"length": mean["length"] / mean["pushes"]})
-    sums = observed[1].own
+    sums = observed[1].observed_sums
     assert length["length"] == pytest.approx(float(jnp.sum(sums["length"]) / jnp.sum(sums["pushes"])))
     assert 0.9 < length["length"] < 1.1
     assert 0 < error["length"] < 0.05
@@ -94,26 +94,26 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
     """Flown with room for three, the numba engine ends after every other step with contacts, and takes none twice."""
     monkeypatch.setattr(observed_advance, "_ROOM", 3)
-    advance = jax.jit(lambda state: observed_advance.advance_observed(FLOW, state, jnp.int32(320), all_of_step))
+    advance = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, jnp.int32(320), all_of_step))
     state, tally, own = advance(flowing(0.7))
     np.testing.assert_allclose(state.velocities, observed[0].velocities, atol=1e-9)
     assert tally.solves == jnp.sum(observed[1].tally.solves) > 50
     assert own["one"] == own["inside"] == tally.steps == 320
     np.testing.assert_allclose(own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12)
-    assert own["temperature"] == pytest.approx(float(jnp.sum(observed[1].own["temperature"])), rel=1e-3)
+    assert own["temperature"] == pytest.approx(float(jnp.sum(observed[1].observed_sums["temperature"])), rel=1e-3)
 
 
 def test_engine_jax_observes_the_same(flowing, run, monkeypatch) -> None:
     """With two sizes of the contact buffer, which are compiled sooner than six."""
     monkeypatch.setattr(collision, "contact_capacities", lambda grains: (1, 3 * grains))
-    flow, state, steps = replace(FLOW, engine="jax"), flowing(0.7), jnp.int32(200)
-    end, tally, own = jax.jit(lambda state: observed_advance.advance_observed(flow, state, steps, all_of_step))(state)
-    plain_end, plain_tally = run(FLOW, state, 200)
+    numerics, state, steps = Numerics(engine=Jax()), flowing(0.7), jnp.int32(200)
+    end, tally, own = jax.jit(lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step))(state)
+    plain_end, plain_tally = run(FLOW, state, 200, solver=BarzilaiBorwein())
     np.testing.assert_allclose(end.velocities, plain_end.velocities, atol=1e-9)
     assert tally.solves == plain_tally.solves > 20
     assert own["one"] == own["inside"] == 200
     np.testing.assert_allclose(own["stress"] * FLOW.timestep * state.side**2, tally.contact_moment, rtol=1e-12)
-    _, _, recorded = jax.jit(lambda state: observed_advance.advance_observed(FLOW, state, steps, all_of_step))(state)
+    _, _, recorded = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))(state)
     assert own.keys() == recorded.keys()
     for name in own:
         np.testing.assert_allclose(own[name], recorded[name], rtol=1e-3, atol=1e-3, err_msg=name)
@@ -124,7 +124,7 @@ def test_what_is_observed_may_depend_on_what_is_differentiated(flowing) -> None:
 
     def found(scale):
         _, measured = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: scale * jnp.sum(seen.impulses))
-        return measured.own
+        return measured.observed_sums
 
     primals, tangents = jax.eval_shape(lambda scale: jax.jvp(found, (scale,), (1.0,)), 2.0)
     assert primals.shape == tangents.shape == (BLOCKS,)
@@ -155,7 +155,7 @@ def test_lax_map_applies(flowing) -> None:
         return jax.lax.map(lambda state: sample(FLOW, state, STRAIN, observe=observe), states)
 
     _, both = jax.eval_shape(shear, states)
-    assert both.own["stress"].shape == (2, BLOCKS, 2, 2)
+    assert both.observed_sums["stress"].shape == (2, BLOCKS, 2, 2)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import GRAINS
 from listed import build, listed_pairs, move, pairs_within
 from oracles import gaps_of
 from scipy.special import ndtri
-from shared_flows import GRAINS
 from synthetic import one_sentence
 
 from jaxgran.contact.near_pairs import widest_skin
@@ -37,7 +37,7 @@ LAWS = {
 
 
 def flow_of(packing_fraction: float = 0.7, **change) -> ShearFlow:
-    return replace(ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3, tolerance=1e-10), **change)
+    return replace(ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), **change)
 
 
 @pytest.fixture(scope="module")

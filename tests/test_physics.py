@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import flow_of
+from flows import GRAINS, flow_of
 from oracles import gaps_of, kinetic_energy
-from shared_flows import GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -118,8 +118,8 @@ def test_momentum_is_conserved(engine_run, flowing, drift):
     """m c_y stays, and m c_x falls by γ̇ m c_y t: a drift across the shear changes nothing in the laboratory."""
     state = flowing(0.75)
     state = replace(state, velocities=state.velocities + jnp.asarray([drift]))
-    flow, steps = flow_of(0.75, tolerance=1e-4), 400
-    after, tally = engine_run(flow, state, steps)
+    flow, steps = flow_of(0.75), 400
+    after, tally = engine_run(flow, state, steps, BarzilaiBorwein())
     before, time = momentum(state), steps * flow.timestep
     assert tally.solves > 50
     rounding = EPS * float(tally.impulse) * np.sqrt(tally.contacts)
@@ -130,8 +130,8 @@ def test_momentum_is_conserved(engine_run, flowing, drift):
 @pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
 def test_shear_power_is_dissipation_and_change_of_energy(engine_run, flowing, packing_fraction, timestep, activation):
     state = flowing(packing_fraction)
-    flow = flow_of(packing_fraction, timestep=timestep, restitution=0.3, activation=activation, tolerance=1e-4)
-    after, tally = engine_run(flow, state, 300)
+    flow = flow_of(packing_fraction, timestep=timestep, restitution=0.3, activation=activation)
+    after, tally = engine_run(flow, state, 300, BarzilaiBorwein())
     power = -(tally.contact_moment + tally.kinetic_moment)[0, 1]  # ∫ τ γ̇ A dt with γ̇ = 1
     assert tally.solves > 20 and tally.dissipation > 0
     change = energy(after) - energy(state)
@@ -155,7 +155,7 @@ def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver
     flow, state = flow_of(0.75, restitution=0.1), flowing(0.75)
     wasted = []
     for tolerance, cap in ((1e-12, 1), (1e-2, 5000), (1e-4, 5000), (1e-8, 5000)):
-        _, tally = engine_run(replace(flow, tolerance=tolerance, max_iterations=cap), state, 300)
+        _, tally = engine_run(flow, state, 300, BarzilaiBorwein(tolerance, cap))
         measured = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, GRAINS, 1.0)
         assert abs(measured["energy_balance_error"]) < 1e-11
         assert measured["momentum_drift"] < 1e-13
@@ -167,9 +167,9 @@ def test_energy_balance_tests_the_books_and_the_complementarity_power_the_solver
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_no_contact_is_missed_over_large_shear(engine, engine_run, flowing, packing_fraction):
     """Overlaps by brute force stay within those that were met as contacts and one step of the fastest pair."""
-    state, flow, tilts = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.7, tolerance=1e-4), []
+    state, flow, tilts = flowing(packing_fraction), flow_of(packing_fraction, restitution=0.7), []
     for _ in range(BLOCKS[engine]):
-        state, tally = engine_run(flow, state, 60)
+        state, tally = engine_run(flow, state, 60, BarzilaiBorwein())
         assert tally.status == Status.ok
         fastest = 2 * np.max(np.linalg.norm(state.velocities, axis=1)) + 1.3
         deepest = -np.min(gaps_of(state.positions, state.grains.radii, state.side, state.tilt))
@@ -192,10 +192,10 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     """Bagnold's scaling: rigid grains have no time scale but that of the shear, so stresses go with its square."""
     interpreted = engine == "pallas" and packing_fraction > 0.2  # and slow where dense
     steps, most = (150, 70) if interpreted else (500, 100_000)
-    state, flow = flowing(packing_fraction), flow_of(packing_fraction, tolerance=1e-4, max_iterations=most)
+    state, flow, solver = flowing(packing_fraction), flow_of(packing_fraction), BarzilaiBorwein(max_steps=most)
     faster = replace(flow, shear_rate=2.0, timestep=flow.timestep / 2)
-    slow, slow_tally = engine_run(flow, state, steps)
-    fast, fast_tally = engine_run(faster, replace(state, velocities=2 * state.velocities), steps)
+    slow, slow_tally = engine_run(flow, state, steps, solver)
+    fast, fast_tally = engine_run(faster, replace(state, velocities=2 * state.velocities), steps, solver)
     assert slow_tally.solves > (5 if packing_fraction == 0.2 else 50)
     np.testing.assert_array_equal(fast.positions, slow.positions)
     np.testing.assert_array_equal(fast.tilt, slow.tilt)

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling import steady_state, timestep
-from jaxgran.sampling.batch import advance_batch, reporting, stack
+from jaxgran.sampling.batch import advance_batch, for_replicas, reporting, stack
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, relative_error
 from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
@@ -57,7 +58,7 @@ def test_same_key_gives_the_same_state_and_another_key_another(batch, keys) -> N
 
 def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     temperature = jnp.asarray([0.3, 2.0])
-    state, found = steady_state._heated(stack(FLOWS), keys, temperature, None)
+    state, found = steady_state._heated(stack(FLOWS), keys, temperature, None, lockstep=False)
     masses, velocities = np.asarray(state.grains.masses), np.asarray(state.velocities)
     assert np.all(found)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-12)
@@ -69,7 +70,8 @@ def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
 def test_whole_numbers_become_real_ones_in_a_batch_of_flows() -> None:
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0, 1)])
     assert flow.restitution.dtype == flow.shear_rate.dtype == jnp.float64
-    assert flow.max_iterations.dtype == jnp.int32
+    numerics = for_replicas(Numerics(), 2)
+    assert (numerics.solver.tolerance.dtype, numerics.solver.max_steps.dtype) == (jnp.float64, jnp.int32)
     np.testing.assert_array_equal(flow.restitution, [0.0, 1.0])
 
 
@@ -128,7 +130,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
-    end = steady_state._until_steady(Batch(flow, start, status, np.zeros(5), np.full(5, 3.2)), None)
+    end = steady_state._until_steady(Batch(flow, Numerics(), start, status, np.zeros(5), np.full(5, 3.2)), None)
     bad = Status.not_steady
     np.testing.assert_array_equal(
         end.status, [Status.ok, bad, Status.ok, bad, Status.nonfinite]
@@ -151,7 +153,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     monkeypatch.setattr(steady_state, "_sheared", sheared)
     flow, coarse = with_timesteps(1e-5, 2e-4), with_timesteps(1e-3, 1e-3)
     state: Any = SimpleNamespace(side=jnp.full(2, 10.0))
-    end = steady_state._shortened(Batch(coarse, state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
+    end = steady_state._shortened(Batch(coarse, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
     timesteps, strains = np.array([dt for dt, _ in record]), np.array([strain for _, strain in record])
     ladder = np.vstack([coarse.timestep, timesteps])
     np.testing.assert_allclose(ladder[1:, 0] / ladder[:-1, 0], 10**-0.5, rtol=1e-6)
@@ -162,7 +164,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
     assert end.flow is flow
 
     record.clear()
-    steady_state._shortened(Batch(flow, state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
+    steady_state._shortened(Batch(flow, Numerics(), state, np.zeros(2), np.zeros(2), np.ones(2)), flow, None)
     assert record == []
 
 
@@ -192,7 +194,9 @@ def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch: pytest
     flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
     state: Any = SimpleNamespace(side=np.array([6.0]))
     monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
-    end = steady_state._until_steady(Batch(flow, state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None)
+    end = steady_state._until_steady(
+        Batch(flow, Numerics(), state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None
+    )
     assert end.status[0] == Status.ok
     assert end.strain[0] == pytest.approx(15 * 1.0)
 

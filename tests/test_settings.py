@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
+from jaxgran.contact.projected_methods import Jacobi
+from jaxgran.dynamics.engine import Numba, Pallas
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_GRAINS
@@ -67,14 +69,12 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"error": 1.0}, "between 1e-3 and 0.5"),
     ({"error": float("nan")}, "between 1e-3 and 0.5"),
     ({"equilibrate": -1.0}, "at least 0"),
-    ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
-    ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
-    ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
+    ({"solver": "gauss"}, "a ProjectedMethod, such as"),
     ({"activation": "always"}, "midpoint or touching"),
     ({"snapshots": 1}, "True or False"),
-    ({"engine": "fortran"}, "auto, numba, jax or pallas"),
-    ({"engine": "pallas"}, "auto or jax on a CPU, not pallas: it is made for NVIDIA GPUs"),
-    ({"engine": "numba", "solver": "jacobi"}, "auto or jax with the solver jacobi, not numba"),
+    ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\), jg.Pallas\(\) or None"),
+    ({"engine": Pallas()}, "on a CPU, not pallas: it is made for NVIDIA GPUs"),
+    ({"engine": Numba(), "solver": Jacobi()}, "with the solver jacobi, not numba"),
 ]
 
 
@@ -93,11 +93,11 @@ def test_lists_may_fall_as_well_as_rise() -> None:
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
     settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6)})
-    settings = replace(settings, activation="touching", engine="jax")
+    settings = replace(settings, activation="touching")
     points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
-        assert (flow.grains, flow.timestep, flow.activation, flow.engine) == (64, 1e-3, "touching", "jax")
+        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
 
 
 def test_numbers_of_numpy_are_accepted() -> None:
@@ -138,7 +138,7 @@ def test_automatic_choices_are_accepted_and_finer_for_a_smaller_error() -> None:
         numbers, words = automatic(choices, target_error)
         settings = MapSettings(**numbers)
         assert "restitution 0.9 and packing fraction 0.6" in words and f"error of {target_error:g}" in words
-        found.append((settings.timestep, settings.tolerance))
+        found.append((settings.timestep, settings.solver.tolerance))
     timesteps, tolerances = zip(*found, strict=True)
     assert list(timesteps) == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
     assert list(tolerances) == sorted(set(tolerances), reverse=True)
@@ -148,6 +148,14 @@ def test_given_numbers_stay_as_they_are() -> None:
     assert automatic(GOOD, 0.02) == (GOOD, "")
     numbers, words = automatic({**GOOD, "tolerance": "auto"}, 0.02)
     assert numbers["timestep"] == GOOD["timestep"] and "timestep" not in words
+
+
+def test_a_given_tolerance_is_that_of_the_solver() -> None:
+    numbers, _ = automatic({**GOOD, "solver": Jacobi(relaxation=1.5), "tolerance": 1e-3}, 0.02)
+    assert MapSettings(**numbers).solver == Jacobi(tolerance=1e-3, relaxation=1.5)
+    for value in (0.0, 1.0, "small"):
+        with pytest.raises(InputError, match="tolerance must be between"):
+            automatic({**GOOD, "tolerance": value}, 0.02)
 
 
 @pytest.mark.parametrize("target_error", [0.0, 1.0, float("nan"), "small"])

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import EXACT, GRAINS
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from shared_flows import GRAINS
 
 from jaxgran.dynamics.snapshots import collided, flown, snapshot, snapshot_series
 from jaxgran.model.cell import displacement
@@ -17,12 +17,12 @@ from jaxgran.model.flow import ShearFlow
 
 @pytest.fixture(scope="module")
 def flow() -> ShearFlow:
-    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-10)
+    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3)
 
 
 @pytest.fixture(scope="module")
 def series(flow, flowing):
-    return snapshot_series(flow, flowing(0.78), 0.05, 5)
+    return snapshot_series(flow, flowing(0.78), 0.05, 5, solver=EXACT)
 
 
 def assert_same_flow(one, other, tolerance: float) -> None:
@@ -37,7 +37,7 @@ def test_collision_and_flight_are_the_two_halves_of_a_step(flow, flowing, run) -
     state, loaded = flowing(0.78), 0
     one_snapshot = jax.jit(snapshot)
     for _ in range(40):
-        seen = one_snapshot(flow, state)
+        seen = one_snapshot(flow, state, EXACT)
         loaded += int(jnp.sum(seen.impulses > 0))
         by_halves = flown(collided(seen), flow.shear_rate, flow.timestep)
         state, _ = run(flow, state, 1)
@@ -62,7 +62,7 @@ def test_sums_over_the_snapshots_of_every_step_are_those_of_the_tally(flow, flow
     _, tally = run(flow, state, steps)
     one_snapshot, contact, clustered = jax.jit(snapshot), np.zeros((2, 2)), np.zeros((2, 2))
     for _ in range(steps):
-        seen = one_snapshot(flow, state)
+        seen = one_snapshot(flow, state, EXACT)
         loaded = np.flatnonzero(np.asarray(seen.impulses) > 0)
         i, j = (np.asarray(x)[loaded] for x in (seen.contacts.i, seen.contacts.j))
         normals, distances = (np.asarray(x)[loaded] for x in (seen.contacts.normals, seen.contacts.distances))

@@ -12,11 +12,12 @@ from oracles import MAX_DISCS, delassus, exact_velocities, padded_network, rando
 
 from jaxgran.contact.delassus import count_bound, delassus_product, grain_impulses, spectral_bound
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, JacobiCount, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
-METHODS = ["nesterov", "barzilai-borwein", "jacobi", "jacobi-count"]
+METHODS = [Nesterov, BarzilaiBorwein, Jacobi, JacobiCount]
 PRECISE = METHODS[:3]  # the last is too slow to reach 1e-12 on all networks
 networks = st.tuples(st.integers(0, 2**32 - 1), st.integers(1, MAX_DISCS))
 
@@ -102,7 +103,7 @@ def test_isolated_pairs_are_exact_at_once(solved, method):
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     solution = solved(padded_network(grains, grains + 1, normals, approach, masses), method=method)
     exact = np.maximum(0, -approach) / (1 / masses[::2] + 1 / masses[1::2])
-    if method == "nesterov":
+    if method is Nesterov:
         assert solution.iterations == 1
         np.testing.assert_allclose(solution.impulses[: len(exact)], exact, rtol=16 * EPS)
     np.testing.assert_allclose(solution.impulses[: len(exact)], exact, rtol=1e-11)
@@ -197,10 +198,7 @@ def test_compiled_solve_equals_the_interpreted_one(solved):
             network,
             MAX_DISCS,
             jnp.asarray(1.0),
-            jnp.asarray(1e-4),
-            jnp.asarray(8),
-            jnp.asarray(1.8),
-            "barzilai-borwein",
+            BarzilaiBorwein(1e-4, 8),
             jnp.asarray(True),
         )
     np.testing.assert_allclose(compiled.impulses, interpreted.impulses, rtol=0, atol=1e-12)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from shared_flows import GRAINS
+from flows import GRAINS
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
 from jaxgran.analysis.force_chains import (
@@ -21,6 +21,7 @@ from jaxgran.analysis.force_chains import (
 from jaxgran.analysis.order import coordination, hexatic_order, pair_correlation, profiles
 from jaxgran.analysis.series import series
 from jaxgran.analysis.velocity_correlations import near_contact
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
 from jaxgran.model.cell import displacement, minimum_image
 from jaxgran.model.flow import ShearFlow
@@ -28,12 +29,12 @@ from jaxgran.model.flow import ShearFlow
 
 @pytest.fixture(scope="module")
 def flow() -> ShearFlow:
-    return ShearFlow(GRAINS, 0.5, 0.75, 1e-3, tolerance=1e-8)
+    return ShearFlow(GRAINS, 0.5, 0.75, 1e-3)
 
 
 @pytest.fixture(scope="module")
 def seen(flow, flowing) -> Snapshot:
-    return series(snapshot_series(flow, flowing(0.75), 200.0, SNAPSHOTS)[1])
+    return series(snapshot_series(flow, flowing(0.75), 200.0, SNAPSHOTS, solver=BarzilaiBorwein(1e-8))[1])
 
 
 CHAIN_AND_PAIR = [(0, 1, 2.0), (2, 1, 1.0), (3, 4, 1.0), (4, 5, 0.0)]

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shared_flows import GRAINS
+from flows import EXACT, GRAINS
 
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io.trajectory import (
@@ -34,13 +34,13 @@ TILTS = (-0.4, 0.0, 0.3)
 
 @pytest.fixture(scope="module")
 def flow() -> ShearFlow:
-    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3, tolerance=1e-10)
+    return ShearFlow(GRAINS, 0.3, 0.78, 1e-3)
 
 
 @pytest.fixture(scope="module")
 def seen(flow, flowing, run):
     """Snapshots that carry forces, by tilt: the flow is sheared until its cell is tilted so."""
-    by_tilt, one_snapshot, state = {}, jax.jit(snapshot), flowing(0.78)
+    by_tilt, one_snapshot, state = {}, jax.jit(partial(snapshot, solver=EXACT)), flowing(0.78)
     for tilt in TILTS:
         state, _ = run(flow, state, round((tilt - state.tilt.item()) % 1 / 1e-3))
         by_tilt[tilt] = one_snapshot(flow, state)
@@ -54,7 +54,7 @@ def seen(flow, flowing, run):
 def drive(flow, run):
     """A drive of a batch of one by the compiled function that all tests share."""
 
-    def driven(_, states, steps):
+    def driven(_flow, _numerics, states, steps):
         state = jax.tree.map(lambda x: x[0], states)
         return jax.tree.map(lambda x: x[None], run(flow, state, int(steps[0])))
 
@@ -73,8 +73,9 @@ def recorded(flow, flowing, drive, tmp_path_factory):
 
 def driven_in_blocks(drive, flow, state, blocks):
     flows, states, tallies = stack([flow]), jax.tree.map(lambda x: x[None], state), []
+    numerics = for_replicas(Numerics(EXACT), 1)
     for steps in blocks:
-        states, tally = drive(flows, states, jnp.asarray([steps], jnp.int32))
+        states, tally = drive(flows, numerics, states, jnp.asarray([steps], jnp.int32))
         tallies.append(tally)
     return jax.tree.map(lambda x: x[0], (states, tallies))
 

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import flow_of
+from flows import GRAINS, flow_of
 from made_up_maps import known_closure
-from shared_flows import GRAINS
 from synthetic import one_sentence, snapshot_of
 
 import jaxgran as jg

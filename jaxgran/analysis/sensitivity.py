@@ -20,13 +20,15 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.network import first_contact_time
-from jaxgran.dynamics.jax_engine import advance
+from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
+from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
 
+_EXACT = BarzilaiBorwein(tolerance=1e-8)
 _MOST_POINTS = 10**6  # of a growth curve, which is held in memory
 
 
@@ -50,28 +52,40 @@ class Growth:
     status: Int[Array, "*b points"]
 
 
-def growth(flow: ShearFlow, state: State, strain: float | Array, count: int, moving_contacts: bool = True) -> Growth:
+def growth(
+    flow: ShearFlow,
+    state: State,
+    strain: float | Array,
+    count: int,
+    moving_contacts: bool = True,
+    *,
+    solver: ProjectedMethod = _EXACT,
+) -> Growth:
     """The derivative of a flow with respect to its restitution at equal intervals of strain.
 
     Args:
-      flow: parameters, with a small ``tolerance`` (1e-8 or less).
+      flow: parameters of the state.
       state: the flow at the beginning.
       strain: total strain.
       count: number of points, static.
       moving_contacts: whether the derivative lets contacts move in time, see ``dynamics.jax_engine``.
+      solver: solves the contacts of each step; derivatives want a tolerance of 1e-8 or less.
 
     Raises:
-      ValueError: the strain is shorter than a time step for each point.
+      InputError: (a ValueError) the strain is shorter than a time step for each point.
     """
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_POINTS, "as memory is limited")
     require_strain(flow, strain, count)
     require_match(flow, state)
-    return _growth(flow, state, strain, count, moving_contacts)
+    require_solver(solver)
+    return _growth(flow, solver, state, strain, count, moving_contacts)
 
 
 @partial(jax.jit, static_argnames=("count", "moving_contacts"))
-def _growth(flow: ShearFlow, state: State, strain: Array, count: int, moving_contacts: bool) -> Growth:
+def _growth(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, strain: Array, count: int, moving_contacts: bool
+) -> Growth:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
 
@@ -80,7 +94,8 @@ def _growth(flow: ShearFlow, state: State, strain: Array, count: int, moving_con
 
         def run(alpha, positions, velocities, tilt):
             start = State(now.grains, positions, velocities, now.side, tilt)
-            end, tally = advance(replace(flow, restitution=alpha), start, steps, moving_contacts=moving_contacts)
+            changed = replace(flow, restitution=alpha)
+            end, tally = advance_by_jax(changed, solver, start, steps, moving_contacts=moving_contacts)
             return (end.positions, end.velocities, end.tilt), tally.status
 
         alpha = jnp.asarray(flow.restitution, now.side.dtype)

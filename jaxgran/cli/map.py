@@ -22,7 +22,7 @@ from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, require_device, say, say_written
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.model.choices import Activation, Engine, FileFormat, Solver
+from jaxgran.model.choices import Activation, EngineName, FileFormat, SolverName
 from jaxgran.model.display import with_error
 
 MAP_EXAMPLES = {
@@ -69,10 +69,10 @@ def map_command(
         float, typer.Option(help="Relative error of the stresses that auto aims at, 1e-4 to 0.1.")
     ] = 0.02,
     solver: Annotated[
-        Solver | None,
+        SolverName | None,
         typer.Option(help="Method of the contact solve in the engine jax. [default: barzilai-borwein]"),
     ] = None,
-    engine: Annotated[Engine | None, typer.Option(help="Program that advances the flows. [default: auto]")] = None,
+    engine: Annotated[EngineName | None, typer.Option(help="Program that advances the flows. [default: auto]")] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
     snapshots: Annotated[
         bool | None,
@@ -185,7 +185,7 @@ def _like(file: Path) -> dict[str, Any]:
     chosen, different = choices_of(data), differences(data)
     if different:
         say(f"not as in {file}: {'; '.join(different)}.")
-    return chosen
+    return chosen | {"tolerance": getattr(chosen["solver"], "tolerance", None)}  # also of another solver
 
 
 def kept_choices(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:

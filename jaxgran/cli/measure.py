@@ -67,7 +67,7 @@ def measured(
 
     if output is not None:
         check_output(output)
-    numbers, automatic_choice = automatic(chosen, target_error)
+    numbers, automatic_choice = automatic(_with_objects(chosen), target_error)
     settings = MapSettings(**numbers)
     if automatic_choice:
         say(f"chosen: {automatic_choice}")
@@ -135,6 +135,16 @@ def measured(
     return Outcome(data, interrupted, written)
 
 
+def _with_objects(chosen: dict[str, Any]) -> dict[str, Any]:
+    """The parameters with a solver and an engine in place of their names."""
+    from jaxgran.contact.projected_methods import SOLVERS
+    from jaxgran.dynamics.engine import engine_named
+
+    solver, engine = chosen.get("solver"), chosen.get("engine")
+    made = {"solver": SOLVERS[solver]()} if isinstance(solver, str) and solver in SOLVERS else {}
+    return chosen | made | ({"engine": engine_named(engine)} if isinstance(engine, str) else {})
+
+
 def _earlier(output: Path, settings) -> tuple[Any, str, bool]:
     """The map that the output holds already, what is lost with it in words, and whether it is finished."""
     if not output.exists():
@@ -149,9 +159,9 @@ def _load_beside(settings, modules: Iterable[str]) -> None:
     """Load, beside the flows, their numba engine and what is needed at the end; errors come back where it is used."""
     with suppress(Exception):
         from jaxgran.dynamics.advance import register_numba
-        from jaxgran.dynamics.engine import select_engine
+        from jaxgran.dynamics.engine import Numba, select_engine
 
-        if select_engine(settings.flows()[0]) == "numba":
+        if isinstance(select_engine(settings.flows()[0], settings.numerics), Numba):
             register_numba()
         for name in ("jaxgran.maps.dataset", "jaxgran.maps.results", *modules):
             import_module(name)

@@ -14,7 +14,7 @@ from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, say
 from jaxgran.maps.progress import counted
 from jaxgran.model.checks import InputError, require_number, short_repr
-from jaxgran.model.choices import Activation, Engine, Solver
+from jaxgran.model.choices import Activation, EngineName, SolverName
 from jaxgran.model.display import with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
@@ -61,11 +61,11 @@ def run_command(
         str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
     ] = None,
     solver: Annotated[
-        Solver | None,
+        SolverName | None,
         typer.Option(help="Method of the contact solve in the engine jax. [default: barzilai-borwein]"),
     ] = None,
     activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
-    engine: Annotated[Engine, typer.Option(help="Program that advances the flow.")] = "auto",
+    engine: Annotated[EngineName, typer.Option(help="Program that advances the flow.")] = "auto",
     trajectory: Annotated[
         Path | None,
         typer.Option(

@@ -1,124 +1,325 @@
-"""The projected methods: how an iterate of the contact problem follows from the ones before it.
+"""The projected methods: how one iterate of a contact solve follows from those before it.
 
 All of them take projected steps p ← max(0, y − τ D⁻¹(W y + b)) from a point y, with a diagonal D of ``delassus`` in
 place of the operator W, and cost one product with W each. They differ in D, in y, and in the step length τ:
 
-==================  ===============  ==============================  ========================================
-method              diagonal D       starting point y                step length τ
-==================  ===============  ==============================  ========================================
-jacobi-diagonal     diag(W)          p                               relaxation ω
-jacobi-count        contact counts   p                               ω
-jacobi              spectral bound   p                               ω
-nesterov            spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
-barzilai-borwein    spectral bound   p                               curvature along the last step; guarded
-==================  ===============  ==============================  ========================================
+=================  ===============  ==============================  ========================================
+method             diagonal D       starting point y                step length τ
+=================  ===============  ==============================  ========================================
+JacobiDiagonal     diag(W)          p                               relaxation ω
+JacobiCount        contact counts   p                               ω
+Jacobi             spectral bound   p                               ω
+Nesterov           spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
+BarzilaiBorwein    spectral bound   p                               curvature along the last step; guarded
+=================  ===============  ==============================  ========================================
 
 Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ = 1. With diag(W)
-neither holds: "jacobi-diagonal" is kept because it shows what the bound is for.
+neither holds: ``JacobiDiagonal`` is kept because it shows what the bound is for.
 
 Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at least 1 as W ⪯ D.
 The objective does not fall in every step, and with a projection the iterates can cycle. The safeguard needs no values
-of the objective: where the best residual has not halved over 100 steps, the method goes on as Nesterov's. So either the
-residual falls at that rate, or the iteration is one that converges. This is the default: in flows it needs a fifth to a
-third fewer products than Nesterov's method alone (``benchmarks solvers``).
+of the objective: where the best residual has not halved over 100 steps, the method continues as Nesterov's. So either
+the residual falls at that rate, or the iteration is one that converges. This is the default: in flows it needs a fifth
+to a third fewer products than Nesterov's method alone (``benchmarks solvers``).
+
+A subclass of ``ProjectedMethod`` is a method too, wherever it is written.
 
 Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988); Birgin, Martínez
 and Raydan (2000) for projected spectral gradients; Tonge, Benevolenski and Voroshilov (2012) for mass splitting.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import Operator, count_bound, diagonal, spectral_bound
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.model.choices import Solver
+from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
+from jaxgran.model.choices import SolverName
 
 
 class Iterate(NamedTuple):
-    """Where a method stands; a point holds impulses and their response W p."""
+    """State of the iteration; a point holds impulses and their response W p."""
 
     point: Float[Array, "2 contacts"]
     previous: Float[Array, "2 contacts"]
-    memory: tuple[Float[Array, ""], ...]
+    memory: Any
     best_residual: Float[Array, ""]
     iterations: Int[Array, ""]
 
 
-class Method(NamedTuple):
-    """A projected method.
+@dataclass(frozen=True)
+class ProjectedMethod:
+    """Base class of the methods that solve the contacts of a step: 0 ≤ p ⟂ W p + b ≥ 0.
 
-    =======  ======================================  ============================================================
-    field    signature                               meaning
-    =======  ======================================  ============================================================
-    bound    contacts, grains → (contacts,)          diagonal D
-    memory   numbers                                 what it remembers between iterations, at the start
-    propose  iterate, relaxation → (2, contacts), () point y with its response, and step length τ
-    learn    iterate, y, p, D, residual → memory     the same after the step from y to p; the residual is the best
-    =======  ======================================  ============================================================
+    ==========  =====  ====  =====================================================================================
+    field       shape  unit  meaning
+    ==========  =====  ====  =====================================================================================
+    tolerance   ()     –     relative residual ‖min(diag(W) p, W p + b)‖ / ‖min(b, 0)‖ to reach, 1e-12 to 0.1
+    max_steps   ()     –     largest number of iterations; the best iterate is then returned, with a status
+    ==========  =====  ====  =====================================================================================
+
+    Each iteration is a projected step p ← max(0, y − τ D⁻¹(W y + b)). A subclass says what D, y and τ are, by
+    overriding one or more of ``bound``, ``init``, ``propose`` and ``learn``. What is inherited is Jacobi's method with
+    D the spectral bound and τ = 1. A subclass is a frozen dataclass. It is a JAX pytree whose fields are traced: other
+    numbers recompile nothing. A field with ``metadata={"static": True}`` is static.
+
+    Raises:
+      InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
+
+    Examples:
+      Polyak's heavy ball, p + β (p − p_before) with τ = 1:
+
+      >>> @dataclass(frozen=True)
+      ... class HeavyBall(ProjectedMethod):
+      ...     momentum: float = 0.5
+      ...
+      ...     def propose(self, now):
+      ...         return now.point + self.momentum * (now.point - now.previous), 1.0
+      >>> HeavyBall(tolerance=1e-6)
+      HeavyBall(tolerance=1e-06, max_steps=5000, momentum=0.5)
     """
 
-    bound: Callable[[Operator, int], Array]
-    memory: tuple[float, ...]
-    propose: Callable[[Iterate, Array], tuple[Array, Array]]
-    learn: Callable[[Iterate, Array, Array, Array, Array], tuple[Array, ...]]
+    tolerance: float | Float[Array, ""] = 1e-4
+    max_steps: int | Int[Array, ""] = 5000
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        _register(cls)
+
+    def __post_init__(self) -> None:
+        require_number("tolerance", self.tolerance, lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1")
+        words = "a whole number of at least 1"
+        require_number("max_steps", self.max_steps, lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), words)
+
+    def bound(self, contacts: Operator, grains: int) -> Float[Array, " contacts"]:
+        """Diagonal D of positive numbers in place of W, see ``delassus``.
+
+        Args:
+          contacts: the contact network, or a problem given by its matrix.
+          grains: number of grains; 0 with a matrix.
+        """
+        return spectral_bound(contacts, grains)
+
+    def init(self, approach: Float[Array, " contacts"]) -> Any:
+        """What the method remembers between iterations, at the start: a pytree of floats; ``approach`` is b."""
+        return ()
+
+    def propose(self, now: Iterate) -> tuple[Float[Array, "2 contacts"], float | Float[Array, ""]]:
+        """Point y, as impulses and their response W y, and step length τ."""
+        return now.point, 1.0
+
+    def learn(
+        self,
+        now: Iterate,
+        start: Float[Array, "2 contacts"],
+        point: Float[Array, "2 contacts"],
+        bound: Float[Array, " contacts"],
+        best_residual: Float[Array, ""],
+    ) -> Any:
+        """What is remembered after the step from y to p, in the form of ``init``.
+
+        Args:
+          now: the state before the step.
+          start, point: y and p, each with its response.
+          bound: the diagonal D.
+          best_residual: ‖min(diag(W) p, W p + b)‖, the smallest so far, in σγ̇.
+        """
+        return now.memory
+
+
+def _register(cls: type) -> None:
+    """Make a class of methods a pytree, whose fields are read when an instance is first flattened."""
+
+    def names(static: bool) -> list[str]:
+        return [field.name for field in fields(cls) if bool(field.metadata.get("static")) == static]
+
+    def flatten(solver: Any) -> tuple[list[tuple[Any, Any]], tuple]:
+        leaves = [(jax.tree_util.GetAttrKey(name), getattr(solver, name)) for name in names(False)]
+        return leaves, tuple(getattr(solver, name) for name in names(True))
+
+    def unflatten(static: tuple, leaves: Any) -> Any:
+        solver = object.__new__(cls)  # without checks: JAX also passes axis numbers and placeholders
+        for name, value in zip([*names(True), *names(False)], (*static, *leaves), strict=True):
+            object.__setattr__(solver, name, value)
+        return solver
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+
+
+_register(ProjectedMethod)
+
+
+@dataclass(frozen=True)
+class BarzilaiBorwein(ProjectedMethod):
+    """The method of Barzilai and Borwein with a safeguard, the default; fields as ``ProjectedMethod``.
+
+    Source: J. Barzilai and J. M. Borwein, IMA J. Numer. Anal. 8, 141 (1988); projected by E. G. Birgin,
+    J. M. Martínez and M. Raydan, SIAM J. Optim. 10, 1196 (2000).
+
+    Examples:
+      >>> BarzilaiBorwein(tolerance=1e-6)
+      BarzilaiBorwein(tolerance=1e-06, max_steps=5000)
+    """
+
+    def init(self, approach: Array) -> Any:
+        return 1.0, -1.0, float("inf")  # step length; momentum, negative until it is Nesterov's; last judged residual
+
+    def propose(self, now: Iterate) -> tuple[Array, Array]:
+        stride, k, _ = now.memory
+        momentum = jnp.maximum(k, 0)
+        return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
+
+    def learn(self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array) -> Any:
+        _, k, before = now.memory
+        judged = now.iterations % WINDOW == WINDOW - 1
+        guarded = (k >= 0) | (judged & ~(best_residual < PROGRESS * before))
+        step, response = point - now.point
+        long = now.iterations % 2 == 1
+        left = jnp.where(long | guarded, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
+        own, mixed = dot(left, jnp.where(long | guarded, step, response)), dot(step, response)
+        over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
+        longest = LONGEST_STRIDE
+        stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), longest), longest)
+        momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
+        return (
+            jnp.where(guarded, 1, stride),
+            jnp.where(guarded, momentum, -1),
+            jnp.where(judged, best_residual, before),
+        )
+
+
+@dataclass(frozen=True)
+class Nesterov(ProjectedMethod):
+    """Nesterov's accelerated method with restarts; fields as ``ProjectedMethod``.
+
+    Source: Y. Nesterov, Sov. Math. Dokl. 27, 372 (1983); the restart: B. O'Donoghue and E. Candès, Found. Comput. Math.
+    15, 715 (2015).
+
+    Examples:
+      >>> Nesterov()
+      Nesterov(tolerance=0.0001, max_steps=5000)
+    """
+
+    def init(self, approach: Array) -> Any:
+        return 0.0  # the momentum k
+
+    def propose(self, now: Iterate) -> tuple[Array, Array]:
+        k = now.memory
+        return now.point + k / (k + 3) * (now.point - now.previous), jnp.ones_like(k)
+
+    def learn(self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array) -> Any:
+        uphill = dot(bound * (start[0] - point[0]), point[0] - now.point[0]) > 0
+        return jnp.where(uphill, 0, now.memory + 1)
+
+
+@dataclass(frozen=True)
+class Jacobi(ProjectedMethod):
+    """Projected Jacobi with the spectral bound, of relaxation ω; other fields as ``ProjectedMethod``.
+
+    ==========  =====  ====  =============
+    field       shape  unit  meaning
+    ==========  =====  ====  =============
+    relaxation  ()     –     ω in (0, 2)
+    ==========  =====  ====  =============
+
+    Source: O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977).
+
+    Raises:
+      InputError: (a ValueError) as ``ProjectedMethod``.
+
+    Examples:
+      >>> Jacobi(relaxation=1.5)
+      Jacobi(tolerance=0.0001, max_steps=5000, relaxation=1.5)
+    """
+
+    relaxation: float | Float[Array, ""] = 1.8
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_number("relaxation", self.relaxation, lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded")
+
+    def propose(self, now: Iterate) -> tuple[Array, Array]:
+        return now.point, jnp.asarray(self.relaxation, now.point.dtype)
+
+
+@dataclass(frozen=True)
+class JacobiCount(Jacobi):
+    """``Jacobi`` with D the numbers of contacts over the masses (mass splitting), which also bounds W.
+
+    Source: R. Tonge, F. Benevolenski and A. Voroshilov, ACM Trans. Graph. 31, 105 (2012).
+
+    Examples:
+      >>> JacobiCount()
+      JacobiCount(tolerance=0.0001, max_steps=5000, relaxation=1.8)
+    """
+
+    def bound(self, contacts: Operator, grains: int) -> Array:
+        return count_bound(contacts, grains)
+
+
+@dataclass(frozen=True)
+class JacobiDiagonal(Jacobi):
+    """``Jacobi`` with D = diag(W), the classical choice, which does not bound W and diverges in dense flows.
+
+    Examples:
+      >>> JacobiDiagonal()
+      JacobiDiagonal(tolerance=0.0001, max_steps=5000, relaxation=1.8)
+    """
+
+    def bound(self, contacts: Operator, grains: int) -> Array:
+        return diagonal(contacts, grains)
+
+
+DEFAULT_SOLVER = BarzilaiBorwein()
+SOLVERS: dict[SolverName, type[ProjectedMethod]] = {  # by their names on the command line and in files
+    "barzilai-borwein": BarzilaiBorwein,
+    "nesterov": Nesterov,
+    "jacobi": Jacobi,
+    "jacobi-count": JacobiCount,
+    "jacobi-diagonal": JacobiDiagonal,
+}
+
+
+def solver_name(solver: ProjectedMethod) -> str:
+    """The name of a method in files and messages; that of a user's own class says where it is defined.
+
+    Examples:
+      >>> solver_name(Nesterov())
+      'nesterov'
+    """
+    kind = type(solver)
+    names = {cls: name for name, cls in SOLVERS.items()}
+    return names.get(kind, f"{kind.__module__}.{kind.__qualname__}")
+
+
+def solver_numbers(solver: ProjectedMethod) -> dict[str, Any]:
+    """The fields of a method in types of JSON; those that are no numbers as text.
+
+    Examples:
+      >>> solver_numbers(Nesterov(tolerance=1e-6))
+      {'tolerance': 1e-06, 'max_steps': 5000}
+    """
+    values = {field.name: getattr(solver, field.name) for field in fields(solver)}
+    return {name: _in_json(value) for name, value in values.items()}
+
+
+def _in_json(value: Any) -> Any:
+    number = concrete_or_none(value)
+    return repr(value) if number is None or number.dtype.kind not in "biuf" else number.tolist()
+
+
+def require_solver(solver: Any) -> None:
+    """Raise an InputError unless this is a projected method."""
+    if not isinstance(solver, ProjectedMethod):
+        raise InputError(f"solver must be a ProjectedMethod, such as jg.BarzilaiBorwein(), not {short_repr(solver)}.")
 
 
 def dot(a: Float[Array, " contacts"], b: Float[Array, " contacts"]) -> Float[Array, ""]:
     """Scalar product in full precision on every backend."""
     return jnp.dot(a, b, precision=lax.Precision.HIGHEST)
-
-
-def _relax(now: Iterate, relaxation: Array) -> tuple[Array, Array]:
-    return now.point, relaxation
-
-
-def _forget(now: Iterate, start: Array, point: Array, bound: Array, residual: Array) -> tuple[Array, ...]:
-    return now.memory
-
-
-def _extrapolate(now: Iterate, relaxation: Array) -> tuple[Array, Array]:
-    (k,) = now.memory
-    return now.point + k / (k + 3) * (now.point - now.previous), jnp.ones_like(k)
-
-
-def _restart_uphill(now: Iterate, start: Array, point: Array, bound: Array, residual: Array) -> tuple[Array, ...]:
-    uphill = dot(bound * (start[0] - point[0]), point[0] - now.point[0]) > 0
-    return (jnp.where(uphill, 0, now.memory[0] + 1),)
-
-
-def _stride(now: Iterate, relaxation: Array) -> tuple[Array, Array]:
-    stride, k, _ = now.memory
-    momentum = jnp.maximum(k, 0)
-    return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
-
-
-def _spectral_stride(now: Iterate, start: Array, point: Array, bound: Array, residual: Array) -> tuple[Array, ...]:
-    """Step length, momentum (negative as long as the method is not Nesterov's), best residual when last judged."""
-    _, k, before = now.memory
-    judged = now.iterations % WINDOW == WINDOW - 1
-    guarded = (k >= 0) | (judged & ~(residual < PROGRESS * before))
-    step, response = point - now.point
-    long = now.iterations % 2 == 1
-    left = jnp.where(long | guarded, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
-    own, mixed = dot(left, jnp.where(long | guarded, step, response)), dot(step, response)
-    over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
-    stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), LONGEST_STRIDE), LONGEST_STRIDE)
-    momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
-    return (
-        jnp.where(guarded, 1, stride),
-        jnp.where(guarded, momentum, -1),
-        jnp.where(judged, residual, before),
-    )
-
-
-METHODS: dict[Solver, Method] = {
-    "nesterov": Method(spectral_bound, (0.0,), _extrapolate, _restart_uphill),
-    "barzilai-borwein": Method(spectral_bound, (1.0, -1.0, float("inf")), _stride, _spectral_stride),
-    "jacobi": Method(spectral_bound, (), _relax, _forget),
-    "jacobi-count": Method(count_bound, (), _relax, _forget),
-    "jacobi-diagonal": Method(diagonal, (), _relax, _forget),
-}

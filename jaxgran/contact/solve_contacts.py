@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
 from jaxgran.contact.problem_checks import judged
+from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
 from jaxgran.contact.residuals import ContactResiduals, residuals_of
 from jaxgran.contact.solver import solve
-from jaxgran.model.checks import InputError, require_number, short_repr
-from jaxgran.model.choices import Solver
+from jaxgran.model.checks import require_number
 from jaxgran.model.flow import RANGES
+
+_DEFAULT = BarzilaiBorwein(tolerance=1e-6)
 
 
 @jax.tree_util.register_dataclass
@@ -43,23 +45,17 @@ class ContactSolution:
 def solve_contacts(
     problem: ContactProblem,
     restitution: float | Array = 0.0,
-    method: Solver = "barzilai-borwein",
-    tolerance: float | Array = 1e-6,
-    max_iterations: int | Array = 5000,
-    relaxation: float | Array = 1.8,
+    solver: ProjectedMethod = _DEFAULT,
 ) -> ContactSolution:
     """Impulses of a frictionless contact problem: 0 ≤ p ⟂ u⁺ + α u⁻ ≥ 0 with u⁺ = u⁻ + W p.
 
-    ==============  ===============================  ===========================================================
-    argument        type or shape                    meaning
-    ==============  ===============================  ===========================================================
-    problem         ContactNetwork, DelassusProblem  the contacts, or W and u⁻
-    restitution     ()                               α in [0, 1], Newton's: u⁺ = −α u⁻ where an impulse acts
-    method          name, static                     as ``ShearFlow(solver=…)``, see ``projected_methods``
-    tolerance       ()                               residual of the natural map to reach, in [1e-12, 0.1]
-    max_iterations  ()                               cap; the best iterate is then returned, with a status
-    relaxation      ()                               ω in (0, 2) of the Jacobi methods
-    ==============  ===============================  ===========================================================
+    ===========  ===============================  =====================================================================
+    argument     type or shape                    meaning
+    ===========  ===============================  =====================================================================
+    problem      ContactNetwork, DelassusProblem  the contacts, or W and u⁻
+    restitution  ()                               α in [0, 1], Newton's: u⁺ = −α u⁻ where an impulse acts
+    solver       ProjectedMethod                  the method, and the residual of the natural map to reach
+    ===========  ===============================  =====================================================================
 
     ``jit``, ``vmap`` and derivatives of impulses and velocities apply, in forward and in reverse mode. They are those
     of the solution, not of the iteration, and want a tolerance of 1e-8 or less. Where impulses are not unique, as in a
@@ -84,36 +80,25 @@ def solve_contacts(
       ([1.333, 0.667], [1.0, 0.0])
     """
     problem = judged(problem)
-    if method not in get_args(Solver):
-        raise InputError(f"method must be one of {', '.join(get_args(Solver))}, not {short_repr(method)}.")
-    numbers = {
-        "restitution": restitution,
-        "tolerance": tolerance,
-        "max_iterations": max_iterations,
-        "relaxation": relaxation,
-    }
-    for name, value in numbers.items():
-        require_number(name, value, *RANGES[name])
+    require_number("restitution", restitution, *RANGES["restitution"])
+    require_solver(solver)
     kind: Any = problem.approach.dtype
-    types = {"max_iterations": jnp.int32}
-    return _solved(problem, method, *(jnp.asarray(value, types.get(name, kind)) for name, value in numbers.items()))
+    return _solved(problem, jnp.asarray(restitution, kind), jax.tree.map(partial(_of_precision, kind), solver))
 
 
-@partial(jax.jit, static_argnums=1)
-def _solved(
-    problem: ContactProblem,
-    method: Solver,
-    restitution: Array,
-    tolerance: Array,
-    max_iterations: Array,
-    relaxation: Array,
-) -> ContactSolution:
+def _of_precision(kind: Any, number: Any) -> Array:
+    """A number of the solver in the precision of the problem; whole numbers stay whole."""
+    return jnp.asarray(number, kind if jnp.issubdtype(jnp.result_type(number), jnp.floating) else jnp.int32)
+
+
+@jax.jit
+def _solved(problem: ContactProblem, restitution: Array, solver: ProjectedMethod) -> ContactSolution:
     network = isinstance(problem, ContactNetwork)
     operator = as_contacts(problem) if network else problem
     grains = problem.masses.size if network else 0
     fastest = jax.lax.stop_gradient(jnp.max(jnp.abs(operator.approach)))
     always = jnp.asarray(True)
-    solution = solve(operator, grains, fastest, tolerance, max_iterations, relaxation, method, always)
+    solution = solve(operator, grains, fastest, solver, always)
     impulses = (1 + restitution) * solution.impulses
     return ContactSolution(
         impulses=impulses,

@@ -1,4 +1,4 @@
-"""Impulses of a contact network: the loop that runs a projected method until its residual is small.
+"""Impulses of a contact network: the loop that runs a projected method until the residual is small.
 
 With normal impulses p and the Delassus operator W = H M⁻¹ Hᵀ the contact law of a step is
 
@@ -31,8 +31,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.delassus import Operator, delassus_product, diagonal
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
 from jaxgran.contact.network import Contacts
-from jaxgran.contact.projected_methods import METHODS, Iterate, dot
-from jaxgran.model.choices import Solver
+from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
 
@@ -63,16 +62,9 @@ class Solution:
     status: Int[Array, ""]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1, 6))
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
 def solve(
-    contacts: Operator,
-    grains: int,
-    shear_rate: float | Array,
-    tolerance: float | Array,
-    max_iterations: int | Array,
-    relaxation: float | Array,
-    method: Solver,
-    active: Array,
+    contacts: Operator, grains: int, shear_rate: float | Array, solver: ProjectedMethod, active: Array
 ) -> Solution:
     """Impulses p₀ of the network at restitution zero: 0 ≤ p₀ ⟂ W p₀ + u⁻ ≥ 0.
 
@@ -80,10 +72,7 @@ def solve(
       contacts: the network, or a problem given by its matrix.
       grains: number of grains; not used with a matrix.
       shear_rate: γ̇; sets the absolute floor of the residual.
-      tolerance: relative residual to reach.
-      max_iterations: cap; beyond it the best iterate is returned with a status.
-      relaxation: ω of the Jacobi methods; the others do not use it.
-      method: name of a projected method, see ``projected_methods``.
+      solver: the projected method, with its tolerance and its largest number of iterations.
       active: whether this replica has something to solve; others of its batch return zero impulses.
 
     Impulses and response have derivatives with respect to the network, see the module; all else has none.
@@ -91,26 +80,28 @@ def solve(
     b, own = contacts.approach, diagonal(contacts, grains)
     if b.size == 1 and isinstance(contacts, Contacts):
         return _single_contact(b, own, active)
-    rule = METHODS[method]
-    bound = rule.bound(contacts, grains)
+    bound = solver.bound(contacts, grains)
     scale = jnp.sqrt(dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
-    target = residual_target(scale, tolerance, shear_rate, jnp.finfo(b.dtype).eps)
-    relaxation = jnp.asarray(relaxation, b.dtype)
+    target = residual_target(scale, solver.tolerance, shear_rate, jnp.finfo(b.dtype).eps)
+
+    def as_numbers(values: Any) -> Any:
+        """What a method returns, in the precision of the contacts."""
+        return jax.tree.map(lambda x: jnp.asarray(x, b.dtype), values)
 
     def unfinished(now: _Progress):
-        going = ~(now.residual <= target) & (now.at.iterations < max_iterations) & jnp.isfinite(now.residual)
+        going = ~(now.residual <= target) & (now.at.iterations < solver.max_steps) & jnp.isfinite(now.residual)
         return active & (going | (now.at.iterations == 0))
 
     def iterate(now: _Progress) -> _Progress:
         at = now.at
-        start, step = rule.propose(at, relaxation)
+        start, step = as_numbers(solver.propose(at))
         impulses = jnp.maximum(0, start[0] - step * (start[1] + b) / bound)
         point = jnp.stack([impulses, delassus_product(contacts, impulses, grains)])
         error = jnp.minimum(own * impulses, point[1] + b)
         residual = jnp.sqrt(dot(error, error))
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
-        memory = rule.learn(at, start, point, bound, best_residual)
+        memory = as_numbers(solver.learn(at, start, point, bound, best_residual))
         new = _Progress(
             at=Iterate(point, at.point, memory, best_residual, at.iterations + 1),
             residual=residual,
@@ -119,8 +110,7 @@ def solve(
         return where_active(unfinished(now), new, now)
 
     zero, infinite = jnp.zeros((2, b.size), b.dtype), jnp.asarray(jnp.inf, b.dtype)
-    memory = tuple(jnp.asarray(value, b.dtype) for value in rule.memory)
-    start = Iterate(zero, zero, memory, infinite, jnp.int32(0))
+    start = Iterate(zero, zero, as_numbers(solver.init(b)), infinite, jnp.int32(0))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, _Progress(start, infinite, zero))
     impulses, response = end.best
 
@@ -141,9 +131,9 @@ def solve(
 
 
 @solve.defjvp
-def _solve_jvp(grains: int, method: Solver, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    contacts, shear_rate, tolerance, max_iterations, relaxation, active = primals
-    solution = solve(contacts, grains, shear_rate, tolerance, max_iterations, relaxation, method, active)
+def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    contacts, shear_rate, solver, active = primals
+    solution = solve(contacts, grains, shear_rate, solver, active)
     impulses, pressing = solution.impulses, solution.impulses > 0
     own = diagonal(contacts, grains)
 

@@ -1,6 +1,6 @@
 """Advances one replica through time, with the engine that ``dynamics.engine`` selects.
 
-XLA calls the numba engine through its foreign function interface. The thread block is a Pallas kernel. So ``jit``,
+XLA calls the numba engine through its foreign function interface, and the engine ``Pallas`` is a kernel. So ``jit``,
 ``lax.map`` and ``vmap`` apply to all engines.
 """
 
@@ -12,16 +12,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.dynamics import jax_engine
-from jaxgran.dynamics.engine import select_engine
-from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, require_advance
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.engine import Engine, Jax, Numba, checked_numerics, select_engine
+from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, advance_by_jax, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.state import State
 
-_CompiledEngine = Callable[[ShearFlow, State, Array], tuple[State, Tally]]
+_CompiledEngine = Callable[[ShearFlow, ProjectedMethod, State, Array], tuple[State, Tally]]
 
 
 def advance(
@@ -31,13 +31,16 @@ def advance(
     free_flight: bool = True,
     events: int | None = None,
     moving_contacts: bool = False,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
 ) -> tuple[State, Tally]:
     """Advance one replica by a number of time steps.
 
-    The field ``engine`` of the flow selects the engine. "auto" selects a compiled one on a processor or an NVIDIA GPU,
-    if the solver is the default and only the first three arguments are given. It solves the same steps to the same
-    tolerance as the engine "jax". On a processor it is typically 5 to 7 times faster. The engines differ by rounding
-    and within the tolerance only.
+    Without an ``engine`` a compiled one is taken on a processor or an NVIDIA GPU, if the solver is a
+    ``BarzilaiBorwein`` and ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. All
+    engines solve the same steps to the same tolerance. On a processor ``Numba`` is typically 5 to 7 times faster than
+    ``Jax``. The engines differ by rounding and within the tolerance only.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
     (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
@@ -53,35 +56,41 @@ def advance(
         ``count_events`` counts them. If they are too few, the status is ``capacity``. None visits as many as needed.
       moving_contacts: whether derivatives include the shift of the contacts in time, see
         ``dynamics.jax_engine``. Values do not change.
+      solver: solves the contacts of each step. New numbers in it do not recompile.
+      engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for an automatic choice, see ``dynamics.engine``.
 
     Returns:
       The state after the last step, and the tally of the steps. A replica with a number that is not finite stops with
       the status ``nonfinite``. On a GPU, a replica whose lists are full stops with ``capacity``.
 
     Raises:
-      InputError: the flow names an engine that cannot do this, or a derivative in reverse mode lacks ``events``.
+      InputError: the engine cannot do this, or a derivative in reverse mode lacks ``events``.
     """
     require_advance(flow, state, steps)
+    numerics = checked_numerics(solver, engine)
     if events is None:
-        flow, state = forward_only((flow, state), NEEDS_EVENTS)
+        flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
     options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
-    engine = select_engine(flow, state, " and ".join(name for name, given in options.items() if given))
-    if engine == "jax":
-        return jax_engine.advance(flow, state, steps, free_flight, events, moving_contacts)
-    return _advance(numba if engine == "numba" else pallas, flow, state, steps)
+    selected = select_engine(flow, numerics, state, " and ".join(name for name, given in options.items() if given))
+    if isinstance(selected, Jax):
+        return advance_by_jax(flow, numerics.solver, state, steps, free_flight, events, moving_contacts)
+    compiled = advance_by_numba if isinstance(selected, Numba) else advance_by_pallas
+    return _advance_compiled(compiled, flow, numerics.solver, state, steps)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _advance(engine: _CompiledEngine, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """The advance by a compiled engine; its derivatives are those of the engine "jax"."""
-    return engine(flow, state, steps)
+def _advance_compiled(
+    engine: _CompiledEngine, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally]:
+    """The advance by a compiled engine; its derivatives are those of the engine ``Jax``."""
+    return engine(flow, solver, state, steps)
 
 
-@_advance.defjvp
-def _advance_jvp(
+@_advance_compiled.defjvp
+def _advance_compiled_jvp(
     engine: _CompiledEngine, primals: tuple, tangents: tuple
 ) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
-    return jax.jvp(jax_engine.advance, primals, tangents)
+    return jax.jvp(advance_by_jax, primals, tangents)
 
 
 def register_numba() -> None:
@@ -91,19 +100,19 @@ def register_numba() -> None:
     ffi.register()
 
 
-def numba(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+def advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the numba engine."""
-    end, sums, _, _ = call_numba(flow, state, steps)
+    end, sums, _, _ = call_numba(flow, solver, state, steps)
     return ended(state, end.positions, end.tilt, end.velocities, sums)
 
 
 def call_numba(
-    flow: ShearFlow, state: State, steps: Array, solved: Array | int = 0, room: int = 0
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array, solved: Array | int = 0, room: int = 0
 ) -> tuple[State, RunningSums, Array, Array]:
-    """What one call of the numba engine leaves.
+    """Run the numba engine once.
 
     Args:
-      flow, state, steps: as in ``advance``.
+      flow, solver, state, steps: as in ``advance``.
       solved: whether the contacts of the first step have acted already.
       room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
 
@@ -115,8 +124,8 @@ def call_numba(
 
     register_numba()
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
-    numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
-    numbers = (*numbers, flow.activation_fraction, flow.max_iterations, steps, solved)
+    numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
+    numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, solved)
     memory = layout.WORDS + layout.WORDS_PER_GRAIN * count
     record = layout.RECORD_HEAD + (layout.RECORD_OF_GRAIN + 3 * layout.RECORD_OF_CONTACT) * count
     shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,), (room, record)]
@@ -130,8 +139,9 @@ def call_numba(
     return end, sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32)), found, records
 
 
-def pallas(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica with the GPU kernel of ``pallas``, or with the engine "jax" on another device."""
-    from jaxgran.dynamics.pallas_engine.kernel import advance
+def advance_by_pallas(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica with the GPU kernel, or with the engine ``Jax`` on another device."""
+    from jaxgran.dynamics.pallas_engine import kernel
 
-    return lax.platform_dependent(flow, state, steps, cuda=advance, default=jax_engine.advance)
+    engines = {"cuda": kernel.advance_by_pallas, "default": advance_by_jax}
+    return lax.platform_dependent(flow, solver, state, steps, **engines)

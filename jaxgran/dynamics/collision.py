@@ -11,6 +11,7 @@ from jaxgran.contact.delassus import grain_impulses, in_clusters
 from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, contact_network, first_contact_time, is_contact
+from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.flight import PairMotion, pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
@@ -25,12 +26,14 @@ Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: 
 
 
 class AdvanceOptions(NamedTuple):
-    """Options of the plain engine that are static when it is compiled.
+    """How the engine ``Jax`` advances a flow.
 
-    buffers: how many of the contact buffers are compiled, the largest ones; None for all of them. moving_contacts:
-    whether derivatives include that a contact moves in time. observe: a function of the user's, or None.
+    solver: solves the contacts. buffers: how many of the contact buffers are compiled, the largest ones; None for all
+    of them. moving_contacts: whether derivatives include that a contact moves in time. observe: a function of the
+    user's, or None. All but the numbers of the solver are static.
     """
 
+    solver: ProjectedMethod
     buffers: int | None = None
     moving_contacts: bool = False
     observe: Observe | None = None
@@ -93,7 +96,7 @@ def collide(
         def collided():
             index = set_bits(words, capacity, contact.size)
             network = contact_network(index, near, separations, pairs.velocities(), grains)
-            impulses, new = _impulses(flow, network, count > capacity, sums, grains, meets)
+            impulses, new = _impulses(flow, options.solver, network, count > capacity, sums, grains, meets)
             if observe_now is not None:
                 new = new._replace(user_sums=with_contacts(sums.user_sums, observe_now, network, impulses))
             change = _velocity_changes(network, impulses, grains)
@@ -167,13 +170,17 @@ def _velocity_changes(network: Contacts, impulses: Array, grains: Grains):
 
 
 def _impulses(
-    flow: ShearFlow, network: Contacts, overflow: Array, sums: RunningSums, grains: Grains, meets: Array
+    flow: ShearFlow,
+    solver: ProjectedMethod,
+    network: Contacts,
+    overflow: Array,
+    sums: RunningSums,
+    grains: Grains,
+    meets: Array,
 ) -> tuple[Array, RunningSums]:
     """Impulses of a network, and the sums with its contribution."""
     count = grains.radii.size
-    solution = solve(
-        network, count, flow.shear_rate, flow.tolerance, flow.max_iterations, flow.relaxation, flow.solver, meets
-    )
+    solution = solve(network, count, flow.shear_rate, solver, meets)
     one_plus_alpha = 1 + flow.restitution
     impulses = one_plus_alpha * solution.impulses
     approach, (nx, ny), distance = network.approach, network.normals.T, network.distances

@@ -1,120 +1,204 @@
-"""Selects the engine that advances a flow: by name, or for the backend, precision and solver.
+"""The engines that advance a flow, and the choice of one for the backend, precision and solver.
 
-================  ====================================  ============================================================
-engine            for                                   needs
-================  ====================================  ============================================================
-numba      processors                            float64, the default solver, no ``vmap`` with a named axis
-pallas      NVIDIA GPUs                           at most 1024 grains, the default solver
-jax               everything else, and as reference     nothing: every backend, precision, solver and derivative
-auto              every flow                            nothing: the engine of the backend if possible, or else jax
-================  ====================================  ============================================================
+=========  =====================================  ==========================================================
+engine     for                                    needs
+=========  =====================================  ==========================================================
+Numba      processors                             float64, the default solver, no ``vmap`` with a named axis
+Pallas     NVIDIA GPUs                            at most 1024 grains, the default solver
+Jax        everything else, and as the reference  nothing: every backend, precision, solver and derivative
+=========  =====================================  ==========================================================
 
-All engines solve the same steps to the same tolerance. Derivatives and steps without free flight run in the engine
-"jax" only, and ``observe`` in it and in the numba engine. "auto" selects an engine that can. A named engine that cannot
-raises an InputError.
+All engines solve the same steps to the same tolerance, and differ in speed and rounding. Derivatives and steps without
+free flight run in the engine ``Jax`` only, and ``observe`` in it and in ``Numba``. Where no engine is given, that of
+the backend is taken if it can do what is asked for, and otherwise ``Jax``. A given engine that cannot raises an
+InputError.
 """
 
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from jaxgran.model.checks import InputError
-from jaxgran.model.choices import Engine
+from jaxgran.contact.projected_methods import (
+    DEFAULT_SOLVER,
+    BarzilaiBorwein,
+    ProjectedMethod,
+    require_solver,
+    solver_name,
+)
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
-_DEFAULT_SOLVER = ShearFlow.__dataclass_fields__["solver"].default
-_ENGINE_OF_PLATFORM: dict[str, Engine] = {"cpu": "numba", "gpu": "pallas"}
 _SINGLE_PRECISION = (
     "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
     'begin with jax.config.update("jax_enable_x64", True).'
 )
-_OPTIONS_OF_ENGINE = {"numba": ("observe",)}
-_SOLVER_OF_ENGINE = {"numba": "gauss-seidel, barzilai-borwein where stiff", "pallas": "barzilai-borwein"}
 
 
-def select_engine(flow: ShearFlow, state: State | None = None, option: str = "") -> Engine:
-    """Selects the engine for the backend, precision and solver: ``numba``, ``pallas`` or ``jax``.
+@dataclass(frozen=True)
+class Jax:
+    """The engine in JAX: every backend, precision and solver, and derivatives.
+
+    A map or a batch that names this engine advances its replicas in lockstep by ``vmap``, also on a processor.
+
+    Examples:
+      >>> Jax()
+      Jax()
+    """
+
+    name: ClassVar[str] = "jax"
+
+
+@dataclass(frozen=True)
+class Numba:
+    """The engine for processors, compiled by numba: float64 and the solver ``BarzilaiBorwein`` only.
+
+    It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to its ``tolerance`` and
+    within its ``max_steps``.
+
+    Examples:
+      >>> Numba()
+      Numba()
+    """
+
+    name: ClassVar[str] = "numba"
+    platform: ClassVar[str] = "cpu"
+    hardware: ClassVar[str] = "processors"
+    options: ClassVar[tuple[str, ...]] = ("observe",)
+    solver: ClassVar[str] = "gauss-seidel, barzilai-borwein where stiff"
+
+
+@dataclass(frozen=True)
+class Pallas:
+    """The engine for NVIDIA GPUs, one kernel for all steps: up to 1024 grains and the solver ``BarzilaiBorwein`` only.
+
+    Examples:
+      >>> Pallas()
+      Pallas()
+    """
+
+    name: ClassVar[str] = "pallas"
+    platform: ClassVar[str] = "gpu"
+    hardware: ClassVar[str] = "NVIDIA GPUs"
+    options: ClassVar[tuple[str, ...]] = ()
+    solver: ClassVar[str] = "barzilai-borwein"
+
+
+Engine = Jax | Numba | Pallas
+
+
+def engine_named(name: str) -> Engine | None:
+    """The engine by its name on the command line and in files; None for "auto".
+
+    Examples:
+      >>> engine_named("numba"), engine_named("auto")
+      (Numba(), None)
+    """
+    return {"auto": None, **{kind.name: kind() for kind in (Jax, Numba, Pallas)}}[name]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Numerics:
+    """How a flow is computed, as one value: the solver of its contacts, and the engine, None for automatic."""
+
+    solver: ProjectedMethod = DEFAULT_SOLVER
+    engine: Engine | None = field(default=None, metadata={"static": True})
+
+
+DEFAULT_NUMERICS = Numerics()
+
+
+def checked_numerics(solver: Any, engine: Any) -> Numerics:
+    """Solver and engine as one value; InputError unless they are a projected method, and an engine or None."""
+    require_solver(solver)
+    if engine is not None and not isinstance(engine, Engine):
+        raise InputError(f"engine must be jg.Jax(), jg.Numba(), jg.Pallas() or None, not {short_repr(engine)}.")
+    return Numerics(solver, engine)
+
+
+def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = None, option: str = "") -> Engine:
+    """The engine that advances a flow, for the backend, precision and solver.
 
     Args:
-      flow: gives the engine, the solver and the number of grains; it may be a batch.
+      flow: gives the number of grains; it may be a batch.
+      numerics: the solver, and the engine that was asked for.
       state: gives the precision; None for JAX's default precision.
       option: name of an option that not all engines have; "" if there is none.
 
     Raises:
-      InputError: the flow names an engine that cannot do this.
+      InputError: the engine that was asked for cannot do this.
     """
-    if flow.engine == "jax":
-        return "jax"
+    requested = numerics.engine
+    if isinstance(requested, Jax):
+        return requested
     device = _device()
-    engine = _ENGINE_OF_PLATFORM.get(device.platform) if flow.engine == "auto" else flow.engine
+    engine = requested or next((kind() for kind in (Numba, Pallas) if kind.platform == device.platform), None)
     if engine is None:
-        return "jax"
-    option = "" if option in _OPTIONS_OF_ENGINE.get(engine, ()) else option
-    obstacle = _obstacle(engine, flow, state, option, device)
-    if obstacle is None and engine == "pallas":
-        obstacle = _kernel_obstacle(flow, state, device)
-    if obstacle is None:
+        return Jax()
+    option = "" if option in engine.options else option
+    why = _why_unsupported(engine, flow, numerics.solver, state, option, device)
+    if why is None and isinstance(engine, Pallas):
+        why = _why_no_kernel(requested is None, flow, state, device)
+    if why is None:
         return engine
-    if flow.engine == "auto":
-        if state is not None and engine == "numba" and _only_precision_is_missing(flow, option):
+    if requested is None:
+        other = option or not _is_default(numerics.solver) or in_batch()
+        if state is not None and isinstance(engine, Numba) and not other and not jax.config.read("jax_enable_x64"):
             _warn_once(_SINGLE_PRECISION)
-        return "jax"
-    where, why = obstacle
-    raise InputError(f"engine must be auto or jax {where}, not {engine}: {why}.")
+        return Jax()
+    where, reason = why
+    raise InputError(f"engine must be jax or chosen automatically {where}, not {engine.name}: {reason}.")
 
 
-def solver_in_use(engine: Engine, solver: str) -> str:
+def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
     """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in all of them.
 
     Examples:
-      >>> solver_in_use("jax", "jacobi")
-      'jacobi'
-      >>> solver_in_use("numba", "barzilai-borwein")
-      'gauss-seidel, barzilai-borwein where stiff'
+      >>> solver_in_use(Jax(), DEFAULT_SOLVER), solver_in_use(Numba(), DEFAULT_SOLVER)
+      ('barzilai-borwein', 'gauss-seidel, barzilai-borwein where stiff')
     """
-    return _SOLVER_OF_ENGINE.get(engine, solver)
+    return solver_name(solver) if isinstance(engine, Jax) else engine.solver
 
 
-def _obstacle(engine: Engine, flow: ShearFlow, state: State | None, option: str, device: Any) -> tuple[str, str] | None:
+def _is_default(solver: ProjectedMethod) -> bool:
+    """Whether this is the method that all engines have, with any tolerance."""
+    return type(solver) is BarzilaiBorwein
+
+
+def _why_unsupported(
+    engine: Numba | Pallas, flow: ShearFlow, solver: ProjectedMethod, state: State | None, option: str, device: Any
+) -> tuple[str, str] | None:
     """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
-    if _ENGINE_OF_PLATFORM.get(device.platform) != engine:
-        made_for = "processors" if engine == "numba" else "NVIDIA GPUs"
-        return f"on a {device.platform.upper()}", f"it is made for {made_for}"
+    if device.platform != engine.platform:
+        return f"on a {device.platform.upper()}", f"it is made for {engine.hardware}"
     if option:
-        others = [name for name, options in _OPTIONS_OF_ENGINE.items() if option in options]
-        return f"with {option}", f"only the engine {' or '.join([*others, 'jax'])} does that"
-    if flow.solver != _DEFAULT_SOLVER:
-        return f"with the solver {flow.solver}", "it has a contact solve of its own"
-    if engine == "numba" and _dtype(state) != jnp.float64:
+        others = [kind.name for kind in (Numba, Pallas) if option in kind.options]
+        return f"with {option}", f"only the engine {' or '.join([*others, Jax.name])} does that"
+    if not _is_default(solver):
+        return f"with the solver {solver_name(solver)}", "it has a contact solve of its own"
+    if isinstance(engine, Numba) and _dtype(state) != jnp.float64:
         return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
-    if engine == "numba" and in_batch():
+    if isinstance(engine, Numba) and in_batch():
         return f"in a vmap with the axis name {AXIS!r}", "it advances one replica after another, as in jax.lax.map"
-    if engine == "pallas" and flow.grains > MOST_GRAINS:
+    if isinstance(engine, Pallas) and flow.grains > MOST_GRAINS:
         return f"with more than {MOST_GRAINS} grains", "every grain has a thread of one block"
     return None
 
 
-def _only_precision_is_missing(flow: ShearFlow, option: str) -> bool:
-    """Whether the numba engine would advance the flow if double precision were switched on."""
-    other = option or flow.solver != _DEFAULT_SOLVER or in_batch()
-    return not other and not jax.config.read("jax_enable_x64")
-
-
-def _kernel_obstacle(flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
-    """The obstacle that a trial of the GPU kernel finds; with the engine "auto", a warning reports it."""
+def _why_no_kernel(automatic: bool, flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
+    """Why a trial of the GPU kernel failed, or None; where the choice is automatic, a warning says so."""
     problem = _kernel_problem(flow.grains, _dtype(state), device, jax.config.read("jax_enable_x64"))
-    if not problem:
-        return None
-    if flow.engine == "auto":
+    if problem and automatic:
         _warn_once(f"flows take the engine jax: the kernel for GPUs does not run here ({problem}).")
-    return "here", f"the kernel for GPUs does not run ({problem})"
+    return ("here", f"the kernel for GPUs does not run ({problem})") if problem else None
 
 
 def _dtype(state: State | None) -> jnp.dtype:
@@ -146,5 +230,5 @@ def _kernel_problem(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> st
 
 
 @cache
-def _warn_once(words: str) -> None:
-    warnings.warn(words, stacklevel=2)
+def _warn_once(message: str) -> None:
+    warnings.warn(message, stacklevel=2)

@@ -1,4 +1,4 @@
-"""The plain engine: the advance of one replica in JAX, which derivatives go through and every backend runs.
+"""The engine ``Jax``: one replica through time in JAX, on every backend, with every solver, and with derivatives.
 
 A time step finds the contacts at its beginning, changes the velocities by the impulses of the contact network, and
 flies freely for dt. Between contacts the velocity in the laboratory frame is constant, so separations are linear
@@ -24,6 +24,7 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.near_pairs import PairLists, pair_lists, present
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_capacities, shifted
 from jaxgran.dynamics.flight import LONGEST_FLIGHT, Carry, add_flight, fly, fresh_lists, pairs_now, steps_to_contact
 from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
@@ -52,20 +53,21 @@ def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
     require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
 
 
-def advance(
+def advance_by_jax(
     flow: ShearFlow,
+    solver: ProjectedMethod,
     state: State,
     steps: Int[Array, ""],
     free_flight: bool = True,
     events: int | None = None,
     moving_contacts: bool = False,
 ) -> tuple[State, Tally]:
-    """Advance one replica by the plain engine.
+    """Advance one replica by the engine ``Jax``.
 
-    Arguments, derivatives and results are those of the public ``advance``, see ``dynamics.advance``.
+    Arguments, derivatives and results are those of ``dynamics.advance``.
     """
     buffers = None if events is None and not moving_contacts else _FEW_BUFFERS
-    options = AdvanceOptions(buffers, moving_contacts)
+    options = AdvanceOptions(solver, buffers, moving_contacts)
     start, body, unfinished = _event_loop(flow, state, steps, free_flight, options)
     if events is None:
         end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
@@ -75,12 +77,12 @@ def advance(
     return _ended(state, end, unfinished)
 
 
-def advance_observed(
-    flow: ShearFlow, state: State, steps: Int[Array, ""], observe: Observe
+def observe_by_jax(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
-    """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
-    flow, state = forward_only((flow, state), NEEDS_EVENTS)
-    start, body, unfinished = _event_loop(flow, state, steps, True, AdvanceOptions(observe=observe))
+    """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
+    flow, solver, state = forward_only((flow, solver, state), NEEDS_EVENTS)
+    start, body, unfinished = _event_loop(flow, state, steps, True, AdvanceOptions(solver, observe=observe))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
     return *_ended(state, end, unfinished), end.sums.user_sums.sums
 
@@ -106,10 +108,22 @@ def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: 
     return end, replace(tally, status=status)
 
 
-def count_events(flow: ShearFlow, state: State, steps: Int[Array, ""], free_flight: bool = True) -> Int[Array, ""]:
-    """Evaluations that an advance takes: the ``events`` that it needs in a loop of fixed length."""
-    flow, state = forward_only((flow, state), "count_events returns a whole number, which has no derivative.")
-    start, body, unfinished = _event_loop(flow, state, steps, free_flight, AdvanceOptions())
+def count_events(
+    flow: ShearFlow,
+    state: State,
+    steps: Int[Array, ""],
+    free_flight: bool = True,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+) -> Int[Array, ""]:
+    """Steps that an advance by the engine ``Jax`` visits: the ``events`` that it needs in a loop of fixed length.
+
+    Arguments and errors are those of ``advance``.
+    """
+    require_solver(solver)
+    words = "count_events returns a whole number, which has no derivative."
+    flow, solver, state = forward_only((flow, solver, state), words)
+    start, body, unfinished = _event_loop(flow, state, steps, free_flight, AdvanceOptions(solver))
     counted = jnp.int32(0), start
     return lax.while_loop(lambda at: any_replica(unfinished(at[1])), lambda at: (at[0] + 1, body(at[1])), counted)[0]
 

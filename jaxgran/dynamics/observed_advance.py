@@ -15,11 +15,11 @@ from jaxtyping import Array, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.advance import call_numba
 from jaxgran.dynamics.collision import Observe
-from jaxgran.dynamics.engine import select_engine
-from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, require_advance
-from jaxgran.dynamics.jax_engine import advance_observed as plain_advance
+from jaxgran.dynamics.engine import Jax, Numerics, select_engine
+from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, observe_by_jax, require_advance
 from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
 from jaxgran.dynamics.tally import Tally, empty_sums, place_of
 from jaxgran.model.cell import wrap
@@ -34,18 +34,19 @@ _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
 def advance_observed(
-    flow: ShearFlow, state: State, steps: Int[Array, ""], observe: Observe
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
     """``advance``, and the sum over all its time steps of what a function finds in them, see ``observer``.
 
     Raises:
-      InputError: the flow names an engine that cannot do this, or the function returns something else than sums.
+      InputError: the engine asked for cannot do this, or the function returns something else than sums.
     """
     require_advance(flow, state, steps)
-    flow, state = forward_only((flow, state), NEEDS_EVENTS)
-    if select_engine(flow, state, "observe") == "jax" or _depends_on_traced(observe, flow, state):
-        return plain_advance(flow, state, steps, observe)
-    return _recorded(observe, flow, state, steps)
+    flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
+    engine = select_engine(flow, numerics, state, "observe")
+    if isinstance(engine, Jax) or _depends_on_traced(observe, flow, state):
+        return observe_by_jax(flow, numerics.solver, state, steps, observe)
+    return _recorded(observe, flow, numerics.solver, state, steps)
 
 
 def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
@@ -60,8 +61,10 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally, Any]:
-    """``advance_observed`` with the numba engine; its derivatives are those of the engine "jax"."""
+def _recorded(
+    observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
+) -> tuple[State, Tally, Any]:
+    """``advance_observed`` with the numba engine; its derivatives are those of the engine ``Jax``."""
 
     def unfinished(now) -> Array:
         _, done, _, sums = now
@@ -69,7 +72,7 @@ def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> 
 
     def called(now):
         state, done, solved, sums = now
-        end, new, found, records = call_numba(flow, state, steps - done, solved, _ROOM)
+        end, new, found, records = call_numba(flow, solver, state, steps - done, solved, _ROOM)
         flown = found[place_of("steps")]
         user_sums = _with_records(flow, state, observe, sums.user_sums, records, found, flown)
         return end, done + flown.astype(done.dtype), _solved(found), sums.joined(new._replace(user_sums=user_sums))
@@ -84,7 +87,7 @@ def _recorded(observe: Observe, flow: ShearFlow, state: State, steps: Array) -> 
 
 @_recorded.defjvp
 def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
-    return jax.jvp(lambda flow, state, steps: plain_advance(flow, state, steps, observe), primals, tangents)
+    return jax.jvp(partial(observe_by_jax, observe=observe), primals, tangents)
 
 
 def _solved(found: Array) -> Array:

@@ -14,9 +14,11 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.collision import contacts_now
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
@@ -52,19 +54,10 @@ class Snapshot:
     status: Int[Array, "*times"]
 
 
-def snapshot(flow: ShearFlow, state: State) -> Snapshot:
+def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
     """The snapshot of a flow now: the contact network of the next step is solved, and nothing moves."""
     network = contacts_now(flow, state)
-    solution = solve(
-        network,
-        flow.grains,
-        flow.shear_rate,
-        flow.tolerance,
-        flow.max_iterations,
-        flow.relaxation,
-        flow.solver,
-        jnp.any(network.approach < 0),
-    )
+    solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
     restitution = jnp.asarray(flow.restitution, state.side.dtype)
     return snapshot_of(flow, state, network, (1 + restitution) * solution.impulses, solution.status)
 
@@ -77,7 +70,15 @@ def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Arr
     return Snapshot(state, contacts, impulses, timestep, shear_rate, restitution, status)
 
 
-def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count: int) -> tuple[State, Snapshot]:
+def snapshot_series(
+    flow: ShearFlow,
+    state: State,
+    strain: float | Array,
+    count: int,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
+) -> tuple[State, Snapshot]:
     """Shear a flow and take snapshots at equal intervals of strain; ``jit``, ``vmap`` and ``lax.map`` apply.
 
     Args:
@@ -86,28 +87,31 @@ def snapshot_series(flow: ShearFlow, state: State, strain: float | Array, count:
       strain: total strain, rounded to whole time steps. A new value does not recompile.
       count: number of snapshots, static. The first is taken after a strain of ``strain / count``. With a strain of
         ``count`` time steps, there is a snapshot of every step.
+      solver, engine: as in ``advance``; the solver also solves the contacts of the snapshots.
 
     Returns:
       The final state, which is that of the last snapshot, and the snapshots with a leading (times,) axis.
 
     Raises:
       InputError: (a ValueError) the strain is not a positive number, is shorter than one time step a snapshot, or is
-        longer than 2**31 - 1 time steps.
+        longer than 2**31 - 1 time steps; or the engine cannot do this.
     """
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_GRAIN_SNAPSHOTS // flow.grains, "as memory is limited")
     require_strain(flow, strain, count)
-    return _snapshot_series(flow, state, strain, count)
+    return _snapshot_series(flow, checked_numerics(solver, engine), state, strain, count)
 
 
 @partial(jax.jit, static_argnames="count")
-def _snapshot_series(flow: ShearFlow, state: State, strain: Array, count: int) -> tuple[State, Snapshot]:
+def _snapshot_series(
+    flow: ShearFlow, numerics: Numerics, state: State, strain: Array, count: int
+) -> tuple[State, Snapshot]:
     steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
     edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
 
     def next_snapshot(state: State, steps: Array) -> tuple[State, Snapshot]:
-        state, tally = advance(flow, state, steps)
-        new = snapshot(flow, state)
+        state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+        new = snapshot(flow, state, numerics.solver)
         return state, replace(new, status=jnp.maximum(new.status, tally.status))
 
     return lax.scan(next_snapshot, state, jnp.diff(edges).astype(jnp.int32))

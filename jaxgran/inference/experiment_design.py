@@ -22,7 +22,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.inference.collision_model import Collisions
 from jaxgran.inference.collisions import LONGEST, Candidates, Flights, Noise, candidates, flights_of, relative_step
 from jaxgran.inference.restitution import LEAST_NOISE, LONGEST_STEP
@@ -115,6 +117,8 @@ def fisher_information(
     frame_strain: float | None = None,
     missing: float = 0.0,
     key: Array | None = None,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
 ) -> FisherInformation:
     """How well ``fit_restitution`` will know the restitution of a flow from tracks that are yet to be measured.
 
@@ -128,6 +132,8 @@ def fisher_information(
         collisions of a disc, and no step above 0.2 diameters.
       missing: probability with which a disc is not seen in a frame.
       key: JAX random key of the simulation and its noise; None for that of the seed 0.
+      solver: solves the contacts; the trajectories have a tolerance of at most 1e-8.
+      engine: as in ``sample``.
 
     Raises:
       InputError: (a ValueError) a number is outside its range, the flow is not sheared, or nothing will be learnt: the
@@ -148,17 +154,16 @@ def fisher_information(
     key = jax.random.key(0) if key is None else key
     require_key(key)
     with jax.enable_x64(True):
-        return _expected(_part(flow), flow.grains, frames, noise, frame_strain, float(missing), key)
+        return _expected(
+            _part(flow), checked_numerics(solver, engine), flow.grains, frames, noise, frame_strain, float(missing), key
+        )
 
 
 def _part(flow: ShearFlow) -> ShearFlow:
-    """A flow of fewer grains, with numbers of double precision, for the engine of this machine."""
-    numbers = {
-        name: np.asarray(value).item()
-        for name, value in vars(flow).items()
-        if name not in ("grains", "solver", "engine", "activation")
-    }
-    return replace(flow, **numbers, grains=min(flow.grains, _GRAINS), engine="auto")
+    """A flow of fewer grains, with numbers of double precision."""
+    names = vars(flow).keys() - {"grains", "activation"}
+    numbers = {name: np.asarray(getattr(flow, name)).item() for name in names}
+    return replace(flow, **numbers, grains=min(flow.grains, _GRAINS))
 
 
 class _Found(NamedTuple):
@@ -176,6 +181,7 @@ class _Found(NamedTuple):
 
 def _expected(
     flow: ShearFlow,
+    numerics: Numerics,
     grains: int,
     frames: int,
     noise: TrackNoise,
@@ -192,13 +198,15 @@ def _expected(
         raise InputError(_too_long(frame_strain, f"a disc collides {frame_strain * rate:.2g} times", short))
     key, of_noise = jax.random.split(key)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_noise)).tolist())
-    state = prepare(flow, key)
+    solver, engine = numerics.solver, numerics.engine
+    state = prepare(flow, key, solver=solver, engine=engine)
     timestep = min(float(flow.timestep), _FINE * crossing)
-    exact = replace(flow, timestep=timestep, tolerance=min(float(flow.tolerance), _TOLERANCE))
+    exact = replace(flow, timestep=timestep)
+    tight = Numerics(replace(solver, tolerance=min(float(solver.tolerance), _TOLERANCE)), engine)
     steps = max(1, round(frame_strain / (shear_rate * timestep)))
     seen_frames, found, used = min(frames, _FRAMES), [], 0
     while len(found) < _FEWEST_TRAJECTORIES or (used < _ENOUGH and len(found) < _MOST_TRAJECTORIES):
-        state, tracks, collisions = _tracks(exact, state, steps, seen_frames)
+        state, tracks, collisions = _tracks(exact, tight, state, steps, seen_frames)
         seen = _spoilt(tracks, noise, missing, rng)
         found.append(_found(seen, float(exact.restitution), noise, collisions, _step(tracks)))
         used += found[-1].information.shape[1]
@@ -260,9 +268,9 @@ def _too_few(collisions: float, usable: float) -> str:
     return f"{found}: take more frames, or follow more discs."
 
 
-def _tracks(flow: ShearFlow, state: State, steps: int, frames: int) -> tuple[State, Tracks, float]:
+def _tracks(flow: ShearFlow, numerics: Numerics, state: State, steps: int, frames: int) -> tuple[State, Tracks, float]:
     """The state after some frames, their tracks without noise, and the number of collisions between them."""
-    state, (states, collisions, status) = _frames(flow, state, np.int32(steps), frames)
+    state, (states, collisions, status) = _frames(flow, numerics, state, np.int32(steps), frames)
     worst = Status(int(np.max(status)))
     if worst >= Status.infeasible:
         raise RuntimeError(f"the flow could not be simulated: {MEANINGS[worst.name]}.")
@@ -271,9 +279,9 @@ def _tracks(flow: ShearFlow, state: State, steps: int, frames: int) -> tuple[Sta
 
 
 @partial(jax.jit, static_argnames="frames")
-def _frames(flow: ShearFlow, state: State, steps: Array, frames: int) -> Any:
+def _frames(flow: ShearFlow, numerics: Numerics, state: State, steps: Array, frames: int) -> Any:
     def next_frame(state: State, _: None) -> tuple[State, tuple]:
-        after, tally = advance(flow, state, steps)
+        after, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
         return after, (state, tally.collisions, tally.status)
 
     return lax.scan(next_frame, state, length=frames)

@@ -19,13 +19,14 @@ import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.instants import as_arrays, from_arrays
@@ -223,7 +224,10 @@ def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
     versions = {f"version of {name}": version(name) for name in _VERSIONS}
     here = {"precision": _precision(), "device": jax.default_backend(), "number of running sums": len(fields(Tally))}
-    identity = {**asdict(settings), **versions, **here}
+    parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
+    solver = f"{solver_name(settings.solver)} {json.dumps(solver_numbers(settings.solver))}"
+    engine = "auto" if settings.engine is None else settings.engine.name
+    identity = {**parameters, "solver": solver, "engine": engine, **versions, **here}
     return json.loads(json.dumps(identity, default=lambda number: number.item()))
 
 

@@ -1,10 +1,11 @@
 """The dataset of a ratio map: observables with errors on the grid, statuses, and all parameters of the run."""
 
+import json
 import math
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran import environment
+from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.enskog_factor_variables import enskog_factor_variables
@@ -20,7 +22,6 @@ from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import BOUNDS, large_system_variables
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
-from jaxgran.model.choices import Engine
 from jaxgran.model.status import Status
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
@@ -261,7 +262,8 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     shear_rate                  γ̇
     polydispersity,             of the grains
     size_distribution
-    max_iterations              of a contact solve
+    tolerance, max_steps        of a contact solve
+    solver_parameters           all fields of the solver, in JSON
     precision, device,          what it was computed with; the commit is empty outside a repository
     platform, python, commit
     version_PACKAGE             version of jaxgran and of packages that the numbers depend on
@@ -272,30 +274,33 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     replica_steps_per_second
     ==========================  =======================================================================================
     """
-    parameters = asdict(settings)
+    parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
     equilibrate = parameters.pop("equilibrate")
     if settings.error is not None:
         del parameters["strain"]  # it differs between seeds: see ``strain_by_seed``
     parameters = {name: value for name, value in parameters.items() if value is not None}
     flow = settings.flows()[0]
-    engines: list[Engine] = [select_engine(replace(flow, grains=grains)) for grains in settings.sizes]
+    engines = [select_engine(replace(flow, grains=grains), settings.numerics) for grains in settings.sizes]
+    numbers = solver_numbers(settings.solver)
     solvers = [solver_in_use(engine, settings.solver) for engine in engines]
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": CONVENTIONS,
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
         "snapshots": int(settings.snapshots),  # NetCDF has no True and False
-        "engine": ", ".join(dict.fromkeys(engines)),
+        "engine": ", ".join(dict.fromkeys(engine.name for engine in engines)),
         "solver": ", ".join(dict.fromkeys(solvers)),
-        "engine_requested": settings.engine,
-        "solver_requested": settings.solver,
+        "engine_requested": "auto" if settings.engine is None else settings.engine.name,
+        "solver_requested": solver_name(settings.solver),
+        "solver_parameters": json.dumps(numbers),
+        "tolerance": numbers["tolerance"],
+        "max_steps": numbers["max_steps"],
         "equilibrate": "until steady" if equilibrate is None else equilibrate,
         "timestep_unit": "1 / shear rate",
         "strain_meaning": "sampled strain of each seed; where none is given, see strain_by_seed",
         "shear_rate": flow.shear_rate,
         "polydispersity": flow.polydispersity,
         "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
-        "max_iterations": flow.max_iterations,
         **made_with(),
     }
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.analysis.instant import Instant, averaged, instant_of
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -54,7 +55,7 @@ def first_instants(batch: Batch, task: Sequence[Key]) -> list[Instant | None]:
     done = set()
     for k, (point, _) in enumerate(task):
         if point not in done and batch.status[k] < Status.infeasible:
-            found[k] = _taken(*jax.tree.map(lambda x, k=k: x[k : k + 1], (batch.flow, batch.state)))
+            found[k] = _taken(*jax.tree.map(lambda x, k=k: x[k : k + 1], (batch.flow, batch.numerics, batch.state)))
             done |= {point} if found[k] is not None else set()
     return found
 
@@ -65,12 +66,14 @@ def first_of_points(results: Mapping[Key, Replica]) -> dict[int, Instant]:
     return {point: one for (point, _), one in sorted(kept.items(), reverse=True, key=itemgetter(0)) if one is not None}
 
 
-def _taken(flow: ShearFlow, state: State) -> Instant | None:
+def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
     """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
     steps = _steps((np.asarray(flow.timestep) * np.asarray(flow.shear_rate)).item())
     found: list[Instant] = []
     drive = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
-    drive(flow, state, jnp.array([steps - 1], jnp.int32))  # a snapshot has the forces of the step that it begins
+    drive(
+        flow, numerics, state, jnp.array([steps - 1], jnp.int32)
+    )  # a snapshot has the forces of the step that it begins
     return averaged(found) if len(found) == steps else None
 
 

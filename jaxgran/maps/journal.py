@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.model.flow import ShearFlow
@@ -49,13 +50,13 @@ class Journal:
         if path.exists():
             self._read()
 
-    def __call__(self, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    def __call__(self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1
         if k < len(self.tallies):
             if np.array_equal(self.steps[k], steps):
                 return self._repeated(k, state)
             raise CorruptFile(f"{self.path.name} is the journal of another run")
-        state, tally = self.drive(flow, state, steps)
+        state, tally = self.drive(flow, numerics, state, steps)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
         if time.monotonic() >= self.next:

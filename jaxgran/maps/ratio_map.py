@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.engine import Engine
 from jaxgran.io.atomic import CorruptFile, require_place
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
@@ -31,7 +33,7 @@ from jaxgran.maps.pool import WorkerDied, require_processes, run_tasks, send
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings, automatic
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.model.choices import MAX_REPLICAS, Activation, Engine, Solver
+from jaxgran.model.choices import MAX_REPLICAS, Activation
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.persistent_jit import persistent_jit
@@ -63,11 +65,11 @@ def ratio_map(
     equilibrate: float | None = None,
     strain: float | None = None,
     error: float | None = None,
-    tolerance: float | Literal["auto"] = 1e-4,
+    tolerance: float | Literal["auto"] | None = None,
     target_error: float = 0.02,
-    solver: Solver = "barzilai-borwein",
+    solver: ProjectedMethod = DEFAULT_SOLVER,
     activation: Activation = "midpoint",
-    engine: Engine = "auto",
+    engine: Engine | None = None,
     snapshots: bool = False,
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
@@ -93,12 +95,12 @@ def ratio_map(
         width of an interval of 95 %, see ``error_budget``. Grains, time step and tolerance that are "auto" are chosen
         for it. The strain of a seed is doubled until its share of the error of sampling is reached, up to 256 or 32
         memories. None keeps ``strain``.
-      tolerance: relative residual of a contact solve, or "auto".
+      tolerance: relative residual of a contact solve, in place of that of the solver; "auto" chooses it.
       target_error: relative error of pressure and shear stress for "auto".
-      solver: projected method of the contact solve, see ``projected_methods``.
+      solver: solves the contacts of each step, see ``ProjectedMethod``.
       activation: "midpoint" or "touching".
-      engine: program that advances the flows, see ``ShearFlow``. "auto" selects it for the backend, precision and
-        solver. "jax" advances the replicas of a batch in lockstep by ``vmap``, also on a processor.
+      engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None selects it for the backend, precision and solver. ``Jax()``
+        advances the replicas of a batch in lockstep by ``vmap``, also on a processor.
       snapshots: whether to keep one instant of every point, see ``instant_variables``: its grains after the sample, and
         the forces between them over a strain of 0.002.
       batch: replicas that run together, or "auto".
@@ -413,7 +415,8 @@ def _measured(
     flows = settings.flows()
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
     keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
-    batch = prepare_batch(flow, keys, settings.equilibrate, drive, COARSE_TIMESTEP / refinement)
+    coarse = COARSE_TIMESTEP / refinement
+    batch = prepare_batch(flow, keys, settings.equilibrate, drive, coarse, numerics=settings.numerics)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)

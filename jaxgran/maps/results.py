@@ -5,6 +5,7 @@ first, as the HDF5 library can wait forever in a damaged file. Files of other pr
 """
 
 import hashlib
+import json
 import os
 from dataclasses import fields
 from pathlib import Path
@@ -63,13 +64,16 @@ def _whole(path: Path) -> bytes:
 def choices_of(data: xr.Dataset) -> dict[str, Any]:
     """The parameters of the map in a dataset, as arguments of ``MapSettings``; InputError if one is missing.
 
-    Engine and solver are those of the settings. Older files have no engine, and one name of a solver.
+    The solver of a user's own class is given by its name and numbers, as the class is not in the file.
     """
-    from jaxgran.maps.settings import MapSettings  # here, so that figures are drawn without loading JAX
+    from jaxgran.dynamics.engine import engine_named  # here, so that figures are drawn without loading JAX
+    from jaxgran.maps.settings import MapSettings
 
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
+            if field.name in ("solver", "engine"):
+                continue
             attribute = next((name for name in (f"{field.name}_requested", field.name) if name in data.attrs), None)
             if field.name in data.coords:  # one number where one of a list was selected
                 values = data[field.name].values.tolist()
@@ -79,7 +83,6 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
             elif field.name not in (
                 "strain",
                 "error",
-                "engine",
                 "grains_by_point",
                 "snapshots",
                 "first_seed",
@@ -87,6 +90,7 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         chosen["snapshots"] = bool(chosen.get("snapshots"))
+        chosen |= {"solver": _solver_of(data), "engine": engine_named(data.attrs["engine_requested"])}
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist())
             for name in ("restitution", "packing_fraction", "grains_by_point")
@@ -96,11 +100,21 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
         raise InputError(f"this dataset does not contain the {missing.args[0]} of its map.") from None
 
 
+def _solver_of(data: xr.Dataset) -> Any:
+    """The solver that was asked for; name and numbers where its class is not of this package."""
+    from jaxgran.contact.projected_methods import SOLVERS
+
+    name, numbers = data.attrs["solver_requested"], data.attrs["solver_parameters"]
+    return SOLVERS[name](**json.loads(numbers)) if name in SOLVERS else f"{name} {numbers}"
+
+
 def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None, str]:
     """The map that is in a file already, or None, and what a map of these settings would replace there, in words.
 
     The words are "" if it is a map of the same settings.
     """
+    from jaxgran.contact.projected_methods import solver_name, solver_numbers
+
     try:
         data = read_dataset(path)
         chosen = choices_of(data)
@@ -108,6 +122,8 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None,
         return None, "what is no map of this version"
     for field in fields(settings):
         there, here = chosen.get(field.name, field.default), getattr(settings, field.name)
+        if isinstance(there, str) and field.name == "solver":
+            here = f"{solver_name(here)} {json.dumps(solver_numbers(here))}"
         if there != here:
             return data, f"a map with {field.name} {short_repr(there)} and not {short_repr(here)}"
     return data, ""

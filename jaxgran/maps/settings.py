@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.dynamics.engine import select_engine
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics, select_engine
 from jaxgran.model.checks import InputError, require_number, require_whole, short_repr, two_digits
-from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation, Engine, Solver
+from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
@@ -37,10 +38,9 @@ class MapSettings:
     equilibrate: float | None = None
     strain: float | None = None
     error: float | None = None
-    tolerance: float = 1e-4
-    solver: Solver = "barzilai-borwein"
+    solver: ProjectedMethod = DEFAULT_SOLVER
     activation: Activation = "midpoint"
-    engine: Engine = "auto"
+    engine: Engine | None = None
     grains_by_point: tuple[int, ...] | None = None  # in the order of ``flows``; ``grains`` is then the largest
     snapshots: bool = False
     first_seed: int = 0
@@ -75,10 +75,10 @@ class MapSettings:
             require_number("equilibrate", self.equilibrate, lambda x: (x >= 0) & (x <= most), words)
         if not isinstance(self.timestep, tuple):
             require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
-        require_number("tolerance", self.tolerance, lambda x: x > 0, "between 1e-12 and 0.1")
+        checked_numerics(self.solver, self.engine)
         flows = stack_of_any_size(self._checked_flows())
-        if self.engine != "auto":
-            select_engine(flows)
+        if self.engine is not None:
+            select_engine(flows, self.numerics)
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
             raise InputError(
@@ -115,6 +115,11 @@ class MapSettings:
         return {**lists, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
 
     @property
+    def numerics(self) -> Numerics:
+        """Solver and engine as one value."""
+        return Numerics(self.solver, self.engine)
+
+    @property
     def sizes(self) -> tuple[int, ...]:
         """The numbers of grains, at least one."""
         if self.grains_by_point is not None:
@@ -142,10 +147,7 @@ class MapSettings:
                 restitution=alpha,
                 packing_fraction=nu,
                 timestep=dt,
-                tolerance=self.tolerance,
-                solver=self.solver,
                 activation=self.activation,
-                engine=self.engine,
             )
             for grains, dt, nu, alpha in numbers
         ]
@@ -167,16 +169,19 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
     """The parameters of a map with numbers in place of "auto", and a sentence about these numbers, or "".
 
     Args:
-      choices: keyword arguments of ``MapSettings``; ``grains``, ``timestep`` and ``tolerance`` may be "auto". The
-        grains are then chosen by point, for the ``error`` of the map.
+      choices: keyword arguments of ``MapSettings``, and ``tolerance``, a number in place of that of the solver.
+        ``grains``, ``timestep`` and ``tolerance`` may be "auto". The grains are then chosen by point, for the ``error``
+        of the map.
       target_error: largest accepted relative error of pressure and shear stress from the time step. A given ``error``
         sets it.
     """
     require_number("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
     chosen, words = dict(choices), []
+    tolerance, solver = chosen.pop("tolerance", None), chosen.get("solver", DEFAULT_SOLVER)
+    require_solver(solver)
     error = chosen.get("error")
     if error is not None:
-        MapSettings(**{**chosen, "grains": 256, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4})  # checks the lists
+        MapSettings(**{**chosen, "grains": 256, "timestep": _ACCEPTED_TIMESTEP})  # checks the lists
         target_error = SHARES["timestep"] * error
     if isinstance(chosen.get("grains"), str):
         if error is None:
@@ -195,20 +200,19 @@ def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str
         chosen.setdefault("seeds", 1)  # a longer sample is cheaper than a second preparation
         sizes = " to ".join(str(size) for size in sorted({min(grains), max(grains)}))
         words.append(f"{sizes} grains, {chosen['seeds']} seed{'s' if chosen['seeds'] > 1 else ''}")
-    auto = {name for name in ("timestep", "tolerance") if isinstance(chosen.get(name), str) and chosen[name] == "auto"}
-    if "timestep" in auto:
-        flows = stack_of_any_size(
-            MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "tolerance": 1e-4, "strain": 1.0}).flows()
-        )
+    if isinstance(chosen.get("timestep"), str) and chosen["timestep"] == "auto":
+        flows = stack_of_any_size(MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "strain": 1.0}).flows())
         steps = automatic_timestep(
             _temperature(flows), flows.packing_fraction, chosen.get("activation", "midpoint"), target_error
         )
         least = int(np.argmin(steps))
         chosen["timestep"] = float(two_digits(steps[least], up=False))
         words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
-    if "tolerance" in auto:
-        chosen["tolerance"] = float(two_digits(automatic_tolerance(target_error), up=False))
-        words.append(f"tolerance {chosen['tolerance']:g}")
+    if isinstance(tolerance, str) and tolerance == "auto":
+        tolerance = float(two_digits(automatic_tolerance(target_error), up=False))
+        words.append(f"tolerance {tolerance:g}")
+    if tolerance is not None:
+        chosen["solver"] = replace(solver, tolerance=tolerance)
     aim = f"{target_error:g} from the time step" if error is None else f"{error:g}"
     return chosen, f"{'; '.join(words)}: for an error of {aim} in the stresses." if words else ""
 

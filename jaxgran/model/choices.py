@@ -3,9 +3,9 @@
 from typing import Literal
 
 Activation = Literal["midpoint", "touching"]
-Engine = Literal["auto", "numba", "jax", "pallas"]
+EngineName = Literal["auto", "numba", "jax", "pallas"]  # on the command line and in files
 FileFormat = Literal["png", "pdf", "svg"]  # of a figure
-Solver = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
+SolverName = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
 MAX_PACKING_FRACTION = 0.83
 MIN_GRAINS = 16

@@ -2,25 +2,16 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
-from typing import Any, get_args
+from typing import Any
 
 import jax
 import numpy as np
 from jax.core import Tracer
 
 from jaxgran.model.checks import InputError, concrete_or_none, require, require_number, require_whole, short_repr
-from jaxgran.model.choices import (
-    MAX_GRAINS,
-    MAX_PACKING_FRACTION,
-    MAX_STEPS,
-    MIN_GRAINS,
-    Activation,
-    Engine,
-    Solver,
-)
+from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS, Activation
 from jaxgran.model.display import Row, display_methods
 
-_STATIC = {"static": True}
 _LOOK_AHEAD = {"midpoint": 0.5, "touching": 0.0}  # θ of the activation rules
 _UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
 
@@ -34,9 +25,10 @@ class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
     The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
-    ``grains``, ``solver`` and ``engine`` are static. All other fields are traced: changing them recompiles nothing, and
-    a batch of flows is one ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis. JAX traces the number θ of
-    ``activation``, so the flow that a transformed function receives has θ in that field.
+    ``grains`` is static. All other fields are traced: changing them recompiles nothing, and a batch of flows is one
+    ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis. JAX traces the number θ of ``activation``, so the
+    flow that a transformed function receives has θ in that field. How a flow is solved is no part of it: see the
+    arguments ``solver`` and ``engine`` of ``sample``.
 
     ================  =================  ===============================================================
     field             unit               meaning
@@ -47,49 +39,26 @@ class ShearFlow:
     timestep          1/shear_rate = 1   dt, at most 0.1
     shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free, see ``cooling``
     polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with ``own_grains``
-    tolerance         –                  relative residual of the contact solve, in [1e-12, 0.1]
-    max_iterations    –                  largest number of iterations of one contact solve
     activation        –                  "midpoint": contact if the grains overlap after half a step of free flight;
                                          "touching": contact if the grains overlap now; or θ, 0.5 or 0
-    relaxation        –                  ω in (0, 2) of the Jacobi methods
-    solver            –                  projected method of the contact solve in the engine "jax", see
-                                         ``projected_methods``; the other engines have their own solver and run
-                                         only with the default here
-    engine            –                  program that advances the flow, see ``dynamics.engine``; engines differ in
-                                         speed and rounding, not in the contact law:
-                                         "auto": selected for the backend, precision and solver;
-                                         "numba": on processors, in float64;
-                                         "pallas": on NVIDIA GPUs, up to 1024 grains;
-                                         "jax": everywhere, every solver, derivatives; a map advances its batches
-                                         in lockstep by ``vmap``
     ================  =================  ===============================================================
 
     Raises:
       InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
     """
 
-    grains: int = field(metadata=_STATIC)
+    grains: int = field(metadata={"static": True})
     restitution: float | jax.Array
     packing_fraction: float | jax.Array
     timestep: float | jax.Array
     shear_rate: float | jax.Array = 1.0
     polydispersity: float | jax.Array = 0.26
-    tolerance: float | jax.Array = 1e-4
-    max_iterations: int | jax.Array = 5000
-    relaxation: float | jax.Array = 1.8
     activation: Activation | float | jax.Array = "midpoint"
-    solver: Solver = field(default="barzilai-borwein", metadata=_STATIC)
-    engine: Engine = field(default="auto", metadata=_STATIC)
 
     __repr__, _repr_html_ = display_methods("ShearFlow", _rows)
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
-        for name, kind in (("solver", Solver), ("engine", Engine)):
-            allowed = get_args(kind)
-            value = getattr(self, name)
-            if not isinstance(value, str) or value not in allowed:
-                raise InputError(f"{name} must be {', '.join(allowed[:-1])} or {allowed[-1]}, not {short_repr(value)}.")
         if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
             require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
         for name, (accepts, words) in RANGES.items():
@@ -143,9 +112,6 @@ RANGES = {
     "timestep": (lambda x: (x > 0) & np.isfinite(x), "a positive number"),
     "shear_rate": (lambda x: (x >= 0) & np.isfinite(x), "a number of at least 0"),
     "polydispersity": (lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
-    "tolerance": (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1"),
-    "relaxation": (lambda x: (x > 0) & (x < 2), "between 0 and 2, both excluded"),
-    "max_iterations": (lambda x: (x >= 1) & (x <= 2**31 - 1) & (x == np.floor(x)), "a whole number of at least 1"),
 }
 
 

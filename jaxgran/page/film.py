@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.analysis.instant import Instant, instant_of
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
@@ -47,8 +48,8 @@ class Film:
     def _summed(self, drive: AdvanceBatch) -> AdvanceBatch:
         self._sum = None
 
-        def driven(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-            state, tally = drive(flow, state, steps)
+        def driven(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+            state, tally = drive(flow, numerics, state, steps)
             self._sum = tally if self._sum is None else self._sum + tally
             self.flow, self._area = flow, np.asarray(state.side) ** 2
             return state, tally

@@ -8,7 +8,7 @@ import xarray as xr
 
 from jaxgran.maps.schema import FINEST, require_map
 from jaxgran.model.checks import InputError
-from jaxgran.model.choices import Activation, Engine, Solver
+from jaxgran.model.choices import Activation, EngineName, SolverName
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
 from jaxgran.plotting.encoding import EXCESS_LEVELS
@@ -29,7 +29,7 @@ _PLANE = ("packing_fraction", "restitution")
 _TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_error", "_correlation_strain", "_error_timestep", "_error_size", "_error_tolerance")
 _LEFT_OUT = ("status", "point_grains")
-_NAMED = {"activation": get_args(Activation), "solver": get_args(Solver), "engine": get_args(Engine)}
+_NAMED = {"activation": get_args(Activation), "solver": get_args(SolverName), "engine": get_args(EngineName)}
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
 
 

@@ -1,7 +1,7 @@
 """Batches of replicas: flows stacked into one, and the functions that advance them.
 
-All arrays of a batch have a leading (replicas,) axis. Only a ``Drive`` changes its states. ``advance_batch`` is the
-plain one. Wrappers around it report progress, record frames or keep a journal.
+All arrays of a batch have a leading (replicas,) axis. Only an ``AdvanceBatch`` changes its states. ``advance_batch`` is
+the plain one. Wrappers around it report progress, record frames or keep a journal.
 
 JAX may see several devices, of this host or of all hosts that ``jax.distributed`` connects. Each device then advances
 its share of the replicas. Devices wait for each other only at the end of a call. All hosts get all results.
@@ -9,6 +9,7 @@ its share of the replicas. Devices wait for each other only at the end of a call
 
 from collections.abc import Callable
 from functools import wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +19,18 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxgran.dynamics.advance import advance, register_numba
+from jaxgran.dynamics.engine import Engine, Jax, Numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.persistent_jit import persistent_jit
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
-AdvanceBatch = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
-AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]  # adds reports or records to a drive; states stay the same
+# Advances each replica by its number of steps, and a wrapper that adds reports or records and leaves the states alone.
+AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
+AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
 _DEVICES = "devices"
 _GROUP = 4  # replicas of a compiled program that advances them in turn
 
@@ -36,27 +38,36 @@ _GROUP = 4  # replicas of a compiled program that advances them in turn
 def stack(flows: list[ShearFlow]) -> ShearFlow:
     """The flows as one batch: a ShearFlow whose numbers have a leading (replicas,) axis."""
 
-    def joined(path, *values) -> np.ndarray:
+    def joined(*values) -> np.ndarray:
         numbers = np.stack([np.asarray(value) for value in values])
-        if path[-1].name == "max_iterations":
-            return numbers.astype(np.int32)
         kind = numbers.dtype if numbers.dtype.kind == "f" else np.dtype(float)
         return numbers.astype(jax.dtypes.canonicalize_dtype(kind))
 
-    return jax.tree_util.tree_map_with_path(joined, *flows)
+    return jax.tree.map(joined, *flows)
 
 
-def in_lockstep(engine: Engine = "auto") -> bool:
-    """Whether the replicas of a batch advance together: on an accelerator, and with ``engine="jax"`` on any device.
+def for_replicas(numerics: Numerics, count: int) -> Numerics:
+    """The same numerics for every replica of a batch: numbers of the solver with a leading (replicas,) axis."""
 
-    The batch is then one array program and waits for its slowest replica. On a processor, "auto" advances one replica
-    after another, which is faster, also where it selects the engine "jax".
+    def repeated(value: Any) -> np.ndarray:
+        number = np.asarray(value)
+        kind = np.dtype(np.int32) if number.dtype.kind in "iu" else jax.dtypes.canonicalize_dtype(number.dtype)
+        return np.broadcast_to(number.astype(kind), (count, *number.shape))
+
+    return jax.tree.map(repeated, numerics)
+
+
+def in_lockstep(engine: Engine | None = None) -> bool:
+    """Whether the replicas of a batch advance together: on an accelerator, and with the engine ``Jax`` on any device.
+
+    The batch is then one array program and waits for its slowest replica. On a processor an automatic choice of the
+    engine advances one replica after another, which is faster, also where it selects ``Jax``.
     """
-    return engine == "jax" or jax.default_backend() != "cpu"
+    return isinstance(engine, Jax) or jax.default_backend() != "cpu"
 
 
-def replicated(function: Callable, engine: Engine = "auto") -> Callable:
-    """The function of one replica for a batch: with ``vmap`` and a named axis if ``in_lockstep``, or else ``lax.map``.
+def replicated(function: Callable, lockstep: bool) -> Callable:
+    """The function of one replica for a batch: ``vmap`` with a named axis in lockstep, otherwise ``lax.map``.
 
     With several devices, each computes its share of the replicas.
     """
@@ -64,7 +75,7 @@ def replicated(function: Callable, engine: Engine = "auto") -> Callable:
     def in_turn(*arguments):
         return lax.map(lambda one: function(*one), arguments)
 
-    batched = jax.vmap(function, axis_name=AXIS) if in_lockstep(engine) else in_turn
+    batched = jax.vmap(function, axis_name=AXIS) if lockstep else in_turn
     return batched if jax.device_count() == 1 else _on_all_devices(batched)
 
 
@@ -93,15 +104,19 @@ def _on_all_devices(batched: Callable) -> Callable:
 
 
 def batch_program(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
-    """The compiled function of one replica for a batch; its first argument is the flow.
+    """The compiled function of one replica for a batch, called with batched arguments and ``lockstep``.
 
     Replicas that advance in turn do so in groups of one size. So one compiled program serves batches of any size. For
-    ``register`` see ``kept_jit``.
+    ``register`` see ``persistent_jit``.
     """
 
     @wraps(function)
-    def all_replicas(flow, *arguments):
-        return replicated(function, flow.engine)(flow, *arguments)
+    def in_turn(*arguments):
+        return replicated(function, lockstep=False)(*arguments)
+
+    @wraps(function)
+    def together(*arguments):
+        return replicated(function, lockstep=True)(*arguments)
 
     @wraps(function)
     def group(real, arguments):
@@ -112,13 +127,14 @@ def batch_program(function: Callable, register: Callable[[], None] = lambda: Non
 
         return lax.map(lambda each: one(*each), (real, arguments))
 
-    together, in_group = persistent_jit(all_replicas, register), persistent_jit(group, register)
+    everything = {True: persistent_jit(together, register), False: persistent_jit(in_turn, register)}
+    in_group = persistent_jit(group, register)
 
     @wraps(function)
-    def program(flow, *arguments):
-        if in_lockstep(flow.engine) or jax.device_count() > 1:
-            return waited(together(flow, *arguments))
-        batch = jax.tree.map(_on_host, (flow, *arguments))
+    def program(*arguments, lockstep: bool):
+        if lockstep or jax.device_count() > 1:
+            return waited(everything[lockstep](*arguments))
+        batch = jax.tree.map(_on_host, arguments)
         count = len(jax.tree.leaves(batch)[0])
         groups = []
         for first in range(0, count, _GROUP):
@@ -135,7 +151,25 @@ def _on_host(array: Array) -> Array | np.ndarray:
     return array if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else np.asarray(array)
 
 
-advance_batch: AdvanceBatch = batch_program(advance, register_numba)  # the plain one
+def _advance_replica(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+    return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+
+
+_advance_replicas = batch_program(_advance_replica, register_numba)
+
+
+def advance_batch(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance each replica of a batch by its number of time steps.
+
+    Args:
+      flow, state: those of the replicas, see ``stack``.
+      numerics: those of the replicas, see ``for_replicas``.
+      steps: (replicas,) numbers of time steps.
+
+    Raises:
+      InputError: the engine cannot do this.
+    """
+    return _advance_replicas(flow, numerics, state, steps, lockstep=in_lockstep(numerics.engine))
 
 
 def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:
@@ -143,8 +177,8 @@ def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:
     if report is None:
         return drive
 
-    def driven(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
-        state, tally = drive(flow, state, steps)
+    def driven(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+        state, tally = drive(flow, numerics, state, steps)
         report(float(np.sum(tally.steps)))
         return state, tally
 

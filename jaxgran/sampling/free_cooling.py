@@ -18,7 +18,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, as_array, require, two_digits
@@ -56,7 +58,14 @@ class Cooling:
         return jnp.max(self.tally.status, axis=-1)
 
 
-def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Cooling]:
+def cooling(
+    flow: ShearFlow,
+    state: State,
+    times: ArrayLike,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
+) -> tuple[State, Cooling]:
     """Advance a flow without shear and record how it cools; ``jit``, ``vmap`` and ``lax.map`` apply.
 
         flow = jg.ShearFlow(256, restitution=0.9, packing_fraction=0.3, timestep=1e-3, shear_rate=0.0)
@@ -72,6 +81,7 @@ def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Coo
       flow: parameters of the state, with ``shear_rate`` zero.
       state: the flow at the beginning, usually from ``heated`` and some collisions at restitution one.
       times: (times,) increasing times of the record, in t since the beginning, rounded to whole time steps.
+      solver, engine: as in ``sample``.
 
     Returns:
       The state at the last of the times, and the record.
@@ -79,24 +89,24 @@ def cooling(flow: ShearFlow, state: State, times: ArrayLike) -> tuple[State, Coo
     Raises:
       InputError: (a ValueError) the flow is sheared, the state has another packing fraction or polydispersity,
         the times do not increase by a time step or more, a grain of thermal speed would cross more than a tenth of its
-        diameter in one step, or positions cannot resolve a step.
+        diameter in one step, positions cannot resolve a step, or the engine cannot do this.
     """
     require_state(flow, state)
     require("shear_rate", flow.shear_rate, lambda x: x == 0, "0 in free cooling")
     times = _require_times(flow, times)
     _require_slow(flow, state)
     require_match(flow, state)
-    return waited(_cooling(flow, state, times))
+    return waited(_cooling(flow, checked_numerics(solver, engine), state, times))
 
 
 @jax.jit
-def _cooling(flow: ShearFlow, state: State, times: Float[Array, " times"]) -> tuple[State, Cooling]:
+def _cooling(flow: ShearFlow, numerics: Numerics, state: State, times: Float[Array, " times"]) -> tuple[State, Cooling]:
     dtype = state.side.dtype
     edges = jnp.round(times / flow.timestep)
     steps = jnp.diff(edges, prepend=0).astype(jnp.int32)
 
     def interval(state: State, steps: Array) -> tuple[State, tuple[Array, Tally]]:
-        state, tally = advance(flow, state, steps)
+        state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
         return state, (_temperature(state), tally)
 
     state, (temperature, tally) = lax.scan(interval, state, steps)

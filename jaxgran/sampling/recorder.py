@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
@@ -40,23 +42,25 @@ class Recorder:
         self.frames = self.steps = 0
         return partial(self._driven, drive)
 
-    def _driven(self, drive: AdvanceBatch, flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+    def _driven(
+        self, drive: AdvanceBatch, flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+    ) -> tuple[State, Tally]:
         every = max(1, round(self.every / (np.asarray(flow.shear_rate) * np.asarray(flow.timestep)).item()))
         if self.frames == 0:
-            self._record(flow, state)
+            self._record(flow, numerics, state)
         tallies = []
         for part in _parts(self.steps, np.asarray(steps).item(), every):
-            state, tally = drive(flow, state, jnp.full_like(steps, part))
+            state, tally = drive(flow, numerics, state, jnp.full_like(steps, part))
             tallies.append(tally)
             self.steps += part
             if part > 0 and self.steps % every == 0 and np.asarray(tally.status).item() < Status.nonfinite:
-                self._record(flow, state)
+                self._record(flow, numerics, state)
         return state, reduce(add, tallies)
 
-    def _record(self, flow: ShearFlow, state: State) -> None:
+    def _record(self, flow: ShearFlow, numerics: Numerics, state: State) -> None:
         if not np.isfinite(np.asarray(state.velocities)).all():  # the status reports it
             return
-        frame = _snapshot_of_one(flow, state)
+        frame = _snapshot_of_one(flow, numerics.solver, state)
         for keep in self.keep:
             keep(frame, self.steps)
         self.frames += 1
@@ -74,5 +78,5 @@ def _parts(done: int, steps: int, every: int) -> Iterator[int]:
 
 
 @jax.jit
-def _snapshot_of_one(flow: ShearFlow, state: State) -> Snapshot:
-    return snapshot(*jax.tree.map(lambda x: x[0], (flow, state)))
+def _snapshot_of_one(flow: ShearFlow, solver: ProjectedMethod, state: State) -> Snapshot:
+    return snapshot(*jax.tree.map(lambda x: x[0], (flow, state, solver)))

@@ -13,7 +13,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.network import Contacts
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
@@ -27,6 +29,7 @@ from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
 from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
 
+Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 BLOCKS = 32
 MOST_BLOCKS = 10**6
 ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # a target for the relative error holds for these
@@ -64,16 +67,16 @@ def _rows(sample: "Sample") -> list[Row]:
 class Sample:
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
-    ==========  =========  ====  ============================================
-    field       shape      unit  meaning
-    ==========  =========  ====  ============================================
-    tally       (blocks,)  –     sums over the steps of each block of strain
-    area        ()         σ²    area of the cell
-    shear_rate  ()         1/t   γ̇
-    grains      static     –     number of grains
-    own         (blocks,)  –     sums over the steps of what ``observe`` returns,
-                                 a pytree; None without ``observe``
-    ==========  =========  ====  ============================================
+    =============  =========  ====  =================================================
+    field          shape      unit  meaning
+    =============  =========  ====  =================================================
+    tally          (blocks,)  –     sums over the steps of each block of strain
+    area           ()         σ²    area of the cell
+    shear_rate     ()         1/t   γ̇
+    grains         static     –     number of grains
+    observed_sums  (blocks,)  –     sums over the steps of what ``observe`` returns,
+                                    a pytree; None without ``observe``
+    =============  =========  ====  =================================================
 
     The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
     default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``. They are NumPy numbers,
@@ -84,7 +87,7 @@ class Sample:
     area: Float[Array | np.ndarray, "*replicas"]
     shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
-    own: Any = None
+    observed_sums: Any = None
 
     __repr__, _repr_html_ = display_methods("Sample", _rows)
 
@@ -174,7 +177,7 @@ class Sample:
         Raises:
           InputError: the sample was made without ``observe``, or it holds a batch, or JAX transforms this function.
         """
-        if self.own is None or np.ndim(self.area):
+        if self.observed_sums is None or np.ndim(self.area):
             raise InputError("observed() needs one replica, sampled with observe: sample[0] is the first of a batch.")
         require_untraced("observed()", "take it of the finished sample", self)
 
@@ -185,7 +188,7 @@ class Sample:
             leaves = jax.tree.leaves(jax.vmap(estimate_of_sums)(*parts))
             return {str(k): leaf for k, leaf in enumerate(leaves)}
 
-        sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.own, self.tally.steps))
+        sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.observed_sums, self.tally.steps))
         total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
         structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
         values, errors = standard_errors(leaves_by_number, sums)
@@ -249,8 +252,11 @@ def sample(
     state: State,
     strain: float | Array,
     blocks: int = BLOCKS,
-    observe: Callable[[Snapshot], Any] | None = None,
+    observe: Observable | None = None,
     callback: Callable[[State, Sample], Any] | None = None,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
 ) -> tuple[State, Sample]:
     """Shear a flow and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
 
@@ -284,12 +290,14 @@ def sample(
       blocks: number of equal parts of the strain, static; a tally is kept for each.
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is static: each new function,
         such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
-        2 s. Where the engine "jax" runs, or the function uses values from outside that JAX traces, that engine is
+        2 s. Where the engine ``Jax`` runs, or the function uses values from outside that JAX traces, that engine is
         compiled with it, in about 20 s. ``enable_cache`` keeps the program for the next process.
         The contacts are those of a step with an approaching contact, before the impulses act. The size of their
         buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
         One block is then compiled at a time, and JAX transformations do not apply.
+      solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
+      engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for the fastest that can do this, see ``advance``.
 
     Returns:
       The final state and the sample.
@@ -298,28 +306,29 @@ def sample(
       InputError: (a ValueError) the state has another packing fraction or polydispersity than the flow; the flow is
         not sheared; the strain is not a positive number, is shorter than one time
         step a block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the
-        result of ``observe`` is not summed over contacts; or the flow names an engine that cannot do this.
+        result of ``observe`` is not summed over contacts; or the engine cannot do this.
     """
     require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
     require_strain(flow, strain, blocks)
     require_match(flow, state)
     check_precision(flow, state)
+    numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
-        return waited(_sample(flow, state, strain, blocks, observe))
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, state, strain))):
+        return waited(_sample(flow, numerics, state, strain, blocks, observe))
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, numerics, state, strain))):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
-    return _sample_with_callback(flow, state, strain, blocks, observe, callback)
+    return _sample_with_callback(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback)
 
 
 @partial(jax.jit, static_argnames=("blocks", "observe"))
 def _sample(
-    flow: ShearFlow, state: State, strain: Array, blocks: int, observe: Callable[[Snapshot], Any] | None = None
+    flow: ShearFlow, numerics: Numerics, state: State, strain: Array, blocks: int, observe: Observable | None = None
 ) -> tuple[State, Sample]:
-    return _sample_blocks(flow, state, _steps_of_blocks(flow, strain, blocks), observe)
+    return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
@@ -330,24 +339,24 @@ def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int
 
 
 def _sample_blocks(
-    flow: ShearFlow, state: State, steps: Int[Array, " blocks"], observe: Callable[[Snapshot], Any] | None
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, " blocks"], observe: Observable | None
 ) -> tuple[State, Sample]:
     """The final state and the sample of blocks with the given numbers of time steps."""
 
     def block(state: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
         if observe is None:
-            state, tally = advance(flow, state, steps)
+            state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
             return state, (tally, None)
-        state, tally, user_sums = advance_observed(flow, state, steps, partial(_observe_snapshot, observe))
-        return state, (tally, user_sums)
+        now = partial(_observe_snapshot, observe)
+        state, tally, observed_sums = advance_observed(flow, numerics, state, steps, now)
+        return state, (tally, observed_sums)
 
-    state, (tally, user_sums) = lax.scan(block, state, steps)
-    return state, Sample(tally, state.side**2, jnp.asarray(flow.shear_rate, state.side.dtype), flow.grains, user_sums)
+    state, (tally, observed_sums) = lax.scan(block, state, steps)
+    shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
+    return state, Sample(tally, state.side**2, shear_rate, flow.grains, observed_sums)
 
 
-def _observe_snapshot(
-    observe: Callable[[Snapshot], Any], flow: ShearFlow, state: State, contacts: Contacts, impulses: Array
-) -> Any:
+def _observe_snapshot(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:
     """The result of ``observe`` for the contacts and impulses of one step."""
     return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
 
@@ -356,12 +365,17 @@ _sample_one_block = jax.jit(_sample_blocks, static_argnames="observe")
 
 
 def _sample_with_callback(
-    flow: ShearFlow, state: State, strain: float | Array, blocks: int, observe: Any, callback: Callable
+    flow: ShearFlow,
+    numerics: Numerics,
+    state: State,
+    steps_of_blocks: Int[Array, " blocks"],
+    observe: Observable | None,
+    callback: Callable,
 ) -> tuple[State, Sample]:
     """The sample, block by block, with a call of ``callback`` after each."""
     parts: list[Sample] = []
-    for steps in np.asarray(_steps_of_blocks(flow, strain, blocks)):
-        state, part = waited(_sample_one_block(flow, state, jnp.asarray([steps]), observe))
+    for steps in np.asarray(steps_of_blocks):
+        state, part = waited(_sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe))
         parts.append(part)
         if callback(state, _joined(parts)):
             break
@@ -370,9 +384,9 @@ def _sample_with_callback(
 
 def _joined(parts: list[Sample]) -> Sample:
     """One sample from successive samples of the same flow."""
-    sums = ((part.tally, part.own) for part in parts)
-    tally, user_sums = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *sums)
-    return replace(parts[-1], tally=tally, own=user_sums)
+    sums = ((part.tally, part.observed_sums) for part in parts)
+    tally, observed = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *sums)
+    return replace(parts[-1], tally=tally, observed_sums=observed)
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:

@@ -26,13 +26,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import key_shape, require_key, require_number, require_untraced
 from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import AdvanceBatch, advance_batch, batch_program, stack
+from jaxgran.sampling.batch import AdvanceBatch, advance_batch, batch_program, for_replicas, in_lockstep, stack
 from jaxgran.sampling.correlation_strain import (
     FEWEST_CORRELATION_STRAINS,
     LEAST_SAMPLE,
@@ -70,13 +72,22 @@ class Batch(NamedTuple):
     """Replicas on the way to their sample; all arrays have a leading (replicas,) axis."""
 
     flow: ShearFlow
+    numerics: Numerics
     state: State
     status: Int[np.ndarray, " replicas"]
     strain: Float[np.ndarray, " replicas"]  # before the sample
     memory: Float[np.ndarray, " replicas"]  # strain over which the flow remembers
 
 
-def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grains: Grains | None = None) -> State:
+def prepare(
+    flow: ShearFlow,
+    key: Array,
+    equilibrate: float | None = None,
+    grains: Grains | None = None,
+    *,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
+    engine: Engine | None = None,
+) -> State:
     """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
 
     A batch of keys gives as many states, each to rounding that of its own flow and key alone:
@@ -92,14 +103,16 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grain
         checked here. A map gives the status ``not_steady`` if it is shorter than the memory of the flow.
       grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,) axis; None for
         diameters uniform in σ ± ``polydispersity``.
+      solver, engine: as in ``sample``, for all replicas. With ``Jax()`` those of a batch advance in lockstep by
+        ``vmap``.
 
     Returns:
       The state after packing, heating, shearing and relaxing; that of a batch has a leading (replicas,) axis.
 
     Raises:
       InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
-        diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains. Or JAX
-        transforms this function, which decides in Python when a flow is steady.
+        diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains, or
+        the engine cannot do this. Or JAX transforms this function, which decides in Python when a flow is steady.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
     """
     flows, keys, discs, single = _replicas("prepare", flow, key, grains)
@@ -107,7 +120,7 @@ def prepare(flow: ShearFlow, key: Array, equilibrate: float | None = None, grain
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
-    batch = prepare_batch(flows, keys, equilibrate, grains=discs)
+    batch = prepare_batch(flows, keys, equilibrate, grains=discs, numerics=checked_numerics(solver, engine))
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if single and batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")
@@ -125,20 +138,24 @@ def prepare_batch(
     coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
     heat: float = 1.0,
+    numerics: Numerics = DEFAULT_NUMERICS,
 ) -> Batch:
     """``prepare`` for a batch of flows: a failure is the status of its replica, not an exception.
 
     Given grains have a leading (replicas,) axis too. ``heat`` is the first granular temperature over the expected one.
+    ``numerics`` are those of all replicas.
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
     expected = expected_temperature(theory.granular_temperature, flow.packing_fraction, flow.shear_rate)
-    state, packed = _heated(flow, keys, (heat * expected).astype(theory.granular_temperature.dtype), grains)
+    temperature = (heat * expected).astype(theory.granular_temperature.dtype)
+    state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep(numerics.engine))
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, coarse_timestep, grains))
     predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
-    batch = Batch(coarse, state, status, np.zeros(len(status)), np.zeros(len(status)))
+    each = for_replicas(numerics, len(status))
+    batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
     batch = batch._replace(memory=_memory(batch, predictions))
     if equilibrate is None:
         batch = _until_steady(batch, drive)
@@ -203,7 +220,7 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     """
     flows, keys, discs, single = _replicas("heated", flow, key, grains)
     require_number("temperature", temperature, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    state, found = _heated(flows, keys, jnp.full(len(keys), temperature, float), discs)
+    state, found = _heated(flows, keys, jnp.full(len(keys), temperature, float), discs, lockstep=in_lockstep())
     if not np.all(found):
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
     return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), state)
@@ -255,7 +272,7 @@ def _chunk(batch: Batch, strain: np.ndarray, drive: AdvanceBatch) -> tuple[Batch
     finite = batch.status < Status.nonfinite
     steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
     counts = jax.device_put(np.where(finite, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
-    state, tally = drive(batch.flow, batch.state, counts)
+    state, tally = drive(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally

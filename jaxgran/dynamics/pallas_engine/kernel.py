@@ -31,6 +31,7 @@ from jax.experimental.pallas import triton
 from jaxtyping import Array, Int
 
 from jaxgran.contact.law import first_step, flight_of, gap_coefficients, kinetic_means, overlaps_within, time_to_touch
+from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod
 from jaxgran.dynamics.jax_engine import ended
 from jaxgran.dynamics.pallas_engine.memory import (
     APPROACH,
@@ -92,11 +93,13 @@ class _Carry(NamedTuple):
     counts: Counts
 
 
-def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: bool = False) -> tuple[State, Tally]:
-    """Advance one replica of up to 1024 grains, as ``dynamics.advance`` does; under ``vmap`` a block is a replica.
+def advance_by_pallas(
+    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], interpret: bool = False
+) -> tuple[State, Tally]:
+    """Advance one replica of up to 1024 grains; under ``vmap`` a thread block is a replica.
 
     Args:
-      flow, state, steps: as there; the method of the contact solve is the default one.
+      flow, solver, state, steps: as in ``dynamics.advance``.
       interpret: whether the kernel is interpreted, on any backend.
     """
     dtype, count = state.positions.dtype, flow.grains
@@ -106,7 +109,7 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: boo
     widest = jnp.maximum(side / 2 - largest, 1e-3)  # nearest images are unique
     expected = jnp.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (np.pi * count)) - 1
     usual = jnp.minimum(jnp.maximum(expected, 0.05), widest)
-    numbers = (side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, flow.tolerance)
+    numbers = (side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
     numbers = (*numbers, flow.activation_fraction, largest, usual, widest, jnp.finfo(dtype).eps)
     given = jnp.stack([*state.positions.T, *state.velocities.T, radii, 1 / masses])
     edges = np.full((2, threads), np.inf)
@@ -122,7 +125,7 @@ def advance(flow: ShearFlow, state: State, steps: Int[Array, ""], interpret: boo
     )
     moved, totals, status, sums, *_ = call(
         jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers]),
-        jnp.stack([jnp.asarray(x).astype(jnp.int32) for x in (flow.max_iterations, steps, int(Status.ok))]),
+        jnp.stack([jnp.asarray(x).astype(jnp.int32) for x in (solver.max_steps, steps, int(Status.ok))]),
         jnp.pad(given, ((0, 0), (0, threads - count))),
         jnp.asarray(edges, dtype),
     )
@@ -144,8 +147,8 @@ def trial(grains: int, dtype: jnp.dtype) -> None:
     speeds = 2 * rng.normal(size=(grains, 2))
     numbers = (np.full(grains, 0.5), np.ones(grains), places, speeds - speeds.mean(0), 1.02 * row, 0.0)
     radii, masses, *others = (jnp.asarray(x, dtype) for x in numbers)
-    flow = ShearFlow(grains, 0.2, 0.7, 1e-2, tolerance=1e-5)
-    _, tally = jax.jit(advance)(flow, State(Grains(radii, masses), *others), jnp.int32(30))
+    flow, solver = ShearFlow(grains, 0.2, 0.7, 1e-2), BarzilaiBorwein(tolerance=1e-5)
+    _, tally = jax.jit(advance_by_pallas)(flow, solver, State(Grains(radii, masses), *others), jnp.int32(30))
     work = -(tally.kinetic_moment[0, 1] + tally.contact_moment[0, 1])
     few = 1e-3 if dtype == jnp.float32 else 1e-8
     laws = {

@@ -47,7 +47,7 @@ class Flow(NamedTuple):
     usual: Array
     widest: Array
     epsilon: Array
-    max_iterations: Array
+    max_steps: Array
     steps: Array
     ok: Array  # the status
 

@@ -268,7 +268,7 @@ def _descend(thread: Thread, contacts: Array, most: Array, width: Array, target:
         )
 
     def unfinished(now: _Descent) -> Array:
-        going = ~(now.residual <= target) & (now.residual < jnp.inf) & (now.iterations < flow.max_iterations)
+        going = ~(now.residual <= target) & (now.residual < jnp.inf) & (now.iterations < flow.max_steps)
         return going | (now.iterations == 0)
 
     infinite, one = jnp.full_like(target, jnp.inf), jnp.full_like(target, 1)
