@@ -1,11 +1,10 @@
-"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the charts."""
+"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the figure."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from benchmarks import networks
 from benchmarks.collection import Entry, load
@@ -15,15 +14,13 @@ from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
 from benchmarks.exact_contacts import incidence as dense_incidence
 from benchmarks.networks import Network
-from benchmarks.profiles import STYLES
 from benchmarks.solvers import groups, measure
-from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
-from benchmarks.solvers.forms import in_impulses, in_velocities, weighted
-from benchmarks.solvers.measure import TARGETS, Row, measured
+from benchmarks.solvers.charts import DRAWN, draw_times
+from benchmarks.solvers.forms import program_of, weighted
+from benchmarks.solvers.measure import TARGETS, Row, run_solvers
 from benchmarks.solvers.numba_engine import by_cluster
-from benchmarks.solvers.roster import Solver, own, peers
-from benchmarks.solvers.run import agreement, compile_for, warm_summary
-from benchmarks.solvers.warm import WarmRow, swept_from
+from benchmarks.solvers.roster import Solver, our_solvers, package_solvers
+from benchmarks.solvers.run import agreement, compile_for
 from jaxgran.sampling.budget import RESIDUAL_FACTOR
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -49,43 +46,32 @@ def entries() -> list[Entry]:
     ]
 
 
-def test_solution_is_optimal_in_both_forms(entries):
+def test_solution_is_optimal_for_the_quadratic_program(entries):
     for entry in entries[:4]:
-        impulses = entry.solution.impulses
-        program = in_impulses(entry)
-        slope = program.scale * (program.p @ (impulses / program.scale) + program.q)
+        program = program_of(entry)
+        slope = program.scale * (program.p @ (entry.solution.impulses / program.scale) + program.q)
         np.testing.assert_allclose(slope, entry.solution.velocities, atol=1e-12)
-        program = in_velocities(entry)
-        changes = program.g.T @ impulses / program.scale  # of optimal x: x = Gᵀ p
-        after = program.scale * (program.g @ changes - program.h)
-        np.testing.assert_allclose(after, entry.solution.velocities, atol=1e-12)
         g = weighted(entry)
         np.testing.assert_allclose((g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12)
 
 
 @pytest.mark.slow  # compiles for 13 s
-def test_machine_code_alone_solves_all(entries):
+def test_numba_engine_alone_solves_all(entries):
     for entry in entries[:4]:
         answer = by_cluster(entry, 1e-10)()
         assert measure.velocity_error(entry, entry.matrix, answer.impulses) < 1e-8 and answer.products >= 1
     assert by_cluster(entries[4], 1e-6)() is None
 
 
-def test_start_at_the_solution_needs_one_sweep(entries):
-    entry = entries[1]
-    assert swept_from(entry, 1e-6, entry.solution.impulses)().products == 1
-    assert swept_from(entry, 1e-6)().products > 50
-
-
 @pytest.mark.slow
-def test_peers_and_ours_find_the_same_velocities(entries):
+def test_packages_and_ours_find_the_same_velocities(entries):
     """Each that is installed; all know that a full row has no solution, apart from those that only iterate."""
     pytest.importorskip("pinocchio")
     pytest.importorskip("proxsuite")
-    solvers = {name: own()[name] for name in ("numba engine", "barzilai-borwein")} | peers()
+    solvers = {name: our_solvers()[name] for name in ("numba engine", "barzilai-borwein")} | package_solvers()
     finest: dict = {}
     compile_for(entries, solvers)
-    rows = measured(
+    rows = run_solvers(
         solvers, entries, lambda name, entry, runs: finest.setdefault(entry.name, {}).update({name: runs[-1]})
     )
     assert {row.outcome for row in rows} <= {"ok", "missed"}
@@ -109,13 +95,13 @@ def test_peers_and_ours_find_the_same_velocities(entries):
 @pytest.mark.parametrize("name", ["numba engine", "barzilai-borwein"])
 def test_few_solves_of_flows_have_a_larger_error_of_the_stress_than_is_counted(name: str) -> None:
     flows = [entry for entry in load() if entry.family in groups.FLOWS]
-    solver, ratios = {name: own()[name]}, []
+    solver, ratios = {name: our_solvers()[name]}, []
     compile_for(flows, solver)
 
     def note(_: str, entry: Entry, runs: list[measure.Attempt]) -> None:
         ratios.extend(measure.stress_error(entry, run.impulses) / run.tolerance for run in runs)
 
-    measured(solver, flows, note)
+    run_solvers(solver, flows, note)
     assert len(ratios) > 500
     assert np.mean(np.array(ratios) <= RESIDUAL_FACTOR) >= 0.98
     assert np.median(ratios) < 1
@@ -137,7 +123,7 @@ def test_a_target_costs_what_the_cheapest_run_does_that_meets_it(entries, monkey
     times = iter([3.0, 1.0, 2.0, 0.5])
     monkeypatch.setattr(measure, "LIMIT", 10.0)
     monkeypatch.setattr(measure, "timed", lambda solve: (next(times), solve()))
-    rows = measured({"one": scripted(1e-1, 1e-5, 1e-7, 0.0)}, entries[:1], lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-1, 1e-5, 1e-7, 0.0)}, entries[:1], lambda *_: None)
     assert [row.outcome for row in rows] == ["ok"] * 4
     assert [row.seconds for row in rows] == [0.5] * 4 and rows[0].iterations == 7
     assert all(row.residual <= row.target for row in rows)
@@ -145,14 +131,14 @@ def test_a_target_costs_what_the_cheapest_run_does_that_meets_it(entries, monkey
 
 def test_failures_are_missed_slow_or_skipped(entries, monkeypatch):
     monkeypatch.setattr(measure, "timed", lambda solve: (0.3, solve()))
-    rows = measured({"one": scripted(1e-3)}, [entries[0]] * 2, lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-3)}, [entries[0]] * 2, lambda *_: None)
     assert [row.outcome for row in rows[:4]] == ["ok", "missed", "missed", "missed"]
     longer = entries[0]._replace(problem=networks_problem(64), solution=None)
     monkeypatch.setattr(measure, "targets", lambda entry: TARGETS)
-    rows = measured({"one": scripted(1e-3)}, [entries[0], longer], lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-3)}, [entries[0], longer], lambda *_: None)
     assert {row.outcome for row in rows[4:]} == {"skipped"}
     monkeypatch.setattr(measure, "timed", lambda solve: (1.3, solve()))
-    rows = measured({"one": scripted(0.0)}, entries[:1], lambda *_: None)
+    rows = run_solvers({"one": scripted(0.0)}, entries[:1], lambda *_: None)
     assert {row.outcome for row in rows} == {"slow"}
 
 
@@ -195,29 +181,12 @@ def test_summary_has_a_null_where_the_median_fails(rows):
     json.dumps(lines, allow_nan=False)
 
 
-def test_failures_are_drawn_above_the_line(rows):
-    figure: Figure = draw_work(rows, "seconds")
-    shown = {axes.get_title().rpartition(" (")[0]: axes for axes in figure.axes if axes.get_visible()}
-    assert set(shown) == {"flows, up to 30 contacts", "flows, 31 to 300", "chain"}
-    limit = shown["chain"].lines[0].get_ydata()[0]
-    colour = STYLES["Pinocchio PGS"][0]
-    heights = [line.get_ydata() for line in shown["chain"].lines if line.get_color() == colour]
-    assert np.min(heights[-1]) > limit and len(heights[-1]) == len(TARGETS) and np.all(np.isnan(heights[0]))
-
-
-def test_other_charts_hold_the_numbers(rows):
-    profiles = draw_profiles(rows)
-    in_time, _, in_products, _ = profiles.axes
-    ends = {line.get_label(): line.get_ydata()[-1] for line in in_time.lines}
-    assert ends == {"numba engine": 1, "PIQP": 1, "Pinocchio PGS": pytest.approx(1 / 3)}
-    assert {line.get_label() for line in in_products.lines} == {"numba engine", "Pinocchio PGS"}
-    flows, _ = draw_scaling(rows).axes
-    drawn = next(line for line in flows.lines if line.get_color() == "black")
-    np.testing.assert_allclose(drawn.get_ydata(), 0.01)
-    warm = [WarmRow("OSQP", "1", "cold", 1, 2.0, 10), WarmRow("OSQP", "1", "exact to 0.1", 0.1, 1.0, 4)]
-    in_time, in_iterations = draw_warm(warm).axes
-    assert [axes.containers[0].lines[0].get_ydata()[0] for axes in (in_time, in_iterations)] == [0.5, 0.4]
-    assert warm_summary(warm)[1]["iterations_over_cold"] == 0.4
+def test_figure_shows_the_median_times_and_no_failure(rows):
+    for axes in draw_times(groups.summary(rows)).axes:
+        times = {line.get_label(): line.get_xdata() for line in axes.lines}
+        assert set(times) == set(DRAWN)
+        np.testing.assert_allclose(times["numba engine"][[0, 1, 4]], [0.01, 0.01, 0.04])
+        np.testing.assert_allclose(times["Pinocchio PGS"], [0.1, *[np.nan] * 7])
 
 
 def test_agreement_is_the_largest_difference_of_a_pair():
@@ -226,16 +195,16 @@ def test_agreement_is_the_largest_difference_of_a_pair():
     assert found == [{"solvers": ["x", "y"], "problems": 2, "largest_difference": 1e-7}]
 
 
-def test_committed_solutions_of_ours_agree_with_those_of_peers():
-    told = json.loads((RESULTS / "solvers.json").read_text())
-    peers_there = set(told["settings"]) - set(own())
-    assert len(peers_there) == 9 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(told["packages"])
+def test_committed_solutions_of_ours_agree_with_those_of_package_solvers():
+    results = json.loads((RESULTS / "solvers.json").read_text())
+    packages = set(results["settings"]) - set(our_solvers())
+    assert len(packages) == 7 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(results["packages"])
     for ours in ("numba engine", "barzilai-borwein"):
         pairs = {
             name: pair
-            for pair in told["agreement"]
+            for pair in results["agreement"]
             for name in pair["solvers"]
-            if ours in pair["solvers"] and name in peers_there
+            if ours in pair["solvers"] and name in packages
         }
         assert len(pairs) >= 5
         assert sum(pair["problems"] >= 150 for pair in pairs.values()) >= 3

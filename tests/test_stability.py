@@ -28,8 +28,7 @@ pack = optimised(stability.pack)  # close to jamming it takes long
 def test_quick_chart_is_written_and_nothing_fails_where_a_map_is_accepted(tmp_path: Path) -> None:
     cells = stability.run(Output(tmp_path, quick=True))
     assert json.loads((tmp_path / "stability_quick.json").read_text())["cells"]
-    for name in ("stability_quick.png", "stability_quick_variants.png"):
-        assert (tmp_path / name).stat().st_size > 10_000
+    assert (tmp_path / "stability_quick.png").stat().st_size > 10_000
     default = [one for one in cells if one["variant"] == "default"]
     accepted = [one for one in default if one["accepted"]]
     assert accepted and {one["outcome"] for one in accepted} == {"ok"}
