@@ -119,7 +119,7 @@ def row(tracks: list[jg.Tracks], restitution: float, velocity: float | None, pos
     return head | fit_statistics(fits, restitution)
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     noise = "none" if row["velocity_noise"] is None else f"{100 * row['velocity_noise']:g} %"
     return (
         f"α {row['restitution']:g}, velocities {noise}, positions {row['position_noise']:g}, "
@@ -138,5 +138,5 @@ def run(output: Output, runs: int | None = None) -> None:
         few = output.quick or restitution != RESTITUTIONS[0]
         for noise in FEW_NOISES if few else NOISES:
             rows.append(row(tracks, restitution, *noise))
-            print(sentence(rows[-1]), flush=True)
+            print(report_line(rows[-1]), flush=True)
     output.write_json("fit_coverage", {"grains": GRAINS, "packing_fraction": FRACTION, "rows": rows})

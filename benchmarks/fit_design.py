@@ -99,7 +99,7 @@ def predicted(
         row |= {"refused": str(why)}
     else:
         row |= vars(found)
-    print(sentence(row), flush=True)
+    print(report_line(row), flush=True)
     return row
 
 
@@ -130,7 +130,7 @@ def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
     return rows
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     head = (
         f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['noise']}, {row['interval']:g} between frames"
     )

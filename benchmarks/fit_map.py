@@ -82,7 +82,7 @@ def statistics_of_point(tracks: list[jg.Tracks], alpha: float) -> dict:
     return row | {"coverage": (wilson.low, wilson.high)}
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     head = (
         f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['camera']}, frames {row['interval']:.2g} apart"
     )
@@ -147,7 +147,7 @@ def run(output: Output) -> None:
             tracks, description = by_reference(alpha, nu, runs, camera == "quicker")
         head = {"camera": camera, "restitution": alpha, "packing_fraction": nu}
         rows.append(head | description | statistics_of_point(tracks, alpha))
-        print(sentence(rows[-1]), flush=True)
+        print(report_line(rows[-1]), flush=True)
     head = {"grains": GRAINS, "frames": FRAMES, "velocity_noise": VELOCITY, "position_noise": POSITION}
     output.write_rows("fit_map", head | {"contact_duration": CONTACT_DURATION, "timestep": OWN_TIMESTEP}, "rows", rows)
     output.write_picture(draw(rows), "fit_map")

@@ -109,7 +109,7 @@ def errors_of(
     }
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     error = f"{row['error']:.1e} ± {row['error_stderr']:.0e}, bias {row['bias']:+.1e}" if "error" in row else "none"
     return (
         f"α {row['restitution']:g}, noise {row['velocity_noise']:g} and {row['position_noise']:g}, "
@@ -166,7 +166,7 @@ def run(output: Output) -> None:
             head = {"restitution": alpha, "velocity_noise": noise[0], "position_noise": noise[1]}
             row = errors_of(name, method, [first(tracks, n) for tracks in trajectories], *noise, alpha)
             rows.append(head | {"frames": n, "interval": interval, **row})
-            print(sentence(rows[-1]), flush=True)
+            print(report_line(rows[-1]), flush=True)
     head = {"grains": GRAINS, "packing_fraction": FRACTION, "contact_duration": CONTACT_DURATION}
     output.write_rows("fit_methods", head, "rows", rows)
     output.write_picture(draw(rows), "fit_methods")

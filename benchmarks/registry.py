@@ -15,7 +15,6 @@ class Option:
     help: str
     kind: type = str
     choices: tuple[str | int, ...] | None = None
-    hidden: bool = False
 
 
 @dataclass(frozen=True)
@@ -132,10 +131,7 @@ BENCHMARKS = (
         "How long does a step of a replica take, beside a numba loop made for one purpose?",
         (1, 0.5),
         ("step_cost.json", "step_cost.png"),
-        (
-            Option("--repeats", "timed pairs of each point", int),
-            Option("--memory-only", "print the peak memory of 1000 replicas", bool, hidden=True),
-        ),
+        (Option("--repeats", "timed pairs of each point", int),),
         one_core=True,
     ),
     Benchmark(
