@@ -1,4 +1,4 @@
-"""One door to all benchmarks: lists them, or reads the options of one and runs it."""
+"""The command line of the benchmarks: lists them, or reads the options of one and runs it."""
 
 import argparse
 import ast
@@ -13,11 +13,11 @@ from benchmarks.registry import BENCHMARKS, Benchmark
 SHARED = ("name", "quick", "output", "allow_uncommitted")
 
 
-def main(words: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """List the benchmarks, or run the one that is named."""
-    chosen = parser().parse_args(words)
+    chosen = parser().parse_args(arguments)
     if chosen.name is None:
-        print("\n".join(map(described, BENCHMARKS)))
+        print("\n".join(map(listing, BENCHMARKS)))
         return
     benchmark = next(one for one in BENCHMARKS if one.name == chosen.name)
     set_up(benchmark.one_core)
@@ -30,7 +30,7 @@ def main(words: Sequence[str] | None = None) -> None:
     import_module(benchmark.module_name).run(Output(chosen.output, chosen.quick), **options)
 
 
-def described(benchmark: Benchmark) -> str:
+def listing(benchmark: Benchmark) -> str:
     """Name, minutes, question and results of a benchmark, as lines of text."""
     full, quick = (f"{minutes:g}" for minutes in benchmark.minutes)
     results = ", ".join(benchmark.files) or "keeps no result"
@@ -39,8 +39,8 @@ def described(benchmark: Benchmark) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The command line: the shared options, and those of each benchmark."""
-    whole = argparse.ArgumentParser("python -m benchmarks", description="Without a name, lists all benchmarks.")
-    names = whole.add_subparsers(dest="name", metavar="NAME", title="benchmarks")
+    main_parser = argparse.ArgumentParser("python -m benchmarks", description="Without a name, lists all benchmarks.")
+    names = main_parser.add_subparsers(dest="name", metavar="NAME", title="benchmarks")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--quick", action="store_true", help="small and inaccurate, into files named _quick")
     default = ROOT / "benchmarks" / "results"
@@ -53,20 +53,19 @@ def parser() -> argparse.ArgumentParser:
             benchmark.name,
             parents=[shared],
             help=benchmark.question.replace("%", "%%"),
-            description=about(benchmark),
+            description=module_docstring(benchmark),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         for option in benchmark.options:
-            words = argparse.SUPPRESS if option.hidden else option.help
             if option.kind is bool:
-                one.add_argument(option.name, action="store_true", help=words)
+                one.add_argument(option.name, action="store_true", help=option.help)
             else:
                 place = {} if option.name.startswith("-") else {"nargs": "?"}
-                one.add_argument(option.name, type=option.kind, choices=option.choices, help=words, **place)
-    return whole
+                one.add_argument(option.name, type=option.kind, choices=option.choices, help=option.help, **place)
+    return main_parser
 
 
-def about(benchmark: Benchmark) -> str:
+def module_docstring(benchmark: Benchmark) -> str:
     """The docstring of the module, read from its source: importing it would start JAX."""
     source = (ROOT / benchmark.module_name.replace(".", "/")).with_suffix(".py")
     return ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""

@@ -32,7 +32,7 @@ STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v")) 
 
 def run(output: Output, dataset: Path | None = None) -> None:
     """Fit, leave out, print, and write JSON and PNG; of a dataset of a map, or of one that is made."""
-    data = measured(output.quick) if dataset is None else read_dataset(dataset)
+    data = make_map(output.quick) if dataset is None else read_dataset(dataset)
     errors, closure = leave_one_out(data), jg.fit_closure(data)
     summary = {name: error_summary(errors, name) for name in NAMES} | {"restitution": restitution_summary(errors)}
     print("relative errors of points left out, in percent")
@@ -53,7 +53,7 @@ def run(output: Output, dataset: Path | None = None) -> None:
     output.write_picture(draw(data, errors), "closure")
 
 
-def measured(quick: bool) -> xr.Dataset:
+def make_map(quick: bool) -> xr.Dataset:
     """The map that the command line makes first, or a smaller one."""
     return jg.ratio_map(**PRESETS["quick"] | (SMALLER if quick else {}), workers=usable_cores())
 

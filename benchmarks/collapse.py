@@ -93,7 +93,7 @@ def row(discs: int, gap: float) -> jg.State:
     return jg.State(grains, places, jnp.asarray(laboratory), jnp.asarray(SIDE), jnp.asarray(0.0))
 
 
-def measured(
+def steps_and_excess(
     restitution: float, timestep: float, states: Sequence[jg.State], advance: Callable = advance
 ) -> tuple[np.ndarray, np.ndarray]:
     """Steps with contacts, and excess of the force ratio, of every start; arrays (states,).
@@ -117,7 +117,9 @@ def run(output: Output) -> None:
     rows = [study(discs, r, gaps) for discs, several in RESTITUTIONS.items() for r in several]
     print("discs      r   steps with contacts, at most   steps that a decade adds   exponent of the excess")
     for one in rows:
-        print(f"{one['discs']:5d}{one['restitution']:7g}   " + "   ".join(described(law, one.get(law)) for law in LAWS))
+        print(
+            f"{one['discs']:5d}{one['restitution']:7g}   " + "   ".join(table_cell(law, one.get(law)) for law in LAWS)
+        )
     choices = {
         "first_gap": GAP,
         "second_gap": (gaps[0], gaps[-1]),
@@ -130,7 +132,7 @@ def run(output: Output) -> None:
     output.write_picture(draw(rows), "collapse")
 
 
-def described(law: str, values: tuple | None) -> str:
+def table_cell(law: str, values: tuple | None) -> str:
     """A measured number with its error beside the exact one, as text of fixed width; empty where it does not apply."""
     if values is None:
         return " " * 26
@@ -142,7 +144,7 @@ def described(law: str, values: tuple | None) -> str:
 def study(discs: int, restitution: float, gaps: np.ndarray) -> dict:
     """Means over the starts at each time step, and the law of vanishing dt, measured and exact."""
     states = [row(discs, gap) for gap in gaps]
-    steps, excess = np.stack([measured(restitution, dt, states) for dt in TIMESTEPS], axis=1)
+    steps, excess = np.stack([steps_and_excess(restitution, dt, states) for dt in TIMESTEPS], axis=1)
     found = {"discs": discs, "restitution": restitution}
     for name, values in (("steps", steps), ("excess", excess)):
         found[name] = list(values.mean(axis=1))
@@ -165,7 +167,7 @@ def slopes(
     """
     collisions = int(np.log(COARSE / FINE) / np.log(exact.larger / exact.smaller))
     decades = collisions * np.log10(exact.larger / exact.smaller)
-    coarse, fine = (measured(restitution, dt, states, advance) for dt in (COARSE, COARSE / 10**decades))
+    coarse, fine = (steps_and_excess(restitution, dt, states, advance) for dt in (COARSE, COARSE / 10**decades))
     return (fine[0] - coarse[0]) / decades, np.log10(coarse[1] / fine[1]) / decades
 
 
@@ -186,10 +188,10 @@ def draw(rows: list[dict]) -> Figure:
                 "label": f"r = {one['restitution']:g}",
             }
             steps, excess = np.array(one["steps"]), np.array(one["excess"])
-            seen = excess > LEAST
+            drawn = excess > LEAST
             panels[0, column].errorbar(TIMESTEPS, steps, one["steps_error"], **style)
-            error = np.minimum(one["excess_error"], 0.9 * excess)[seen]
-            panels[1, column].errorbar(TIMESTEPS[seen], excess[seen], error, **style)
+            error = np.minimum(one["excess_error"], 0.9 * excess)[drawn]
+            panels[1, column].errorbar(TIMESTEPS[drawn], excess[drawn], error, **style)
             if collapses:
                 exact = roots(discs, one["restitution"])
                 decades = np.log10(TIMESTEPS / TIMESTEPS[MIDDLE])
@@ -211,5 +213,5 @@ def dress(steps: Axes, excess: Axes) -> None:
     steps.set(xscale="log", ylim=(0, 30), ylabel="steps with contacts (mean over starts)")
     excess.set(yscale="log", ylim=(LEAST, 2), ylabel="excess of the force ratio, ⟨F⟩/⟨F_bc⟩ − 1")
     steps.text(0.02, 0.02, "lines: exact slopes 1/log₁₀(λ₊/λ₋)", transform=steps.transAxes, fontsize="small")
-    words = {"transform": excess.transAxes, "fontsize": "small", "ha": "right"}
-    excess.text(0.98, 0.02, "lines: dt^β, exact exponents", **words)
+    style = {"transform": excess.transAxes, "fontsize": "small", "ha": "right"}
+    excess.text(0.98, 0.02, "lines: dt^β, exact exponents", **style)

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
@@ -89,7 +88,7 @@ def run(output: Output) -> None:
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
     head |= {"reference": reference, "matches": matches, "powers": powers, "event_driven": discs}
     output.write_rows("contact_duration", head, "jaxgran", grains)
-    output.write_picture(draw(flows, discs, grains), "contact_duration")
+    output.write_picture(draw(discs, grains), "contact_duration", dpi=200)
 
 
 def event_driven(flow: Flow, runs: Runs, durations: tuple[float, ...]) -> list[dict]:
@@ -206,51 +205,22 @@ def report(reference: list[dict], matches: list[dict], powers: list[dict]) -> No
         print("ν {:4g}  α {:3g}".format(*some[0]["flow"]), *texts)
 
 
-def draw(flows: list[Flow], discs: list[dict], grains: list[dict]) -> Figure:
-    """Stresses, collision rate and shares, against t_c (open) and dt (filled), a column for each flow."""
-    figure = Figure(figsize=(1.2 + 3.4 * len(flows), 9.6), layout="constrained")
-    panels = figure.subplots(3, len(flows), sharex=True, squeeze=False)
-    curves = (
-        (0, "pressure", "pressure", "o", "black"),
-        (0, "shear_stress", "shear stress", "s", "tab:blue"),
-        (1, "collision_rate", "collisions per grain", "o", "black"),
-        (2, "elastic_pressure_share", "elastic, of the contact pressure", "s", "tab:blue"),
-        (2, "cluster_pressure_share", "in clusters, of the contact pressure", "o", "black"),
-        (2, "force_ratio", "excess of the force ratio", "D", "tab:red"),
-    )
-    for column, flow in enumerate(flows):
-        for line, name, label, marker, colour in curves:
-            for rows, filled, source in ((discs, False, "event-driven, t_c"), (grains, True, "jaxgran, dt")):
-                some = [row for row in rows if tuple(row["flow"]) == flow and name in row]
-                if some:
-                    look = {"marker": marker, "color": colour, "label": f"{label} ({source})"}
-                    plot(panels[line, column], some, name, filled, look)
-        panels[0, column].set_title("ν = {:g}, α = {:g}".format(*flow), fontsize="medium")
-        panels[2, column].set(xlabel="t_c or dt (1/shear rate)", ylim=(1e-4, 5))
-    for line, label in enumerate(("stress (mγ̇²)", "collisions per grain and strain", "share, or excess")):
-        panels[line, 0].set_ylabel(label)
-    handles, labels = zip(
-        *(pair for line in panels[:, 0] for pair in zip(*line.get_legend_handles_labels(), strict=True)), strict=True
-    )
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=min(3, len(flows)), fontsize="small", frameon=False
-    )
+def draw(discs: list[dict], grains: list[dict]) -> Figure:
+    """Pressure and collision rate of the flow that collapses most, against t_c of event-driven discs and dt here."""
+    figure = Figure(figsize=(6.7, 2.7), layout="constrained")
+    flow = max((row["flow"] for row in grains), key=lambda flow: (flow[0], -flow[1]))
+    labels = {"pressure": r"pressure $p/m\dot\gamma^2$", "collision_rate": "collisions of a grain in a unit of strain"}
+    sources = ((discs, r"event-driven, $t_\mathrm{c}$", "o:", "white"), (grains, r"jaxgran, $\Delta t$", "s-", "black"))
+    for axes, (name, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+        for rows, source, look, face in sources:
+            here = [row for row in rows if row["flow"] == flow]
+            value, error = np.array([row[name] for row in here]).T
+            times = [row["time"] for row in here]
+            axes.errorbar(times, value, error, fmt=look, color="black", mfc=face, ms=4.5, capsize=2, label=source)
+        axes.set(xscale="log", yscale="log" if name == "collision_rate" else "linear")
+        axes.set_xlabel(r"$t_\mathrm{c}$ or $\Delta t$ ($1/\dot\gamma$)", fontsize=9)
+        axes.set_ylabel(label, fontsize=8)
+        axes.tick_params(labelsize=8)
+        axes.legend(fontsize=8, frameon=False)
+    figure.axes[0].set_ylim(bottom=0)
     return figure
-
-
-def plot(axes: Axes, rows: list[dict], name: str, filled: bool, look: dict) -> None:
-    """One curve with error bars on logarithmic axes; of a force ratio, the excess."""
-    times = np.array([row["time"] for row in rows])
-    value, error = np.array([row[name] for row in rows]).T
-    value = value - (name == "force_ratio")
-    axes.errorbar(
-        times,
-        value,
-        np.minimum(error, 0.9 * abs(value)),
-        **look,
-        markersize=4.5,
-        capsize=2,
-        linestyle="-" if filled else ":",
-        markerfacecolor=look["color"] if filled else "white",
-    )
-    axes.set(xscale="log", yscale="log")

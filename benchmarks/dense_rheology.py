@@ -44,8 +44,8 @@ def run(output: Output) -> None:
     plan = QUICK if output.quick else FULL
     data = jg.ratio_map(**plan, workers=usable_cores())
     rows = []
+    output.write_picture(friction_figure(data), "dense_rheology", dpi=200)
     for mixture, flows in (("uniform", data), ("bidisperse", bidisperse(plan, data))):
-        output.write_picture(friction_figure(flows), f"dense_rheology_{mixture}", dpi=200)
         for least in LOOSEST:
             chosen = flows.sel(packing_fraction=flows.packing_fraction >= least)
             if chosen.sizes["packing_fraction"] > 3:

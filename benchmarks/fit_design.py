@@ -22,7 +22,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from benchmarks.fit_coverage import peculiar, spoilt, trajectories
+from benchmarks.fit_coverage import fit_all, peculiar_velocities, trajectories, with_noise
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.log_axis import number_log_axis
@@ -99,7 +99,7 @@ def predicted(
         row |= {"refused": str(why)}
     else:
         row |= vars(found)
-    print(sentence(row), flush=True)
+    print(report_line(row), flush=True)
     return row
 
 
@@ -107,15 +107,10 @@ def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
     """Predictions, and fits to trajectories, with each noise."""
     strain = interval / theory(alpha, nu)[0] * (FITTED_FRAMES - 1)
     tracks = trajectories(alpha, runs, nu, FITTED_FRAMES, strain)
-    speed = np.sqrt(np.mean([peculiar(seen) ** 2 for seen in tracks]))
+    speed = np.sqrt(np.mean([peculiar_velocities(one) ** 2 for one in tracks]))
     rows = []
     for noise, (velocity, position) in NOISES.items():
-        fits = []
-        for k, seen in enumerate(tracks):
-            try:
-                fits.append(jg.fit_restitution(spoilt(seen, velocity, position, 0.0, k)))
-            except (InputError, RuntimeError):
-                continue
+        fits, _ = fit_all(with_noise(one, velocity, position, 0.0, k) for k, one in enumerate(tracks))
         row = predicted(alpha, nu, interval, noise, FITTED_FRAMES, None if velocity is None else velocity * speed)
         stated, off = (np.array(x) for x in zip(*[(fit.stderr, fit.restitution - alpha) for fit in fits], strict=True))
         row |= {
@@ -135,7 +130,7 @@ def fit_rows(alpha: float, nu: float, interval: float, runs: int) -> list[dict]:
     return rows
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     head = (
         f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['noise']}, {row['interval']:g} between frames"
     )

@@ -28,6 +28,7 @@ import numpy as np
 
 import jaxgran as jg
 from benchmarks.event_driven import Law, averages, sheared
+from benchmarks.fit_coverage import fit_statistics
 from benchmarks.output import Output
 from benchmarks.peers import lammps, problem
 from benchmarks.tracked_discs import FRACTION, ROWS, discs_at_rest
@@ -121,23 +122,13 @@ def deepest_overlap(tracks: jg.Tracks) -> float:
     return deepest
 
 
-def summary(fits: list[jg.RestitutionFit], refused: list[str], truth: float) -> dict:
+def summary(fits: list[jg.RestitutionFit], refused: list[str], restitution: float) -> dict:
     """Coverage and bias of the fits in one way."""
     few = {"fits": len(fits), "refused": refused}
     if len(fits) < 2:
         return few
-    off = np.array([fit.restitution for fit in fits]) - truth
-    return few | {
-        "held": int(sum(fit.low <= truth <= fit.high for fit in fits)),
-        "bias": float(off.mean()),
-        "bias_stderr": float(off.std(ddof=1) / np.sqrt(len(off))),
-        "spread": float(off.std(ddof=1)),
-        "stderr": float(np.median([fit.stderr for fit in fits])),
-        "collisions": float(np.mean([fit.collisions for fit in fits])),
-        "rejected": float(np.mean([fit.rejected for fit in fits])),
-        "misfit": float(np.median([fit.misfit for fit in fits])),
-        "diameter_noise": float(np.median([fit.diameter_noise for fit in fits])),
-    }
+    diameter_noise = float(np.median([fit.diameter_noise for fit in fits]))
+    return few | fit_statistics(fits, restitution) | {"diameter_noise": diameter_noise}
 
 
 def row(duration: float, runs: int, folder: Path) -> dict:
@@ -178,7 +169,7 @@ def row(duration: float, runs: int, folder: Path) -> dict:
     }
 
 
-def sentences(row: dict) -> str:
+def report_lines(row: dict) -> str:
     first = (
         f"contact {row['contact_over_free_time']:.3g} of the free time, {row['contact_over_frame']:.2g} frames, "
         f"k = {row['stiffness']:.2g}, overlap {row['overlap']:.2g} σ, pairs {row['restitution_of_pairs']:.4f} ± "
@@ -190,8 +181,8 @@ def sentences(row: dict) -> str:
         if of["fits"] > 1:
             words += (
                 f", bias {of['bias']:+.5f} ± {of['bias_stderr']:.5f}, error {of['stderr']:.5f}, spread "
-                f"{of['spread']:.5f}, {of['held']} hold, {of['collisions']:.0f} collisions, {of['rejected']:.0f} "
-                f"rejected, misfit {of['misfit']:.2f}"
+                f"{of['spread_in_errors']:.2f} errors, {of['held']} hold, {of['collisions']:.0f} collisions, "
+                f"{of['rejected']:.0f} rejected, misfit {of['misfit']:.2f}"
             )
         lines.append(words)
     return "\n  ".join(lines)
@@ -206,6 +197,6 @@ def run(output: Output) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for duration in DURATIONS:
             rows.append(row(duration, FEW_RUNS if output.quick else RUNS, Path(folder)))
-            print(sentences(rows[-1]), flush=True)
+            print(report_lines(rows[-1]), flush=True)
     head = {"lammps": lammps.version(), "grains": ROWS**2, "packing_fraction": FRACTION, "frames": FRAMES}
     output.write_json("fit_lammps", {**head, "strain": STRAIN, "dump": DUMP, "rows": rows})

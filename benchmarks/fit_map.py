@@ -1,4 +1,4 @@
-"""In which flows do the intervals of a fitted restitution hold? A map over restitution and packing fraction.
+"""In which flows do the intervals of a fitted restitution cover it? A map over restitution and packing fraction.
 
     python -m benchmarks fit_map           # 20 points, and dense ones again by a quicker camera
     python -m benchmarks fit_map --quick   # three points, few trajectories
@@ -8,8 +8,8 @@ At each point 16 trajectories of the event-driven reference, N = 64, 50 frames, 
 in the mean time between two collisions of a disc. At two points the discs are those of jaxgran itself, at a time step
 of 1e-4, where grains of a cluster stay in touch.
 
-Where discs collide in clusters, the reference has its duration of contact, 1e-6/γ̇: a disc that collides again within
-that time loses no energy. The share of such collisions is written beside each point; those are no collisions with α.
+The event-driven reference has a duration of contact of 1e-6/γ̇: a disc that collides again within that time loses no
+energy. The share of such collisions is written beside each point.
 """
 
 import time
@@ -22,9 +22,17 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.event_driven import Law, averages, discs_of, sheared
-from benchmarks.fit_coverage import BETWEEN, CONTACT_DURATION, GRAINS, SETTLING, observed, spoilt
+from benchmarks.fit_coverage import (
+    BETWEEN,
+    CONTACT_DURATION,
+    GRAINS,
+    SETTLING,
+    fit_all,
+    fit_statistics,
+    successive,
+    with_noise,
+)
 from benchmarks.output import Output
-from jaxgran.model.checks import InputError
 
 RESTITUTIONS, FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.4, 0.6, 0.75, 0.8)
 DENSE = (0.75, 0.8)  # also by the quicker camera
@@ -45,63 +53,43 @@ def by_reference(alpha: float, nu: float, runs: int, quicker: bool) -> tuple[lis
     discs, sums = sheared(discs, law, SETTLING)
     mean = {name: float(value[0]) for name, value in averages(sums, discs).items()}
     interval = 1 / (PER_COLLISION * mean["collision_rate"]) if quicker else INTERVAL
-    found = []
-    for _ in range(runs):
-        discs, seen = observed(discs, law, FRAMES, interval * (FRAMES - 1))
-        found.append(seen)
-        discs, _ = sheared(discs, law, BETWEEN)
-    told = {name: mean[name] for name in ("collision_rate", "granular_temperature", "elastic_share")}
-    return found, {"interval": interval, **told}
+    tracks = successive(discs, alpha, runs, FRAMES, interval * (FRAMES - 1))
+    description = {name: mean[name] for name in ("collision_rate", "granular_temperature", "elastic_share")}
+    return tracks, {"interval": interval, **description}
 
 
 def by_jaxgran(alpha: float, nu: float, runs: int) -> tuple[list[jg.Tracks], dict]:
     """Trajectories of contact dynamics with time steps."""
     flow = jg.ShearFlow(GRAINS, alpha, nu, OWN_TIMESTEP)
-    state, found = jg.prepare(flow, jax.random.key(SEED), SETTLING), []
+    state, tracks = jg.prepare(flow, jax.random.key(SEED), SETTLING), []
     strain = INTERVAL * np.arange(1, FRAMES + 1)
     for _ in range(runs):
-        state, seen = jg.snapshot_series(flow, state, INTERVAL * FRAMES, FRAMES)
-        found.append(jg.tracks_of_states(strain, seen.state))
+        state, snapshots = jg.snapshot_series(flow, state, INTERVAL * FRAMES, FRAMES)
+        tracks.append(jg.tracks_of_states(strain, snapshots.state))
         state, _ = jg.advance(flow, state, jnp.int32(round(BETWEEN / OWN_TIMESTEP)))
-    return found, {"interval": INTERVAL}
+    return tracks, {"interval": INTERVAL}
 
 
-def fitted(found: list[jg.Tracks], alpha: float) -> dict:
-    """How often the intervals of a point hold, with the 95 % interval of that share by Wilson, and by how much not."""
-    fits, refused, start = [], 0, time.process_time()
-    for k, seen in enumerate(found):
-        try:
-            fits.append(jg.fit_restitution(spoilt(seen, VELOCITY, POSITION, 0.0, NOISE_SEED + k)))
-        except (InputError, RuntimeError):
-            refused += 1
-    row = {"fits": len(fits), "refused": refused, "seconds": (time.process_time() - start) / len(found)}
+def statistics_of_point(tracks: list[jg.Tracks], alpha: float) -> dict:
+    """How many intervals of a point cover α, with the 95 % interval of that share by Wilson, and the bias."""
+    start = time.process_time()
+    fits, refused = fit_all(with_noise(one, VELOCITY, POSITION, 0.0, NOISE_SEED + k) for k, one in enumerate(tracks))
+    row = {"fits": len(fits), "refused": refused, "seconds": (time.process_time() - start) / len(tracks)}
     if not fits:
         return row
-    off, errors = np.array([(fit.restitution - alpha, fit.stderr) for fit in fits]).T
-    held = sum(fit.low <= alpha <= fit.high for fit in fits)
-    wilson = scipy.stats.binomtest(held, len(fits)).proportion_ci(method="wilson")
-    return row | {
-        "held": held,
-        "coverage": (wilson.low, wilson.high),
-        "bias_in_errors": float(np.mean(off / errors)),
-        "spread_in_errors": float(np.std(off / errors, ddof=1)),
-        "bias": float(np.mean(off)),
-        "bias_stderr": float(np.std(off, ddof=1) / np.sqrt(len(off))),
-        "stderr": float(np.median(errors)),
-        "collisions": float(np.mean([fit.collisions for fit in fits])),
-        "rejected": float(np.mean([fit.rejected for fit in fits])),
-        "misfit": float(np.median([fit.misfit for fit in fits])),
-    }
+    row |= fit_statistics(fits, alpha)
+    wilson = scipy.stats.binomtest(row["held"], len(fits)).proportion_ci(method="wilson")
+    return row | {"coverage": (wilson.low, wilson.high)}
 
 
-def sentence(row: dict) -> str:
-    words = (
+def report_line(row: dict) -> str:
+    head = (
         f"α {row['restitution']:g}, ν {row['packing_fraction']:g}, {row['camera']}, frames {row['interval']:.2g} apart"
     )
     if not row["fits"]:
-        return f"{words}: all {row['refused']} refused"
+        return f"{head}: all {row['refused']} refused"
     return (
-        f"{words}: {row['held']} of {row['fits']} hold, {row['refused']} refused, bias {row['bias_in_errors']:+.2f} ± "
+        f"{head}: {row['held']} of {row['fits']} hold, {row['refused']} refused, bias {row['bias_in_errors']:+.2f} ± "
         f"{row['spread_in_errors'] / np.sqrt(row['fits']):.2f} errors of {row['stderr']:.1e}, {row['collisions']:.0f} "
         f"collisions, {row['rejected']:.0f} left out, misfit {row['misfit']:.2f}, {row['seconds']:.2f} s"
     )
@@ -153,12 +141,13 @@ def run(output: Output) -> None:
     cases += [("jaxgran", *point) for point in OWN[: 1 if output.quick else None]]
     rows = []
     for camera, alpha, nu in cases:
-        made = (
-            by_jaxgran(alpha, nu, runs) if camera == "jaxgran" else by_reference(alpha, nu, runs, camera == "quicker")
-        )
-        found, told = made
-        rows.append({"camera": camera, "restitution": alpha, "packing_fraction": nu, **told, **fitted(found, alpha)})
-        print(sentence(rows[-1]), flush=True)
+        if camera == "jaxgran":
+            tracks, description = by_jaxgran(alpha, nu, runs)
+        else:
+            tracks, description = by_reference(alpha, nu, runs, camera == "quicker")
+        head = {"camera": camera, "restitution": alpha, "packing_fraction": nu}
+        rows.append(head | description | statistics_of_point(tracks, alpha))
+        print(report_line(rows[-1]), flush=True)
     head = {"grains": GRAINS, "frames": FRAMES, "velocity_noise": VELOCITY, "position_noise": POSITION}
     output.write_rows("fit_map", head | {"contact_duration": CONTACT_DURATION, "timestep": OWN_TIMESTEP}, "rows", rows)
     output.write_picture(draw(rows), "fit_map")

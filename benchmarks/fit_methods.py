@@ -4,25 +4,25 @@
     python -m benchmarks fit_methods --quick   # few trajectories, one noise
 
 Trajectories of the event-driven reference, N = 64, ν = 0.6, as in ``fit_coverage``. Noise of velocities over their root
-mean square, and of positions in σ. The other methods (``fit_rivals``) are told the noise, and those that simulate have
-the program that made the data. Their settings were chosen on trajectories of another seed: mean velocities of up to
-five frames by hand; simulations that follow 16 frames, a strain of 0.08.
+mean square, and of positions in σ. The other methods (``fit_rivals``) get the noise, and simulations are those of the
+program that made the data. Their settings were chosen on trajectories of another seed: mean velocities of up to five
+frames by hand; simulations that follow 16 frames, a strain of 0.08.
 
-Seconds are those of the processor for one trajectory, compilation left out. The simulations with which statistics are
-compared serve all trajectories of a flow, of a frame rate and of a noise; their seconds are written apart.
+Seconds are CPU time of one trajectory, without compilation.
 """
 
 import time
 from collections.abc import Callable
+from itertools import product
 
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from benchmarks.event_driven import Discs, Law, discs_of, sheared
-from benchmarks.fit_coverage import BETWEEN, CONTACT_DURATION, FRACTION, GRAINS, SETTLING, observed, spoilt
-from benchmarks.fit_rivals import Noise, Regression, by_hand, of_simulations, seen_of, statistics, sums_of
+from benchmarks.event_driven import Discs, discs_of
+from benchmarks.fit_coverage import CONTACT_DURATION, FRACTION, GRAINS, peculiar_velocities, successive, with_noise
+from benchmarks.fit_rivals import Noise, by_hand, by_simulations, pairs_of
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
 
@@ -31,18 +31,15 @@ NOISES = ((0.01, 1e-4), (0.05, 1e-3))  # of velocities over their root mean squa
 FRAMES, FEW_FRAMES, INTERVAL = (10, 20, 50, 100), 50, 0.005
 INTERVALS = (0.02, 0.08)  # beside that one, with FEW_FRAMES
 FOLLOWED = 0.08  # strain of a simulation
-STARTS_APART = 4, 8  # frames between two starts, for Brent, and for Nelder and Mead
-RUNS, TABLE, PIECES = 12, 300, 4  # trajectories; simulations of a table, and parts of one that are used for few frames
-RANGE = (0.1, 0.98)  # of the restitution, before anything is seen
+START_EVERY = 4  # frames between two starts of a simulation
+RUNS = 12  # trajectories
 SEED, NOISE_SEED = 3, 2000
 
 Methods = dict[str, Callable]
 STYLES = {  # marker, line, grey
     "this program": ("o", "-", "0.0"),
     "single collisions by hand": ("^", "--", "0.0"),
-    "simulations, Brent": ("s", "-", "0.45"),
-    "simulations, Nelder–Mead": ("D", ":", "0.45"),
-    "statistics of the flow": ("v", "-.", "0.65"),
+    "simulations": ("s", "-", "0.45"),
 }
 
 
@@ -50,17 +47,6 @@ def start() -> Discs:
     """The packing of all trajectories."""
     flow = jg.ShearFlow(GRAINS, RESTITUTIONS[0], FRACTION, 1e-3)
     return discs_of(jg.prepare(flow, jax.random.key(SEED)))
-
-
-def trajectories(discs: Discs, alpha: float, runs: int, frames: int, interval: float) -> list[jg.Tracks]:
-    """Tracks without noise, one after the other of one flow."""
-    law, found = Law(alpha, CONTACT_DURATION), []
-    discs, _ = sheared(discs, law, SETTLING)
-    for _ in range(runs):
-        discs, seen = observed(discs, law, frames, interval * (frames - 1))
-        found.append(seen)
-        discs, _ = sheared(discs, law, BETWEEN)
-    return found
 
 
 def first(tracks: jg.Tracks, frames: int) -> jg.Tracks:
@@ -72,36 +58,13 @@ def first(tracks: jg.Tracks, frames: int) -> jg.Tracks:
 
 def noise_of(tracks: jg.Tracks, velocity: float, position: float) -> Noise:
     """What ``spoilt`` does to the tracks."""
-    c = tracks.velocities.copy()
-    c[..., 0] -= tracks.shear_rate * tracks.positions[..., 1]
-    return Noise(velocity * float(np.sqrt(np.mean(c**2))), position)
+    return Noise(velocity * float(np.sqrt(np.mean(peculiar_velocities(tracks) ** 2))), position)
 
 
-def regressions(discs: Discs, frames: tuple[int, ...], interval: float, noises: tuple, size: int) -> tuple[dict, dict]:
-    """A regression for each noise and number of frames, and the seconds of the simulations of each noise."""
-    restitutions = np.random.default_rng(SEED).uniform(*RANGE, size)
-    found = {(noise, n): ([], []) for noise in noises for n in frames}
-    seconds = dict.fromkeys(noises, 0.0)
-    for k, alpha in enumerate(restitutions):
-        begin = time.process_time()
-        (tracks,) = trajectories(discs, alpha, 1, max(frames), interval)
-        simulating = time.process_time() - begin
-        for noise in noises:
-            begin = time.process_time()
-            sums = sums_of(seen_of(spoilt(tracks, *noise, 0.0, NOISE_SEED + RUNS + k)), noise_of(tracks, *noise))
-            for n in frames:
-                for part in range(min(PIECES, max(frames) // n)):
-                    values, numbers = found[noise, n]
-                    values.append(alpha)
-                    numbers.append(statistics(sums[part * n : (part + 1) * n].mean(axis=0)))
-            seconds[noise] += simulating + time.process_time() - begin
-    return {key: Regression(*map(np.array, each)) for key, each in found.items()}, seconds
-
-
-def methods(regression: Regression, interval: float) -> Methods:
+def methods(interval: float) -> Methods:
     """All methods: functions of tracks with noise, and of that noise."""
     window = max(1, round(FOLLOWED / interval))
-    brent, nelder_mead = (min(window, apart) for apart in STARTS_APART)
+    every = min(window, START_EVERY)
 
     def ours(tracks: jg.Tracks, noise: Noise) -> float:
         try:
@@ -111,30 +74,24 @@ def methods(regression: Regression, interval: float) -> Methods:
 
     return {
         "this program": ours,
-        "single collisions by hand": lambda tracks, noise: by_hand(seen_of(tracks), noise, 5),
-        "simulations, Brent": lambda tracks, noise: of_simulations(
-            seen_of(tracks), noise, CONTACT_DURATION, window, brent
-        )[0],
-        "simulations, Nelder–Mead": lambda tracks, noise: of_simulations(
-            seen_of(tracks), noise, CONTACT_DURATION, window, nelder_mead, True
-        )[0],
-        "statistics of the flow": lambda tracks, noise: regression.restitution(
-            statistics(sums_of(seen_of(tracks), noise).mean(axis=0))
-        ),
+        "single collisions by hand": lambda tracks, noise: by_hand(pairs_of(tracks), noise, 5),
+        "simulations": lambda tracks, noise: by_simulations(pairs_of(tracks), noise, CONTACT_DURATION, window, every)[
+            0
+        ],
     }
 
 
-def measured(
-    name: str, method: Callable, found: list[jg.Tracks], velocity: float, position: float, alpha: float
+def errors_of(
+    name: str, method: Callable, trajectories: list[jg.Tracks], velocity: float, position: float, alpha: float
 ) -> dict:
     """Root mean square error of a method over the trajectories, with its standard error, and its seconds."""
     off, seconds = [], []
-    for k, tracks in enumerate(found):
-        seen, noise = spoilt(tracks, velocity, position, 0.0, NOISE_SEED + k), noise_of(tracks, velocity, position)
+    for k, tracks in enumerate(trajectories):
+        noisy, noise = with_noise(tracks, velocity, position, 0.0, NOISE_SEED + k), noise_of(tracks, velocity, position)
         if k == 0:
-            method(seen, noise)  # compilation
+            method(noisy, noise)  # compilation
         begin = time.process_time()
-        off.append(method(seen, noise) - alpha)
+        off.append(method(noisy, noise) - alpha)
         seconds.append(time.process_time() - begin)
     off = np.array(off)
     done = off[np.isfinite(off)]
@@ -152,7 +109,7 @@ def measured(
     }
 
 
-def sentence(row: dict) -> str:
+def report_line(row: dict) -> str:
     error = f"{row['error']:.1e} ± {row['error_stderr']:.0e}, bias {row['bias']:+.1e}" if "error" in row else "none"
     return (
         f"α {row['restitution']:g}, noise {row['velocity_noise']:g} and {row['position_noise']:g}, "
@@ -173,7 +130,7 @@ def draw(rows: list[dict]) -> Figure:
             mine = [r for r in here if r["method"] == name]
             more = sorted((r for r in mine if r["interval"] == INTERVAL), key=lambda r: r["frames"])
             apart = sorted((r for r in mine if r["frames"] == FEW_FRAMES), key=lambda r: r["interval"])
-            open_mark = "hand" in name or "Mead" in name
+            open_mark = "hand" in name
             style = {"marker": marker, "ls": dashes, "color": grey, "ms": 5, "mfc": "white" if open_mark else grey}
             for axis, x, some in ((line[0], "frames", more), (line[1], "interval", apart), (line[2], "seconds", more)):
                 error = [min(r["error_stderr"], 0.7 * r["error"]) for r in some]
@@ -197,25 +154,19 @@ def draw(rows: list[dict]) -> Figure:
 
 def run(output: Output) -> None:
     """Fit all trajectories by all methods, print, and write JSON and PNG."""
-    noises, runs, size = (NOISES[:1], 3, 60) if output.quick else (NOISES, RUNS, TABLE)
+    noises, runs = (NOISES[:1], 3) if output.quick else (NOISES, RUNS)
     frames, intervals = ((20, FEW_FRAMES), INTERVALS[1:]) if output.quick else (FRAMES, INTERVALS)
-    discs, rows, tables = start(), [], []
-    cases = [(INTERVAL, frames, alpha) for alpha in RESTITUTIONS[: 1 if output.quick else None]]
+    discs, rows = start(), []
+    cases = [(INTERVAL, frames, RESTITUTIONS[0])]
+    cases += [] if output.quick else [(INTERVAL, (FEW_FRAMES,), alpha) for alpha in RESTITUTIONS[1:]]
     cases += [(interval, (FEW_FRAMES,), RESTITUTIONS[0]) for interval in intervals]
-    made = {}
     for interval, numbers, alpha in cases:
-        if interval not in made:
-            made[interval], seconds = regressions(discs, numbers, interval, noises, size)
-            tables += [{"interval": interval, "velocity_noise": n[0], "seconds": s} for n, s in seconds.items()]
-        found = trajectories(discs, alpha, runs, max(numbers), interval)
-        for n in numbers if alpha == RESTITUTIONS[0] else (FEW_FRAMES,):
-            part = [first(tracks, n) for tracks in found]
-            for noise in noises:
-                for name, method in methods(made[interval][noise, n], interval).items():
-                    head = {"restitution": alpha, "velocity_noise": noise[0], "position_noise": noise[1]}
-                    row = measured(name, method, part, *noise, alpha)
-                    rows.append(head | {"frames": n, "interval": interval, **row})
-                    print(sentence(rows[-1]), flush=True)
-    told = {"grains": GRAINS, "packing_fraction": FRACTION, "contact_duration": CONTACT_DURATION, "table": size}
-    output.write_rows("fit_methods", told | {"tables": tables}, "rows", rows)
+        trajectories = successive(discs, alpha, runs, max(numbers), interval * (max(numbers) - 1))
+        for (n, noise), (name, method) in product(product(numbers, noises), methods(interval).items()):
+            head = {"restitution": alpha, "velocity_noise": noise[0], "position_noise": noise[1]}
+            row = errors_of(name, method, [first(tracks, n) for tracks in trajectories], *noise, alpha)
+            rows.append(head | {"frames": n, "interval": interval, **row})
+            print(report_line(rows[-1]), flush=True)
+    head = {"grains": GRAINS, "packing_fraction": FRACTION, "contact_duration": CONTACT_DURATION}
+    output.write_rows("fit_methods", head, "rows", rows)
     output.write_picture(draw(rows), "fit_methods")

@@ -39,11 +39,11 @@ def run(output: Output, colour: Colour = "speed") -> None:
     choice = QUICK if output.quick else FULL
     flows = [window(restitution, choice) for restitution in RESTITUTIONS]
 
-    rows = [described(restitution, seen) for restitution, seen in zip(RESTITUTIONS, flows, strict=True)]
+    rows = [summary(restitution, snapshots) for restitution, snapshots in zip(RESTITUTIONS, flows, strict=True)]
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
-    output.write_picture(draw([scene_of(seen) for seen in flows], colour), "flow", dpi=200)
+    output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow", dpi=200)
 
 
 def window(restitution: float, choice: Choice) -> Snapshot:
@@ -55,9 +55,9 @@ def window(restitution: float, choice: Choice) -> Snapshot:
     return jg.snapshot_series(flow, state, choice.steps * step, choice.steps)[1]
 
 
-def described(restitution: float, seen: Snapshot) -> dict[str, float]:
+def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
     """What the picture shows, in numbers."""
-    scene, share, sizes = scene_of(seen), cluster_share(seen), cluster_sizes(seen)
+    scene, share, sizes = scene_of(snapshots), cluster_share(snapshots), cluster_sizes(snapshots)
     return {
         "alpha": restitution,
         "pairs": len(scene.force),

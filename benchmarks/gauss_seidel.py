@@ -18,7 +18,6 @@ def gauss_seidel(
     tolerance: float,
     max_sweeps: int,
     shear_rate: float = 1,
-    start: np.ndarray | None = None,
 ) -> Solution:
     """Impulses by projected Gauss–Seidel sweeps over the contacts in their order.
 
@@ -31,7 +30,6 @@ def gauss_seidel(
       tolerance: relative residual to reach.
       max_sweeps: cap of the sweeps.
       shear_rate: γ̇; sets the absolute floor of the residual.
-      start: impulses to begin with, (contacts,); zero by default.
 
     Returns:
       The solution, of NumPy arrays; ``iterations`` counts the sweeps, each of the cost of one product with W.
@@ -42,10 +40,6 @@ def gauss_seidel(
     target = kind(tolerance * scale + 10 * eps * shear_rate)
     count = int(np.sum(used))
     impulses, kicks = np.zeros_like(approach), np.zeros((grains, 2), normals.dtype)
-    if start is not None:
-        impulses[:] = start
-        np.add.at(kicks, i, (start * inverse_i)[:, None] * normals)
-        np.add.at(kicks, j, -(start * inverse_j)[:, None] * normals)
     sweeps, residual = _sweep(
         i, j, normals, inverse_i, inverse_j, approach, impulses, kicks, count, target**2, max_sweeps
     )

@@ -19,20 +19,16 @@ else is made to be fast:
 Axes: positions and velocities are ``(grains, 2)``, radii and masses ``(grains,)``. Velocities are peculiar: the
 laboratory velocity is ``velocity + shear_rate * y`` along x. The periodic cell has the lattice vectors ``(side, 0)``
 and ``(tilt * side, side)``, tilt in [-1/2, 1/2).
-
-``rival_table`` measures with it.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-ACTIVATION = {"midpoint": 0.5, "touching": 0.0}
 MAX_SWEEPS = 10_000
 # Over-relaxation of the Gauss-Seidel sweeps, in small clusters and in those of more than SMALL contacts: measured best.
 # 1 is the plain method, which needs twice the sweeps and up to 1.6 times the time in the densest flows.
@@ -785,70 +781,3 @@ def advance(
         inner_rebuilds=int(sums[_INNER]),
     )
     return np.stack([x, y], 1), np.stack([vx, vy], 1), tilt, tally
-
-
-def polydisperse(grains, packing_fraction, spread, rng):
-    """Radii, masses and cell side: quantile midpoints of the uniform law, shuffled; mass is the squared diameter."""
-    diameters = 1.0 + spread * (2.0 * (np.arange(grains) + 0.5) / grains - 1.0)
-    diameters = rng.permutation(diameters)
-    side = math.sqrt(np.sum(np.pi * diameters**2 / 4.0) / packing_fraction)
-    return 0.5 * diameters, diameters**2, side
-
-
-@compiled
-def _push_apart(x, y, radii, side, max_rounds):
-    """Random points become a packing in an unsheared cell: overlapping pairs are separated until none is left."""
-    grains = x.size
-    for _ in range(max_rounds):
-        overlaps = 0
-        for i in range(grains):
-            for j in range(i):
-                dy = y[i] - y[j]
-                dy -= side * np.rint(dy / side)
-                dx = x[i] - x[j]
-                dx -= side * np.rint(dx / side)
-                touch = radii[i] + radii[j]
-                squared = dx * dx + dy * dy
-                if squared < touch * touch:
-                    overlaps += 1
-                    distance = math.sqrt(squared)
-                    push = 0.5 * (1.002 * touch - distance) / distance
-                    x[i] += push * dx
-                    y[i] += push * dy
-                    x[j] -= push * dx
-                    y[j] -= push * dy
-        if overlaps == 0:
-            return True
-    return False
-
-
-def start(grains, packing_fraction, seed, spread=0.26):
-    """Positions, velocities (temperature 1, zero momentum), radii, masses, side of an unsheared flow, no overlaps."""
-    rng = np.random.default_rng(seed)
-    radii, masses, side = polydisperse(grains, packing_fraction, spread, rng)
-    x, y = rng.uniform(0.0, side, (2, grains))
-    if not _push_apart(x, y, radii * 1.001, side, 100_000):
-        raise ValueError(f"no overlap-free packing of {grains} grains found at packing fraction {packing_fraction}")
-    velocities = rng.normal(size=(grains, 2)) / np.sqrt(masses)[:, None]
-    velocities -= (masses[:, None] * velocities).sum(0) / masses.sum()
-    return np.stack([x, y], 1), velocities, radii, masses, side
-
-
-def strained(state, strain, **law):
-    """State (positions, velocities, radii, masses, side, tilt) after a strain, its tally, the seconds it took."""
-    positions, velocities, radii, masses, side, tilt = state
-    steps = max(1, round(strain / (law["shear_rate"] * law["timestep"])))
-    begin = time.perf_counter()
-    positions, velocities, tilt, tally = advance(positions, velocities, radii, masses, side, tilt, steps=steps, **law)
-    return (positions, velocities, radii, masses, side, tilt), tally, time.perf_counter() - begin
-
-
-def settled(grains, packing_fraction, seed, timestep, strain, relax, **law):
-    """A flow sheared to its steady state at a time step of 1e-3 in strain, then relaxed at each tenfold shorter one."""
-    state = *start(grains, packing_fraction, seed), 0.0
-    coarse = max(1e-3 / law["shear_rate"], timestep)
-    state, _, _ = strained(state, strain, timestep=coarse, **law)
-    while coarse > 1.001 * timestep:
-        coarse = max(coarse / 10.0, timestep)
-        state, _, _ = strained(state, relax, timestep=coarse, **law)
-    return state

@@ -1,4 +1,4 @@
-"""The figures of ``size_study``: values against N, waves of velocity and density, and profiles."""
+"""The figures of ``size_study``: values against N, and waves of velocity and density."""
 
 from collections.abc import Mapping
 
@@ -103,32 +103,4 @@ def draw_waves(states: Mapping[tuple[float, float], tuple[int, dict]], edges: np
         axes.grid(color="0.9")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
-    return figure
-
-
-def draw_profiles(states: Mapping[tuple[float, float], tuple[int, dict]]) -> Figure:
-    """Mean peculiar velocity and density of layers across the velocity gradient, in both halves of the sample."""
-    chosen = sorted(states, key=lambda flow: -states[flow][0])[:4]
-    figure = Figure(figsize=(2.9 * len(chosen) + 0.6, 6.4), layout="constrained")
-    panels = figure.subplots(2, len(chosen), squeeze=False, sharey="row")
-    for column, flow in zip(panels.T, chosen, strict=True):
-        grains, row = states[flow]
-        profile = row["profile"][0]  # (blocks, 4, bins) of the first seed
-        bins = profile.shape[-1]
-        height = (np.arange(bins) + 0.5) / bins
-        thermal = np.sqrt(profile[:, 3].sum() / profile[:, 1].sum() / 2)
-        half = len(profile) // 2
-        parts = ((profile[0], "one instant", {"color": "0.7", "linewidth": 1}),)
-        parts += ((profile[:half].mean(axis=0), "first half", {"color": "black", "linestyle": "-"}),)
-        parts += ((profile[half:].mean(axis=0), "second half", {"color": "tab:red", "linestyle": "--"}),)
-        for values, label, style in parts:
-            column[0].plot(values[2] / values[1] / thermal, height, label=label, **style)
-            column[1].plot(values[0] / values[0].mean(), height, **style)
-        column[0].set_title(f"{flow_name(*flow)}\nN {grains}, strain {float(row['strain']):.0f}", fontsize="medium")
-        column[0].set_xlabel("mean $c_x$ of a layer\nover thermal speed")
-        column[1].set_xlabel("packing fraction\nof a layer over ν")
-    for axes in panels[:, 0]:
-        axes.set_ylabel("height y over L")
-    handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize="small", frameon=False)
     return figure

@@ -27,7 +27,7 @@ import numpy as np
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.process import ROOT
-from benchmarks.size_figures import draw_profiles, draw_sizes, draw_waves
+from benchmarks.size_figures import draw_sizes, draw_waves
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES, boxes_across
 from jaxgran.environment import usable_cores
@@ -293,7 +293,7 @@ def structure_result(row: dict[str, np.ndarray], grains: int) -> dict[str, float
 
 
 def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
-    """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values, waves and profiles."""
+    """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values and waves."""
     plan = QUICK if output.quick else FULL
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     measure(plan, folder, largest)
@@ -311,7 +311,6 @@ def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
     largest_of = dict(done)  # the last one of a flow is its largest
     states = {plan.flows[k][:2]: (n, read_flow(folder, *plan.flows[k][:2], n)) for k, n in largest_of.items()}
     output.write_picture(draw_waves(states, WAVE_BINS), "size_study", "_waves.png")
-    output.write_picture(draw_profiles(states), "size_study", "_profiles.png")
 
 
 def print_table(rows: list[dict]) -> None:

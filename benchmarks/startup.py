@@ -1,16 +1,13 @@
-"""How long does a command take from the prompt to its end, and where does the time go?
+"""How long does a command take, from the prompt to its end?
 
-Every command runs in a process of its own, with a cache folder of this benchmark: once with nothing in it, and then
-five times more, of which the median is taken. One more run, with timers in it, says where the time goes. Imports that
-run in a thread beside the flows are counted too, so the parts may add up to more than the whole.
+Every command runs in its own process, with a cache folder of this benchmark: once with nothing in it, and then five
+times more, of which the median is taken.
 
     python -m benchmarks startup            # 3 minutes on two cores
     python -m benchmarks startup --quick    # two runs of each command, and no map
 """
 
-import json
 import os
-import re
 import statistics
 import subprocess
 import sys
@@ -31,8 +28,6 @@ COMMANDS = {
     "plot": ["plot", MAP],
 }
 SMALL_MAP = ["map", "--restitution", "0.3,0.7", "--packing-fraction", "0.5,0.6", "--grains", "32", "--output", MAP]
-PARTS = ("imports", "tracing", "compiling", "loading programs", "flows", "figures")
-_IMPORT_LINE = re.compile(r"^import time:\s*(\d+) \|", re.MULTILINE)  # microseconds of one module
 _SAMPLE = """
 import time, statistics, jax
 jax.config.update("jax_enable_x64", True)
@@ -61,18 +56,17 @@ def run(output: Output) -> None:
                 words = [*SMALL_MAP, "--quiet"]
             first = seconds_of(words, folder)
             warm = [seconds_of(words, folder) for _ in range(2 if output.quick else RUNS)]
-            row = {"command": command, "first": first, "warm": statistics.median(warm), "warm_runs": warm}
-            rows.append(row | parts_of(words, folder))
-            print_row(rows[-1])
+            rows.append({"command": command, "first": first, "warm": statistics.median(warm), "warm_runs": warm})
+            print(f"{command:18} first {first:6.1f} s, then {rows[-1]['warm']:6.2f} s", flush=True)
         sample, compiled = map(float, process([sys.executable, "-c", _SAMPLE], folder).stdout.split())
     print(f"jg.sample of one step in each of 32 blocks: {sample:.2g} ms, of which {sample - compiled:.2g} ms Python")
     milliseconds = {"sample_milliseconds": sample, "sample_python_milliseconds": sample - compiled}
     output.write_rows("startup", {"runs": RUNS} | milliseconds, "commands", rows)
 
 
-def process(command: list[str], folder: Path, **more: str) -> subprocess.CompletedProcess:
+def process(command: list[str], folder: Path) -> subprocess.CompletedProcess:
     """A finished process whose caches are in the folder."""
-    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(ROOT)} | more
+    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(ROOT)}
     for name in ("JAX_ENABLE_X64", "JAX_COMPILATION_CACHE_DIR", "NUMBA_CACHE_DIR"):
         environment.pop(name, None)
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
@@ -83,20 +77,3 @@ def seconds_of(words: list[str], folder: Path) -> float:
     start = time.perf_counter()
     process([sys.executable, "-m", "jaxgran", *words], folder)
     return round(time.perf_counter() - start, 3)
-
-
-def parts_of(words: list[str], folder: Path) -> dict[str, float]:
-    """Seconds of one more run by what they go into; workers of a map are not seen, only waited for."""
-    place = folder / "parts.json"
-    command = [sys.executable, "-X", "importtime", "-m", "benchmarks.startup_parts", *words]
-    done = process(command, folder, STARTUP_PARTS=str(place))
-    imports = sum(map(int, _IMPORT_LINE.findall(done.stderr))) / 1e6
-    return {name: round(x, 3) for name, x in {"imports": imports, **json.loads(place.read_text())}.items()}
-
-
-def print_row(row: dict) -> None:
-    """A line of the table, below its head if it is the first."""
-    if row["command"] == "help":
-        print(f"{'seconds':18} {'first':>6} {'warm':>6}   {'  '.join(PARTS)}")
-    parts = "  ".join(f"{row[name]:{len(name)}.2f}" for name in PARTS)
-    print(f"{row['command']:18} {row['first']:6.1f} {row['warm']:6.2f}   {parts}", flush=True)

@@ -2,15 +2,13 @@
 
 For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxgran and the rival advance the same state
 by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
-printed and written as JSON and PNG. Compilation is reported apart, as is the memory of 1000 replicas.
+printed and written as JSON and PNG. Compilation is reported apart.
 
     python -m benchmarks step_cost            # about 1 minute
     python -m benchmarks step_cost --quick    # half a minute
 """
 
-import resource
 import time
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +18,14 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks import rival_numba
 from benchmarks.output import Output
-from benchmarks.process import printed_by
 
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
 STRAINS = {1e-3: 2.0, 1e-4: 1.0, 1e-5: 0.5}  # advanced at a time
 GRAINS, TOLERANCE = 256, 1e-4
 
 
-def run(output: Output, repeats: int = 7, memory_only: bool = False) -> None:
-    """Compare at every point, print, and write JSON and PNG; or print the peak memory of 1000 replicas."""
-    if memory_only:
-        print(peak_memory(1000))
-        return
+def run(output: Output, repeats: int = 7) -> None:
+    """Compare at every point, print, and write JSON and PNG."""
     compile_seconds = compilation()
     grid = [(alpha, nu) for alpha in RESTITUTIONS for nu in PACKING_FRACTIONS]
     if output.quick:
@@ -50,15 +44,12 @@ def run(output: Output, repeats: int = 7, memory_only: bool = False) -> None:
     means = {dt: float(np.exp(np.mean([np.log(p["ratio"]) for p in points if p["dt"] == dt]))) for dt in STRAINS}
     for dt, mean in means.items():
         print(f"dt = {dt:g}: geometric mean of jaxgran over rival {mean:.2f}")
-    memory = float(printed_by("step_cost", "--memory-only"))
-    print(f"peak memory of 1000 replicas of {GRAINS} grains: {memory:.2f} GB")
 
     result = {
         "grains": GRAINS,
         "tolerance": TOLERANCE,
         "repeats": repeats,
         "compile_seconds": compile_seconds,
-        "memory_gb_1000_replicas": memory,
         "geometric_mean_ratio": {f"{dt:g}": mean for dt, mean in means.items()},
         "points": points,
     }
@@ -126,18 +117,6 @@ def rival_arguments(flow: jg.ShearFlow, state: jg.State) -> dict[str, np.ndarray
         "activation": flow.activation_fraction,
         "tolerance": float(flow.tolerance),
     }
-
-
-def peak_memory(replicas: int) -> float:
-    """Peak resident gigabytes of a process that samples a batch of replicas."""
-    flow = jg.ShearFlow(grains=GRAINS, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
-    state = jax.jit(jg.pack)(flow, jax.random.key(0))[0]
-    batch = jax.tree.map(lambda x: jnp.repeat(x[None], replicas, axis=0), state)
-    keys = jax.random.split(jax.random.key(1), replicas)
-    velocities = jax.vmap(lambda key: jax.random.normal(key, state.velocities.shape))(keys)
-    run = jax.jit(lambda states: jax.lax.map(lambda one: jg.sample(flow, one, 0.05), states))
-    jax.block_until_ready(run(replace(batch, velocities=velocities)))
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 def draw(points: list[dict], means: dict[float, float]) -> Figure:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.run_chart import on_front
+from benchmarks.speed_vs_accuracy import on_front
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack
@@ -70,7 +70,7 @@ def test_numbers_of_jax_are_accepted() -> None:
 
 
 def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_its_noise() -> None:
-    chart, compared = json.loads((RESULTS / "runs.json").read_text()), 0
+    chart, compared = json.loads((RESULTS / "speed_vs_accuracy.json").read_text()), 0
     for flow in chart["flows"]:
         temperature = flow["reference"]["granular_temperature"][0]
         for row in flow["rows"]:
@@ -100,7 +100,7 @@ def test_stress_of_the_worst_solve_in_the_committed_chart_is_within_the_target()
 
 def test_nothing_cheaper_than_the_default_has_a_better_pressure_in_the_committed_chart() -> None:
     """Deep overlaps left aside: at ν = 0.8 the default meets one now and then, in a strain of hundreds."""
-    chart = json.loads((RESULTS / "runs.json").read_text())
+    chart = json.loads((RESULTS / "speed_vs_accuracy.json").read_text())
     for flow in chart["flows"]:
         rows = [r for r in flow["rows"] if (r["timestep"], r["tolerance"], r["activation"]) == (1e-3, 1e-4, "midpoint")]
         assert len(rows) == 1 and on_front(rows[0] | {"status": "ok"}, flow["rows"], "pressure"), flow[

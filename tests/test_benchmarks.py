@@ -14,7 +14,7 @@ from observed import RESTITUTION, noisy, tracks
 
 import jaxgran as jg
 from benchmarks import __main__ as door
-from benchmarks import fit_design, fit_map, fit_methods, fit_rivals, output, run_chart, timestep_study
+from benchmarks import fit_design, fit_map, fit_methods, fit_rivals, output, speed_vs_accuracy, timestep_study
 from benchmarks.output import Output
 from benchmarks.registry import BENCHMARKS
 
@@ -67,7 +67,7 @@ def test_list_names_question_minutes_and_results_without_jax() -> None:
 
 
 def test_an_unknown_name_is_refused_and_an_option_belongs_to_its_benchmark() -> None:
-    for words in (["no_such"], ["validation", "--only", "runs"], ["speed_vs_accuracy", "--only", "no_such"]):
+    for words in (["no_such"], ["validation", "--dataset", "x"], ["flow_picture", "--colour", "no_such"]):
         with pytest.raises(SystemExit) as end:
             door.parser().parse_args(words)
         assert end.value.code == 2
@@ -112,7 +112,7 @@ def test_uncommitted_changes_are_those_beside_the_results(monkeypatch: pytest.Mo
     git("init", "--quiet")
     git("add", ".")
     git("commit", "--quiet", "--message", "first")
-    (folder / "load.json").write_text("{}\n")
+    (folder / "paper.json").write_text("{}\n")
     assert output.uncommitted() == []
     (tmp_path / "code.py").write_text("2\n")
     (tmp_path / "more.py").write_text("3\n")
@@ -121,9 +121,9 @@ def test_uncommitted_changes_are_those_beside_the_results(monkeypatch: pytest.Mo
 
 def test_results_say_what_they_were_measured_with_and_quick_ones_have_names_of_their_own(tmp_path: Path) -> None:
     made = {"processor": "one", "commit": "abc"}
-    for quick, name in ((False, "load"), (True, "load_quick")):
+    for quick, name in ((False, "paper"), (True, "paper_quick")):
         place = Output(tmp_path / "new", quick, made)
-        place.write_json("load", {"value": 1})
+        place.write_json("paper", {"value": 1})
         assert json.loads((tmp_path / "new" / f"{name}.json").read_text()) == {"hardware": made, "value": 1}
     place.write_rows("rows", {"head": 2}, "rows", [{"a": 1.0}, {"a": float("nan")}])
     written = (tmp_path / "new" / "rows_quick.json").read_text()
@@ -143,8 +143,8 @@ def test_front_is_what_nothing_beats_in_cost_and_beyond_noise_in_error() -> None
         config(4.0, 0.05, 0.005),  # dearer and worse than the second
         config(0.5, 0.0, 0.001, "deep_overlap"),  # beats nothing, and is on no front
     ]
-    assert [run_chart.on_front(row, rows, "pressure") for row in rows] == [True, True, True, False, False]
-    assert run_chart.staircase(rows, "pressure") == rows[:2]
+    assert [speed_vs_accuracy.on_front(row, rows, "pressure") for row in rows] == [True, True, True, False, False]
+    assert speed_vs_accuracy.staircase(rows, "pressure") == rows[:2]
 
 
 def test_extrapolation_finds_the_limit_of_two_power_laws_within_its_interval() -> None:
@@ -161,39 +161,14 @@ def test_extrapolation_finds_the_limit_of_two_power_laws_within_its_interval() -
 
 
 def test_other_methods_find_the_restitution_of_tracked_discs() -> None:
-    """Single collisions by hand, simulations that follow eight frames, and fits of these with two more unknowns."""
+    """Single collisions by hand, and simulations that follow eight frames."""
     discs = noisy(tracks(), 1e-4, 0.01)
     noise = fit_rivals.Noise(float(np.std(discs.velocities - tracks().velocities)), 1e-4)
-    seen = fit_rivals.seen_of(discs)
-    assert abs(fit_rivals.by_hand(seen, noise) - RESTITUTION) < 3e-3
-    for scales in (False, True):
-        found, tried = fit_rivals.of_simulations(seen, noise, 1e-9, window=8, every=8, scales=scales)
-        assert abs(found - RESTITUTION) < 5e-3
-        assert tried > 5
-
-
-def test_statistics_of_pairs_do_not_jump_where_discs_leave_through_the_sides() -> None:
-    """As many discs recede as approach, so that in a thin shell the sums of u² have the ratio α, and those of u one."""
-    seen = fit_rivals.seen_of(tracks(strain=3.0))
-    lifted = seen.velocities[..., 0] - seen.tracks.velocities[..., 0]
-    assert np.abs(lifted).max() == pytest.approx(seen.tracks.cell[0, 1])
-    sums = fit_rivals.sums_of(seen, fit_rivals.Noise(1e-9, 1e-9)).sum(axis=0)
-    (_, speed, square), (_, speed_after, square_after) = sums[10:16].reshape(2, 3)  # in the smallest gap
-    assert speed_after / speed == pytest.approx(1, rel=0.25)
-    assert square_after / square == pytest.approx(RESTITUTION, rel=0.25)
-
-
-def test_a_regression_finds_what_statistics_were_made_with() -> None:
-    rng = np.random.default_rng(0)
-    alpha = rng.uniform(0.1, 0.9, 300)
-
-    def numbers(value):
-        noise = 0.02 * rng.normal(size=(*np.shape(value), 3))
-        return np.stack([value**2, np.exp(value), 0 * value], axis=-1) + noise
-
-    regression = fit_rivals.Regression(alpha, numbers(alpha))
-    off = [regression.restitution(numbers(np.array(value))) - value for value in np.linspace(0.2, 0.8, 40)]
-    assert np.sqrt(np.mean(np.square(off))) < 0.03
+    pairs = fit_rivals.pairs_of(discs)
+    assert abs(fit_rivals.by_hand(pairs, noise) - RESTITUTION) < 3e-3
+    restitution, tried = fit_rivals.by_simulations(pairs, noise, 1e-9, window=8, every=8)
+    assert abs(restitution - RESTITUTION) < 5e-3
+    assert tried > 5
 
 
 def test_charts_of_fits_show_every_point_with_a_result_and_no_other() -> None:

@@ -14,7 +14,7 @@ from jaxgran.maps.results import read_dataset
 from jaxgran.model.checks import InputError
 
 MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
-SCRIPT = Path(__file__).parents[1] / "examples" / "slurm_map.py"
+SCRIPT = Path(__file__).parents[1] / "docs" / "how-to" / "slurm_map.py"
 
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess:

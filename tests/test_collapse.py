@@ -13,9 +13,9 @@ GAPS = GAP * np.geomspace(0.5, 2, 96)
 
 
 @pytest.fixture(scope="module")
-def measured(engines):
-    """``measured(restitution, timestep, states)``: steps with contacts and excess of the force ratio of each start."""
-    return partial(collapse.measured, advance=engines["numba"])
+def steps_and_excess(engines):
+    """``steps_and_excess(restitution, timestep, states)`` by the numba engine."""
+    return partial(collapse.steps_and_excess, advance=engines["numba"])
 
 
 @pytest.mark.parametrize(("discs", "angle"), [(3, np.pi / 12), (4, np.pi / 8)])
@@ -28,10 +28,10 @@ def test_roots_of_a_collapse_are_real_below_the_threshold(discs, angle) -> None:
 
 
 @pytest.mark.parametrize(("discs", "restitution"), [(3, 0.08), (3, 0.1), (3, 0.3), (4, 0.18), (4, 0.2), (4, 0.5)])
-def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(measured, discs, restitution) -> None:
+def test_above_the_threshold_the_steps_of_contact_saturate_and_are_binary(steps_and_excess, discs, restitution) -> None:
     """No start has more collisions than the rotation by θ allows, and one of these has all but two."""
     states = [row(discs, gap) for gap in GAPS[::4]]
-    steps, excess = np.stack([measured(restitution, dt, states) for dt in (1e-6, 1e-7)], axis=1)
+    steps, excess = np.stack([steps_and_excess(restitution, dt, states) for dt in (1e-6, 1e-7)], axis=1)
     np.testing.assert_array_equal(steps[0], steps[1])
     most = most_collisions(discs, restitution)
     assert most - 2 <= np.max(steps) <= most
@@ -49,11 +49,12 @@ def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(engine
 
 
 @pytest.mark.parametrize("discs", [3, 4])
-def test_growth_begins_at_the_threshold(measured, discs) -> None:
+def test_growth_begins_at_the_threshold(steps_and_excess, discs) -> None:
     """Ten percent above it a finer dt adds no step for any start; ten percent below it adds some at every decade."""
     states = [row(discs, gap) for gap in GAPS[::4]]
     above, below = (
-        [measured(share * THRESHOLDS[discs], dt, states)[0] for dt in (1e-5, 1e-6, 1e-7)] for share in (1.1, 0.9)
+        [steps_and_excess(share * THRESHOLDS[discs], dt, states)[0] for dt in (1e-5, 1e-6, 1e-7)]
+        for share in (1.1, 0.9)
     )
     np.testing.assert_array_equal(above[1], above[2])
     assert np.all(np.diff(np.mean(below, axis=1)) > 2)
@@ -61,12 +62,12 @@ def test_growth_begins_at_the_threshold(measured, discs) -> None:
 
 @pytest.mark.parametrize(("share", "collapses"), [(0.95, True), (1.05, False)])
 def test_three_discs_collapse_where_the_third_leaves_more_slowly_than_the_larger_root(
-    measured, share, collapses
+    steps_and_excess, share, collapses
 ) -> None:
     restitution, speed = 0.05, 40.0  # so that the collapse, which begins slowly, ends in time
     leaving = share * roots(3, restitution).larger
     velocities = speed * np.array([1.0, 0.0, leaving])
     states = [row(3, gap) for gap in GAPS[::4]]
     states = [replace(state, velocities=state.velocities.at[:3, 0].set(velocities)) for state in states]
-    coarse, fine = (measured(restitution, dt, states)[0] for dt in (1e-6, 1e-8))
+    coarse, fine = (steps_and_excess(restitution, dt, states)[0] for dt in (1e-6, 1e-8))
     assert fine.mean() > coarse.mean() + 1 if collapses else np.array_equal(fine, coarse)

@@ -14,6 +14,7 @@ import pytest
 import jaxgran
 
 ROOT = Path(jaxgran.__file__).parents[1]
+PAPER = ROOT / "docs" / "paper"
 DOCS = ROOT / "docs"
 PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
 SOURCES = sorted((ROOT / "jaxgran").rglob("*.py"))
@@ -94,8 +95,8 @@ def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
 
 
 def test_the_paper_cites_what_its_bibliography_has_and_shows_figures_that_are_there() -> None:
-    text, bibliography = ((ROOT / "paper" / name).read_text() for name in ("paper.md", "paper.bib"))
+    text, bibliography = ((PAPER / name).read_text() for name in ("paper.md", "paper.bib"))
     cited = set(re.findall(r"@([a-z]+\d{4})", text))
     assert cited == set(re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE))
     figures = re.findall(r"\]\((\S+\.png)\)", text)
-    assert len(figures) == 2 and all((ROOT / "paper" / figure).is_file() for figure in figures)
+    assert len(figures) == 2 and all((PAPER / figure).is_file() for figure in figures)

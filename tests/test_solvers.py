@@ -1,11 +1,10 @@
-"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the charts."""
+"""Contact solvers side by side: problems as others pose them, what is judged and counted, and the figure."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from benchmarks import networks
 from benchmarks.collection import Entry
@@ -15,14 +14,12 @@ from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
 from benchmarks.exact_contacts import incidence as dense_incidence
 from benchmarks.networks import Network
-from benchmarks.profiles import STYLES
 from benchmarks.solvers import groups, measure
-from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
-from benchmarks.solvers.forms import in_impulses, in_velocities, weighted
-from benchmarks.solvers.measure import TARGETS, Row, measured
-from benchmarks.solvers.roster import Solver, own
-from benchmarks.solvers.run import agreement, warm_summary
-from benchmarks.solvers.warm import WarmRow, swept_from
+from benchmarks.solvers.charts import DRAWN, draw_times
+from benchmarks.solvers.forms import program_of, weighted
+from benchmarks.solvers.measure import TARGETS, Row, run_solvers
+from benchmarks.solvers.roster import Solver, our_solvers
+from benchmarks.solvers.run import agreement
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -47,24 +44,13 @@ def entries() -> list[Entry]:
     ]
 
 
-def test_solution_is_optimal_in_both_forms(entries):
+def test_solution_is_optimal_for_the_quadratic_program(entries):
     for entry in entries[:4]:
-        impulses = entry.solution.impulses
-        program = in_impulses(entry)
-        slope = program.scale * (program.p @ (impulses / program.scale) + program.q)
+        program = program_of(entry)
+        slope = program.scale * (program.p @ (entry.solution.impulses / program.scale) + program.q)
         np.testing.assert_allclose(slope, entry.solution.velocities, atol=1e-12)
-        program = in_velocities(entry)
-        changes = program.g.T @ impulses / program.scale  # of optimal x: x = Gᵀ p
-        after = program.scale * (program.g @ changes - program.h)
-        np.testing.assert_allclose(after, entry.solution.velocities, atol=1e-12)
         g = weighted(entry)
         np.testing.assert_allclose((g @ g.T).toarray(), delassus(entry.problem).toarray(), atol=1e-12)
-
-
-def test_start_at_the_solution_needs_one_sweep(entries):
-    entry = entries[1]
-    assert swept_from(entry, 1e-6, entry.solution.impulses)().products == 1
-    assert swept_from(entry, 1e-6)().products > 50
 
 
 def scripted(*residuals: float, seconds: float = 0.0):
@@ -83,7 +69,7 @@ def test_a_target_costs_what_the_cheapest_run_does_that_meets_it(entries, monkey
     times = iter([3.0, 1.0, 2.0, 0.5])
     monkeypatch.setattr(measure, "LIMIT", 10.0)
     monkeypatch.setattr(measure, "timed", lambda solve: (next(times), solve()))
-    rows = measured({"one": scripted(1e-1, 1e-5, 1e-7, 0.0)}, entries[:1], lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-1, 1e-5, 1e-7, 0.0)}, entries[:1], lambda *_: None)
     assert [row.outcome for row in rows] == ["ok"] * 4
     assert [row.seconds for row in rows] == [0.5] * 4 and rows[0].iterations == 7
     assert all(row.residual <= row.target for row in rows)
@@ -91,14 +77,14 @@ def test_a_target_costs_what_the_cheapest_run_does_that_meets_it(entries, monkey
 
 def test_failures_are_missed_slow_or_skipped(entries, monkeypatch):
     monkeypatch.setattr(measure, "timed", lambda solve: (0.3, solve()))
-    rows = measured({"one": scripted(1e-3)}, [entries[0]] * 2, lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-3)}, [entries[0]] * 2, lambda *_: None)
     assert [row.outcome for row in rows[:4]] == ["ok", "missed", "missed", "missed"]
     longer = entries[0]._replace(problem=networks_problem(64), solution=None)
     monkeypatch.setattr(measure, "targets", lambda entry: TARGETS)
-    rows = measured({"one": scripted(1e-3)}, [entries[0], longer], lambda *_: None)
+    rows = run_solvers({"one": scripted(1e-3)}, [entries[0], longer], lambda *_: None)
     assert {row.outcome for row in rows[4:]} == {"skipped"}
     monkeypatch.setattr(measure, "timed", lambda solve: (1.3, solve()))
-    rows = measured({"one": scripted(0.0)}, entries[:1], lambda *_: None)
+    rows = run_solvers({"one": scripted(0.0)}, entries[:1], lambda *_: None)
     assert {row.outcome for row in rows} == {"slow"}
 
 
@@ -141,29 +127,12 @@ def test_summary_has_a_null_where_the_median_fails(rows):
     json.dumps(lines, allow_nan=False)
 
 
-def test_failures_are_drawn_above_the_line(rows):
-    figure: Figure = draw_work(rows, "seconds")
-    shown = {axes.get_title().rpartition(" (")[0]: axes for axes in figure.axes if axes.get_visible()}
-    assert set(shown) == {"flows, up to 30 contacts", "flows, 31 to 300", "chain"}
-    limit = shown["chain"].lines[0].get_ydata()[0]
-    colour = STYLES["Pinocchio PGS"][0]
-    heights = [line.get_ydata() for line in shown["chain"].lines if line.get_color() == colour]
-    assert np.min(heights[-1]) > limit and len(heights[-1]) == len(TARGETS) and np.all(np.isnan(heights[0]))
-
-
-def test_other_charts_hold_the_numbers(rows):
-    profiles = draw_profiles(rows)
-    in_time, _, in_products, _ = profiles.axes
-    ends = {line.get_label(): line.get_ydata()[-1] for line in in_time.lines}
-    assert ends == {"numba engine": 1, "PIQP": 1, "Pinocchio PGS": pytest.approx(1 / 3)}
-    assert {line.get_label() for line in in_products.lines} == {"numba engine", "Pinocchio PGS"}
-    flows, _ = draw_scaling(rows).axes
-    drawn = next(line for line in flows.lines if line.get_color() == "black")
-    np.testing.assert_allclose(drawn.get_ydata(), 0.01)
-    warm = [WarmRow("OSQP", "1", "cold", 1, 2.0, 10), WarmRow("OSQP", "1", "exact to 0.1", 0.1, 1.0, 4)]
-    in_time, in_iterations = draw_warm(warm).axes
-    assert [axes.containers[0].lines[0].get_ydata()[0] for axes in (in_time, in_iterations)] == [0.5, 0.4]
-    assert warm_summary(warm)[1]["iterations_over_cold"] == 0.4
+def test_figure_shows_the_median_times_and_no_failure(rows):
+    for axes in draw_times(groups.summary(rows)).axes:
+        times = {line.get_label(): line.get_xdata() for line in axes.lines}
+        assert set(times) == set(DRAWN)
+        np.testing.assert_allclose(times["numba engine"][[0, 1, 4]], [0.01, 0.01, 0.04])
+        np.testing.assert_allclose(times["Pinocchio PGS"], [0.1, *[np.nan] * 7])
 
 
 def test_agreement_is_the_largest_difference_of_a_pair():
@@ -172,16 +141,16 @@ def test_agreement_is_the_largest_difference_of_a_pair():
     assert found == [{"solvers": ["x", "y"], "problems": 2, "largest_difference": 1e-7}]
 
 
-def test_committed_solutions_of_ours_agree_with_those_of_peers():
-    told = json.loads((RESULTS / "solvers.json").read_text())
-    peers_there = set(told["settings"]) - set(own())
-    assert len(peers_there) == 9 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(told["packages"])
+def test_committed_solutions_of_ours_agree_with_those_of_package_solvers():
+    results = json.loads((RESULTS / "solvers.json").read_text())
+    packages = set(results["settings"]) - set(our_solvers())
+    assert len(packages) == 7 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(results["packages"])
     for ours in ("numba engine", "barzilai-borwein"):
         pairs = {
             name: pair
-            for pair in told["agreement"]
+            for pair in results["agreement"]
             for name in pair["solvers"]
-            if ours in pair["solvers"] and name in peers_there
+            if ours in pair["solvers"] and name in packages
         }
         assert len(pairs) >= 5
         assert sum(pair["problems"] >= 150 for pair in pairs.values()) >= 3

@@ -1,25 +1,21 @@
 """Peers on the same flows: seconds of one core for a unit of strain against the errors of pressure and shear stress.
 
-jaxgran, the numba loop, LAMMPS and a plain jax-md program (see the modules beside this one) shear the same discs from
-the same steady state. Contact dynamics is run at several time steps, soft discs at several stiffnesses, whose time step
-is a fixed share of a contact: both trade time for accuracy. Each has a process of its own, all share one core and take
-turns, round after round. Times are medians over the rounds of the processor's time of the process, which is what the
-clock shows on a machine with nothing else to do; those of the clock stand beside them. What a first call takes longer
+jaxgran, the numba loop and LAMMPS (see the modules beside this one) shear the same discs from the same steady state.
+Contact dynamics runs at several time steps, soft discs at several stiffnesses, whose time step is a fixed share of a
+contact: both trade time for accuracy. Each has its own process, all share one core and take turns, round after round.
+Times are medians of the CPU time over the rounds; wall-clock times stand beside them. What a first call takes longer
 (compilation) is reported apart. Errors are relative to a reference, contact dynamics at a time step of 3e-5 and a
 tolerance of 1e-6 over a longer strain.
 
 The time to an error of 3 % is read off the front of error against time, in logarithms (see ``front.py``).
 
     python -m benchmarks peers           # about 20 minutes
-    python -m benchmarks peers --flow 2  # the second flow alone, in the place of that of an earlier result
     python -m benchmarks peers --quick   # one flow of 256 discs, under 3 minutes
 """
 
-import json
 import os
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -27,13 +23,13 @@ import numpy as np
 
 import jaxgran as jg
 from benchmarks.output import Output
-from benchmarks.peers import jax_md_dense, jaxgran_itself, lammps, numba_rival
+from benchmarks.peers import jaxgran_itself, lammps, numba_rival
 from benchmarks.peers.front import OBSERVABLES, TARGET, draw, table
 from benchmarks.peers.problem import Discs, Flow, Stress
 from benchmarks.peers.workers import Worker
 from jaxgran.statistics import jackknife
 
-PEERS = (jaxgran_itself, numba_rival, lammps, jax_md_dense)
+PEERS = (jaxgran_itself, numba_rival, lammps)
 REFERENCE_TIMESTEP = 3e-5
 
 
@@ -57,13 +53,11 @@ FULL = Plan(CASES, 1000, 2.8)
 QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
 
 
-def run(output: Output, flow: int | None = None) -> None:
-    """Compare in all flows, or in the one of a number; print the tables, and write JSON and PNG."""
+def run(output: Output) -> None:
+    """Compare in all flows, print the tables, and write JSON and PNG."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     plan = QUICK if output.quick else FULL
-    if flow is not None and not output.quick:
-        plan = plan._replace(cases=plan.cases[flow - 1 : flow])
     left_out = {peer.__name__.rpartition(".")[2]: why for peer in PEERS if (why := peer.missing())}
     for why in left_out.values():
         print(why, flush=True)
@@ -71,10 +65,9 @@ def run(output: Output, flow: int | None = None) -> None:
     flows = []
     for case in plan.cases:
         begin, load = time.perf_counter(), os.getloadavg()
-        flows.append(measured(plan, case, peers))
+        flows.append(compare_peers(plan, case, peers))
         flows[-1] |= {"load_averages": [load, os.getloadavg()], "wall_seconds": time.perf_counter() - begin}
         report(flows[-1])
-    flows = joined(output.path("peers", ".json"), flows)
     print(table(flows))
     result = {
         "hardware": output.hardware | ({"lammps": lammps.version()} if lammps in peers else {}),
@@ -88,17 +81,7 @@ def run(output: Output, flow: int | None = None) -> None:
     output.write_picture(draw(flows), "peers")
 
 
-def joined(earlier: Path, flows: list[dict]) -> list[dict]:
-    """Flows now measured, among those of an earlier result that are others of the full plan."""
-    known = {(flow["restitution"], flow["packing_fraction"]): flow for flow in flows}
-    places = [case.flow[:2] for case in FULL.cases]
-    if earlier.is_file() and set(known) < set(places):
-        for flow in json.loads(earlier.read_text())["flows"]:
-            known.setdefault((flow["restitution"], flow["packing_fraction"]), flow)
-    return sorted(known.values(), key=lambda flow: places.index((flow["restitution"], flow["packing_fraction"])))
-
-
-def measured(plan: Plan, case: Case, peers: list) -> dict:
+def compare_peers(plan: Plan, case: Case, peers: list) -> dict:
     """Reference, and errors and times of every setting of every peer, for one flow."""
     flow = case.flow
     law = jg.ShearFlow(plan.discs, flow.restitution, flow.packing_fraction, 1e-3)

@@ -17,12 +17,11 @@ STYLES = {  # marker, shade
     "numba loop": ("^", "0.0"),
     "LAMMPS, 20 steps a contact": ("D", "#b35806"),
     "LAMMPS, 10 steps a contact": ("d", "#b35806"),
-    "jax-md, dense": ("v", "#2166ac"),
 }
-LINES = dict(zip(STYLES, ("-", "--", ":", "-", "--", "-."), strict=True))
+LINES = dict(zip(STYLES, ("-", "--", ":", "-", "--"), strict=True))
 
 
-def size(row: dict, names: tuple[str, ...]) -> float:
+def largest_error(row: dict, names: tuple[str, ...]) -> float:
     """The largest of some errors of a row, without sign."""
     return max(abs(row["errors"][name][0]) for name in names)
 
@@ -39,17 +38,17 @@ def time_to_target(rows: list[dict], names: tuple[str, ...], cost: str = COST) -
     front: list[dict] = []
     rows = [row for row in rows if "errors" in row]
     last_miss = max((k for k, row in enumerate(rows) if _misses(row, names)), default=-1)
-    rows = [row for k, row in enumerate(rows) if k >= last_miss or size(row, names) > TARGET]
+    rows = [row for k, row in enumerate(rows) if k >= last_miss or largest_error(row, names) > TARGET]
     for row in sorted(rows, key=lambda row: row[cost]):
-        if not front or size(row, names) < size(front[-1], names):
+        if not front or largest_error(row, names) < largest_error(front[-1], names):
             front.append(row)
     if not front:
         return math.nan, ">"
-    if size(front[0], names) <= TARGET:
+    if largest_error(front[0], names) <= TARGET:
         return front[0][cost], "<"
     for dear, cheap in zip(front[1:], front, strict=False):
-        if size(dear, names) <= TARGET:
-            worse, better = (math.log(size(row, names)) for row in (cheap, dear))
+        if largest_error(dear, names) <= TARGET:
+            worse, better = (math.log(largest_error(row, names)) for row in (cheap, dear))
             share = (worse - math.log(TARGET)) / (worse - better)
             return cheap[cost] ** (1 - share) * dear[cost] ** share, "="
     return front[-1][cost], ">"
@@ -69,7 +68,7 @@ def table(flows: list[dict]) -> str:
     choices = (("pressure",), ("shear_stress",), OBSERVABLES)
     for flow in flows:
         for curve in dict.fromkeys(row["curve"] for row in flow["rows"]):
-            cells = [_words(*time_to_target(_rows(flow, curve), names)) for names in choices]
+            cells = [_time(*time_to_target(_rows(flow, curve), names)) for names in choices]
             ratios = [_ratio(flow, curve, cost) for cost in (COST, "wall_seconds_per_strain")]
             head = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
             lines.append(f"| {head} | {curve} | " + " | ".join(cells + ratios) + " |")
@@ -80,7 +79,7 @@ def _rows(flow: dict, curve: str) -> list[dict]:
     return [row for row in flow["rows"] if row["curve"] == curve]
 
 
-def _words(seconds: float, sign: str) -> str:
+def _time(seconds: float, sign: str) -> str:
     """A time; "not reached" where the target is not met, "< " before that of the cheapest setting if it meets it."""
     return "not reached" if sign == ">" else f"{'< ' if sign == '<' else ''}{seconds:.2g}"
 

@@ -4,8 +4,7 @@ The loop looks at every time step, but only at the parabola of each near pair's 
 discs that were hit alone. It has no simpler way than that, and none that leaves steps out.
 """
 
-from importlib.util import find_spec
-
+from benchmarks import rival_numba
 from benchmarks.peers.problem import Discs, Flow, Run, Stress
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
@@ -14,14 +13,12 @@ TOLERANCES = {"numba loop": 1e-4, "reference": 1e-6}
 MIDPOINT = 0.5
 
 
-def missing() -> str | None:
-    return None if find_spec("numba") else 'The numba loop is left out: pip install "jaxgran[bench]" installs numba.'
+def missing() -> None:
+    """Nothing: jaxgran requires numba."""
 
 
 def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float) -> Run:
     """A run at one time step; ``curve`` names the tolerance."""
-    from benchmarks import rival_numba
-
     now = discs._replace(positions=discs.positions.copy(), velocities=discs.velocities.copy())
 
     def advance() -> Stress:

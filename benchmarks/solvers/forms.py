@@ -1,44 +1,34 @@
-"""The contact problem as others pose it: a quadratic program in impulses, or in velocities.
+"""The contact problem as others pose it: a quadratic program.
 
-0 ≤ p ⟂ W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½ are the conditions of optimality of both
+0 ≤ p ⟂ W p + u⁻ ≥ 0 with W = G Gᵀ and G = H M^-½ is the condition of optimality of
 
-    in impulses    minimise ½ pᵀ W p + p·u⁻    subject to p ≥ 0,
-    in velocities  minimise ½ ‖x‖²             subject to G x ≥ −u⁻,
+    minimise ½ pᵀ W p + p·u⁻ subject to p ≥ 0.
 
-where x = M^½ Δv are velocity changes in the norm of the kinetic energy, and p the multipliers of the constraints. All
-speeds are divided by ‖min(u⁻, 0)‖, since tolerances of others are absolute.
+All speeds are divided by ‖min(u⁻, 0)‖, since the tolerances of the packages are absolute.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_matrix, diags_array, eye_array, sparray
+from scipy.sparse import csc_matrix, diags_array, sparray
 
 from benchmarks.collection import Entry
 from benchmarks.collection.certificates import incidence
 
 
 class Program(NamedTuple):
-    """minimise ½ xᵀ P x + q·x subject to G x ≥ h; impulses are ``scale`` times the unknowns or the multipliers."""
+    """minimise ½ xᵀ P x + q·x subject to x ≥ 0, ``count`` unknowns; impulses are ``scale`` times the unknowns."""
 
     p: csc_matrix
     q: np.ndarray
-    g: csc_matrix
-    h: np.ndarray
     scale: float
+    count: int
 
 
-def in_impulses(entry: Entry) -> Program:
-    """The unknowns are impulses."""
+def program_of(entry: Entry) -> Program:
+    """The quadratic program of a contact problem."""
     rates, scale = scaled(entry)
-    return Program(columns(entry.matrix), rates, columns(eye_array(len(rates))), np.zeros_like(rates), scale)
-
-
-def in_velocities(entry: Entry) -> Program:
-    """The unknowns are velocity changes; multipliers are the impulses."""
-    rates, scale = scaled(entry)
-    g = columns(weighted(entry))
-    return Program(columns(eye_array(g.shape[1])), np.zeros(g.shape[1]), g, -rates, scale)
+    return Program(columns(entry.matrix), rates, scale, len(rates))
 
 
 def scaled(entry: Entry) -> tuple[np.ndarray, float]:

@@ -11,6 +11,7 @@ SMALL, MEDIUM = 30, 300  # contacts
 FLOW_GROUPS = (f"flows, up to {SMALL} contacts", f"flows, {SMALL + 1} to {MEDIUM}", f"flows, more than {MEDIUM}")
 CONSTRUCTED = ("static packing", "chain", "size ratio 10", "mass ratio 10000", "hexagonal cluster")
 INFEASIBLE = "no solution"
+OUTCOMES = ("ok", "missed", "slow", "skipped")
 GROUPS = (*FLOW_GROUPS, *CONSTRUCTED, INFEASIBLE)
 
 
@@ -49,7 +50,7 @@ def summary(rows: Sequence[Row]) -> list[dict]:
     lines, best = [], fastest(rows)
     for (group, solver, target), members in grouped(rows).items():
         line = {"group": group, "solver": solver, "target": target, "problems": len(members)}
-        line |= {word: sum(row.outcome == word for row in members) for word in ("ok", "missed", "slow", "skipped")}
+        line |= {outcome: sum(row.outcome == outcome for row in members) for outcome in OUTCOMES}
         line["fastest"] = sum(best[row.problem, target] == solver for row in members)
         for key in ("seconds", "iterations"):
             line[key] = _rounded(median([cost(row, key) for row in members]))
@@ -83,13 +84,13 @@ def table(rows: Sequence[Row], targets: Sequence[float] = (1e-4, 1e-8), shown: i
             if not found:
                 continue
             ranked = sorted(found, key=lambda name: median([cost(row) for row in found[name]]))
-            cells = [words(name, found[name]) for name in ranked[:shown]]
+            cells = [table_cell(name, found[name]) for name in ranked[:shown]]
             lines.append(f"| {group} | {target:.0e} | " + " | ".join(cells) + " |")
     head = "| problems | residual | " + " | ".join(f"{n + 1}." for n in range(shown)) + " |"
     return "\n".join([head, "| --- " * (shown + 2) + "|", *lines])
 
 
-def words(name: str, members: Sequence[Row]) -> str:
+def table_cell(name: str, members: Sequence[Row]) -> str:
     """A solver with its median time, and the share that it solves unless that is all."""
     time, solved = median([cost(row) for row in members]), sum(row.outcome == "ok" for row in members)
     share = "" if solved == len(members) else f", {solved} of {len(members)}"

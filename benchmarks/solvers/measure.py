@@ -57,10 +57,10 @@ class Row(NamedTuple):
     stress_error: float = np.nan
 
 
-def measured(
+def run_solvers(
     solvers: Mapping[str, Solver], entries: Sequence[Entry], note: Callable[[str, Entry, list[Attempt]], None]
 ) -> list[Row]:
-    """All solvers on all problems, problem by problem; ``note`` is told the runs of each."""
+    """All solvers on all problems, problem by problem; ``note`` receives the runs of each."""
     rows, slowest = [], {}
     for entry in entries:
         matrix = entry.matrix
@@ -73,7 +73,7 @@ def measured(
             note(name, entry, runs)
             slow = max(run.seconds for run in runs)
             slowest[name, entry.family] = (count, slow) if slow > LIMIT / 10 else (1, 0.0)
-            rows += [judged(name, entry, matrix, runs, target) for target in targets(entry)]
+            rows += [best_run(name, entry, matrix, runs, target) for target in targets(entry)]
     return rows
 
 
@@ -106,8 +106,8 @@ def natural_residual(entry: Entry, matrix, impulses: np.ndarray) -> float:
     return float(np.linalg.norm(least) / np.linalg.norm(np.minimum(approach, 0)))
 
 
-def judged(name: str, entry: Entry, matrix, runs: list[Attempt], target: float) -> Row:
-    """The row of a target."""
+def best_run(name: str, entry: Entry, matrix, runs: list[Attempt], target: float) -> Row:
+    """The cheapest run that meets a target, as a row."""
     if not entry.solution.feasible:
         run = runs[0]
         outcome = "slow" if run.seconds > LIMIT else "missed" if run.impulses is not None else "ok"

@@ -58,41 +58,29 @@ def orthant(contacts: int) -> tuple[Any, Any]:
     return models, data
 
 
-def gauss_seidel(entry: Entry, tolerance: float, start: np.ndarray | None = None, settings: dict = PGS) -> Solve:
+def gauss_seidel(entry: Entry, tolerance: float) -> Solve:
     """Projected Gauss–Seidel. It takes a dense matrix alone."""
     rates, scale = scaled(entry)
-    chosen = _chosen(pin.PGSSolverSettings(), tolerance, settings)
+    chosen = _chosen(pin.PGSSolverSettings(), tolerance, PGS)
     matrix, sets, solver = np.asfortranarray(entry.matrix.toarray()), orthant(len(rates)), pin.PGSConstraintSolver()
 
     def solve() -> Answer:
         result = pin.PGSSolverResult()
-        if start is not None:
-            result.setConstraintImpulseGuess(start / scale)
         solver.solve(pin.DelassusOperatorDense(matrix), rates, *sets, chosen, result)
         return Answer(scale * result.retrieveConstraintImpulses(), result.iterations)
 
     return _limited(solve, chosen, len(rates))
 
 
-def multipliers(
-    entry: Entry,
-    tolerance: float,
-    start: np.ndarray | None = None,
-    settings: dict = ADMM,
-    sparse: bool = True,
-) -> Solve:
+def multipliers(entry: Entry, tolerance: float) -> Solve:
     """Alternating directions: each iteration solves with W + ρ, which is factored anew whenever ρ changes."""
     rates, scale = scaled(entry)
-    chosen = _chosen(pin.ADMMSolverSettings(), tolerance, settings)
-    matrix = columns(entry.matrix) if sparse else np.asfortranarray(entry.matrix.toarray())
-    operator = pin.DelassusOperatorSparse if sparse else pin.DelassusOperatorDense
-    sets, solver = orthant(len(rates)), pin.ADMMConstraintSolver()
+    chosen = _chosen(pin.ADMMSolverSettings(), tolerance, ADMM)
+    matrix, sets, solver = columns(entry.matrix), orthant(len(rates)), pin.ADMMConstraintSolver()
 
     def solve() -> Answer:
         result, impulses = pin.ADMMSolverResult(), np.zeros_like(rates)
-        if start is not None:
-            result.setConstraintImpulseGuess(start / scale)
-        solver.solve(operator(matrix), rates, *sets, chosen, result)
+        solver.solve(pin.DelassusOperatorSparse(matrix), rates, *sets, chosen, result)
         result.retrievePrimalSolution(impulses)
         return Answer(scale * impulses, result.iterations)
 

@@ -6,11 +6,10 @@ from typing import NamedTuple, get_args
 
 from benchmarks.collection.compare import Prepare, projected, swept
 from benchmarks.solvers.numba_engine import by_cluster
-from benchmarks.solvers.single_precision import projected_in_float32
 from jaxgran.model.choices import Solver as Method
 
 DEFAULT = "barzilai-borwein"
-MACHINE_CODE = "numba engine"
+NUMBA_ENGINE = "numba engine"
 PACKAGES = ("pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy")
 
 
@@ -23,7 +22,7 @@ class Solver(NamedTuple):
     ours: bool = False
 
 
-def own() -> dict[str, Solver]:
+def our_solvers() -> dict[str, Solver]:
     """The solvers of this program, and plain Gauss–Seidel sweeps."""
     settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
     settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
@@ -34,14 +33,13 @@ def own() -> dict[str, Solver]:
         for name in get_args(Method)
     }
     return {
-        MACHINE_CODE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
+        NUMBA_ENGINE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
         **methods,
-        f"{DEFAULT}, float32": Solver(partial(projected_in_float32, DEFAULT), "products with W", {}, True),
         "Gauss–Seidel": Solver(swept, "sweeps", {}, True),
     }
 
 
-def peers() -> dict[str, Solver]:
+def package_solvers() -> dict[str, Solver]:
     """The solvers of other packages.
 
     Raises:
@@ -51,23 +49,19 @@ def peers() -> dict[str, Solver]:
         from benchmarks.solvers import pinocchio, quadratic
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f'{error.name} is missing: pip install "jaxgran[solver-peers]"') from error
-    dense_admm = partial(pinocchio.multipliers, sparse=False)
-    dense_proxqp = partial(quadratic.proximal, sparse=False, settings=quadratic.PROXQP_DENSE)
     return {
         "Pinocchio PGS": Solver(pinocchio.gauss_seidel, "sweeps", pinocchio.PGS),
         "Pinocchio ADMM": Solver(pinocchio.multipliers, "iterations", pinocchio.ADMM),
-        "Pinocchio ADMM, dense": Solver(dense_admm, "iterations", pinocchio.ADMM),
         "ProxQP": Solver(quadratic.proximal, "iterations", quadratic.PROXQP),
-        "ProxQP, dense": Solver(dense_proxqp, "iterations", quadratic.PROXQP_DENSE),
         "OSQP": Solver(quadratic.osqp, "iterations", quadratic.OSQP),
         "Clarabel": Solver(quadratic.interior, "iterations", quadratic.CLARABEL),
-        "PIQP": Solver(quadratic.proximal_interior, "iterations", quadratic.PIQP),
+        "PIQP": Solver(quadratic.proximal_interior, "iterations", {}),
         "SciPy NNLS": Solver(quadratic.least_squares, "", {}),
     }
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages of the peers that are installed."""
+    """Versions of the packages that are installed."""
     found = {}
     for name in PACKAGES:
         try:

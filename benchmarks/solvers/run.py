@@ -1,6 +1,6 @@
 """Contact solvers side by side: this program's and those of other packages, on the collection of contact problems.
 
-python -m benchmarks solvers          # solvers.json and its charts; about 10 minutes
+python -m benchmarks solvers          # solvers.json and solvers.png; about 10 minutes
 python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
 
 The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's solvers are compared
@@ -18,18 +18,17 @@ import numpy as np
 from benchmarks.collection import Entry, load
 from benchmarks.networks import SLOTS
 from benchmarks.output import Output
-from benchmarks.solvers.charts import draw_profiles, draw_scaling, draw_warm, draw_work
+from benchmarks.solvers.charts import draw_times
 from benchmarks.solvers.groups import FLOWS, summary, table
-from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, measured, stress_error
-from benchmarks.solvers.roster import DEFAULT, MACHINE_CODE, Solver, own, peers, versions
-from benchmarks.solvers.warm import WarmRow, compared
+from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, run_solvers, stress_error
+from benchmarks.solvers.roster import DEFAULT, NUMBA_ENGINE, Solver, our_solvers, package_solvers, versions
 
 _QUICK_STEP, _QUICK_CONTACTS = 10, 600
 _AGREED = 1e-8  # residual of solutions whose velocities are compared
 
 
 def run(output: Output) -> None:
-    """Measure, print the tables, and write ``solvers.json`` and its charts."""
+    """Measure, print the tables, and write ``solvers`` as JSON and PNG."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     solvers = roster()
@@ -37,7 +36,7 @@ def run(output: Output) -> None:
     start, load_before = time.perf_counter(), os.getloadavg()
     compile_for(entries, solvers)
     finest: dict[str, dict[str, np.ndarray]] = {}
-    stress: dict[str, dict[float, float]] = {name: {} for name in (MACHINE_CODE, DEFAULT)}
+    stress: dict[str, dict[float, float]] = {name: {} for name in (NUMBA_ENGINE, DEFAULT)}
 
     def note(name: str, entry: Entry, runs: list[Attempt]) -> None:
         if entry.solution.feasible and runs[-1].residual <= _AGREED:
@@ -48,10 +47,9 @@ def run(output: Output) -> None:
                 ratio = stress_error(entry, run.impulses) / run.tolerance
                 stress[name][run.tolerance] = max(stress[name].get(run.tolerance, 0.0), ratio)
 
-    rows = measured(solvers, entries, note)
-    warm = compared(entries, output.quick) if set(solvers) > set(own()) else []
+    rows = run_solvers(solvers, entries, note)
     agreed = agreement(finest)
-    print(table(rows), told(agreed, solvers), sep="\n\n")
+    print(table(rows), agreement_lines(agreed, solvers), sep="\n\n")
     head = {
         "packages": versions(),
         "settings": {name: solver.settings for name, solver in solvers.items()},
@@ -66,24 +64,19 @@ def run(output: Output) -> None:
             name: {f"{tolerance:.0e}": float(f"{ratio:.3g}") for tolerance, ratio in found.items()}
             for name, found in stress.items()
         },
-        "warm": warm_summary(warm),
     }
-    output.write_rows("solvers", head, "summary", summary(rows))
-    output.write_picture(draw_work(rows, "seconds"), "solvers", dpi=110)
-    output.write_picture(draw_work(rows, "iterations"), "solvers", "_iterations.png", dpi=110)
-    output.write_picture(draw_profiles(rows), "solvers", "_profiles.png", dpi=110)
-    output.write_picture(draw_scaling(rows), "solvers", "_scaling.png", dpi=110)
-    if warm:
-        output.write_picture(draw_warm(warm), "solvers", "_warm.png", dpi=110)
+    lines = summary(rows)
+    output.write_rows("solvers", head, "summary", lines)
+    output.write_picture(draw_times(lines), "solvers", dpi=200)
 
 
 def roster() -> dict[str, Solver]:
     """Our solvers, and those of the other packages if they are installed."""
     try:
-        return {**own(), **peers()}
+        return {**our_solvers(), **package_solvers()}
     except ModuleNotFoundError as error:
         print(f"{error}; only this program's solvers are compared.", flush=True)
-        return own()
+        return our_solvers()
 
 
 def compile_for(entries: Sequence[Entry], solvers: Mapping[str, Solver]) -> None:
@@ -113,26 +106,9 @@ def agreement(finest: Mapping[str, Mapping[str, np.ndarray]]) -> list[dict]:
     return pairs
 
 
-def told(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
+def agreement_lines(pairs: Sequence[Mapping], solvers: Mapping[str, Solver]) -> str:
     """The agreement as text: the pairs of ours with others, and the worst of all."""
     lines = ["largest difference of velocities between solutions to 1e-8, over the fastest approach"]
     mixed = [pair for pair in pairs if sum(solvers[name].ours for name in pair["solvers"]) == 1]
     lines += [f"{' / '.join(pair['solvers'])}: {pair['largest_difference']:.1e} ({pair['problems']})" for pair in mixed]
     return "\n".join(lines)
-
-
-def warm_summary(rows: Sequence[WarmRow]) -> list[dict]:
-    """Of each solver and start: the medians of time and iterations over those of a cold start."""
-    cold = {(row.solver, row.problem): row for row in rows if row.start == "cold"}
-    members: dict[tuple[str, str], list[WarmRow]] = {}
-    for row in rows:
-        members.setdefault((row.solver, row.start), []).append(row)
-    lines = []
-    for (solver, start), held in members.items():
-        line = {"solver": solver, "start": start, "problems": len(held)}
-        line["distance"] = float(f"{np.median([row.distance for row in held]):.3g}")
-        for of in ("seconds", "iterations"):
-            shares = [getattr(row, of) / getattr(cold[solver, row.problem], of) for row in held]
-            line[f"{of}_over_cold"] = float(f"{np.nanmedian(shares):.3g}")
-        lines.append(line)
-    return lines

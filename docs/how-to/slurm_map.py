@@ -1,6 +1,6 @@
 """Run a map on a cluster: start Dask workers through Slurm, or on this machine where there is none, and map on them.
 
-    python examples/slurm_map.py --workers 32 --walltime 04:00:00 -- --preset paper --output paper.nc --resume
+    python docs/how-to/slurm_map.py --workers 32 --walltime 04:00:00 -- --preset paper --output paper.nc --resume
 
 What follows ``--`` goes to ``jaxgran map``. Run it where it may live as long as the map, such as a login node's
 terminal multiplexer or a small job of its own; when it is cut off, the same line goes on where it was. With Slurm it
