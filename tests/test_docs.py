@@ -68,20 +68,6 @@ def test_readme_is_short_and_its_links_lead_somewhere() -> None:
     assert len(links) > 20 and all((ROOT / link).is_file() for link in links)
 
 
-def test_drawing_of_the_folders_shows_every_folder_and_every_import(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(DOCS / "_build")
-    architecture = import_module("architecture")
-    folders = {path.parent.name for path in ROOT.glob("jaxgran/*/__init__.py")}
-    rows, imports, figure = architecture.rows(), architecture.imports(), architecture.drawing()
-    shown = [text.get_text() for text in figure.axes[0].texts]
-    named = {name for row in rows for name in row}
-    page = (DOCS / "explanation" / "architecture.md").read_text(encoding="utf-8")
-    assert folders <= named == set(re.findall(r"^\| `(\w+)` \|", page.split("## How data flows")[0], re.MULTILINE))
-    assert folders <= set(shown)
-    assert imports["sampling", "dynamics"] > 0 and ("dynamics", "sampling") not in imports
-    assert sorted(word for word in shown if word.isdecimal()) == sorted(str(number) for number in imports.values())
-
-
 @pytest.mark.environment
 @pytest.mark.parametrize("page", RUN)
 def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from benchmarks.mistakes import MISTAKES, Mistake
-from benchmarks.mutants import failed_tests
 
 ROOT = Path(__file__).parents[1]
 WORD = r'"[^"]*"|[\w.]+|[<>=!]=|\S'
@@ -22,18 +21,3 @@ def test_a_mistake_is_one_word_of_a_line_that_its_file_has_once(mistake: Mistake
     assert wrong.count(mistake.after) == 1 and mistake.before not in wrong
     ast.parse(wrong)
     assert any((ROOT / "tests" / test).is_file() for test in mistake.tests)
-
-
-def test_a_line_that_has_changed_is_named() -> None:
-    with pytest.raises(ValueError, match=f"{MISTAKES[0].name}' 0 times"):
-        MISTAKES[0].made_in("")
-
-
-def test_failed_tests_are_those_of_the_summary() -> None:
-    said = """
-ERROR    jax:log.py:1 tests are slow
-FAILED tests/test_a.py::test_one[a b - c] - assert 1 == 2 - 0
-FAILED tests/test_a.py::test_two
-ERROR tests/test_b.py - ImportError
-"""
-    assert failed_tests(said) == ["tests/test_a.py::test_one[a b - c]", "tests/test_a.py::test_two", "tests/test_b.py"]
