@@ -11,7 +11,8 @@ other programs on the machine hardly matter.
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,11 +45,11 @@ def run(output: Output) -> None:
         for size in sizes if together is _in_lockstep else sizes[-1:]:
             compiled, seconds = None, 0.0
             for ((alpha, nu), dt), batch in prepared.items():
-                flow = replace(jg.ShearFlow(grains, alpha, nu, dt, tolerance=TOLERANCE), **choice)
+                flow = jg.ShearFlow(grains, alpha, nu, dt)
                 now = jax.tree.map(lambda leaf, size=size: leaf[:size], batch)
                 if compiled is None:
                     start = time.process_time()
-                    compiled = jax.jit(together).lower(_traced(flow), now, jnp.int32(1)).compile()
+                    compiled = jax.jit(partial(together, **choice)).lower(_traced(flow), now, jnp.int32(1)).compile()
                     seconds = time.process_time() - start
                 rate, iterations = throughput(compiled, _traced(flow), now, dt)
                 points.append(
@@ -69,25 +70,25 @@ def run(output: Output) -> None:
     output.write_picture(draw(points), "engine_cost")
 
 
-def _in_turn(flow: jg.ShearFlow, states: jg.State, steps: jax.Array) -> tuple[jg.State, jg.Tally]:
-    return lax.map(lambda state: jg.advance(flow, state, steps), states)
+def _in_turn(flow: jg.ShearFlow, states: jg.State, steps: jax.Array, **how: Any) -> tuple[jg.State, jg.Tally]:
+    return lax.map(lambda state: jg.advance(flow, state, steps, **how), states)
 
 
-def _in_lockstep(flow: jg.ShearFlow, states: jg.State, steps: jax.Array) -> tuple[jg.State, jg.Tally]:
-    return jax.vmap(lambda state: jg.advance(flow, state, steps), axis_name=AXIS)(states)
+def _in_lockstep(flow: jg.ShearFlow, states: jg.State, steps: jax.Array, **how: Any) -> tuple[jg.State, jg.Tally]:
+    return jax.vmap(lambda state: jg.advance(flow, state, steps, **how), axis_name=AXIS)(states)
 
 
-WAYS: dict[str, tuple[dict[str, str], Callable]] = {
-    "numba engine": ({"engine": "numba"}, _in_turn),
-    "jax, lax.map": ({"engine": "jax"}, _in_turn),
-    "jax, vmap": ({"engine": "jax"}, _in_lockstep),
-    "jax, Jacobi, vmap": ({"engine": "jax", "solver": "jacobi"}, _in_lockstep),
+WAYS: dict[str, tuple[dict[str, Any], Callable]] = {
+    "numba engine": ({"engine": jg.Numba()}, _in_turn),
+    "jax, lax.map": ({"engine": jg.Jax()}, _in_turn),
+    "jax, vmap": ({"engine": jg.Jax()}, _in_lockstep),
+    "jax, Jacobi, vmap": ({"engine": jg.Jax(), "solver": jg.Jacobi()}, _in_lockstep),
 }
 
 
 def states(restitution: float, packing_fraction: float, timestep: float, grains: int, count: int) -> jg.State:
     """Packings of one flow, sheared and relaxed at the time step."""
-    flow = stack([jg.ShearFlow(grains, restitution, packing_fraction, timestep, tolerance=TOLERANCE)] * count)
+    flow = stack([jg.ShearFlow(grains, restitution, packing_fraction, timestep)] * count)
     return prepare_batch(flow, jax.random.split(jax.random.key(0), count), EQUILIBRATION).state
 
 

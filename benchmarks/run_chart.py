@@ -103,10 +103,13 @@ def run(plan: Plan, task: tuple[tuple[float, float], int]) -> dict[Config, tuple
     measured = {}
     for config in dict.fromkeys((plan.reference, *plan.configs)):
         strain = plan.reference_strain if config == plan.reference else plan.strain
-        here = jg.ShearFlow(plan.grains, alpha, nu, config.timestep, tolerance=config.tolerance, activation=config[2])
-        relaxed, _ = jax.block_until_ready(jg.sample(here, state, RELAXATION))  # so it is compiled before it is timed
+        here = jg.ShearFlow(plan.grains, alpha, nu, config.timestep, activation=config.activation)
+        solver = jg.BarzilaiBorwein(config.tolerance)
+        relaxed, _ = jax.block_until_ready(
+            jg.sample(here, state, RELAXATION, solver=solver)
+        )  # compiled before it is timed
         begin = time.process_time()
-        _, sample = jax.block_until_ready(jg.sample(here, relaxed, strain))
+        _, sample = jax.block_until_ready(jg.sample(here, relaxed, strain, solver=solver))
         seconds = (time.process_time() - begin) / strain
         measured[config] = jax.tree.map(np.asarray, sample), seconds, int(sample.status)
     return measured

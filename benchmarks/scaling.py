@@ -24,8 +24,9 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.process import printed_by
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS
 from jaxgran.environment import usable_cores
-from jaxgran.sampling.batch import advance_batch, stack
+from jaxgran.sampling.batch import advance_batch, for_replicas, stack
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
 REPLICAS, QUICK_REPLICAS = (1, 4, 16, 64, 256, 1024, 4096), (8, 64)
@@ -110,10 +111,10 @@ def replicas(sizes: tuple[int, ...]) -> list[dict[str, float]]:
     rows = []
     for size in sizes:
         flows, states = stack([flow] * size), jax.tree.map(lambda leaf, n=size: jnp.stack([leaf] * n), state)
-        steps = jnp.full(size, 1000, jnp.int32)
-        jax.block_until_ready(advance_batch(flows, states, steps // 10))
+        steps, numerics = jnp.full(size, 1000, jnp.int32), for_replicas(DEFAULT_NUMERICS, size)
+        jax.block_until_ready(advance_batch(flows, numerics, states, steps // 10))
         start = time.process_time()
-        jax.block_until_ready(advance_batch(flows, states, steps))
+        jax.block_until_ready(advance_batch(flows, numerics, states, steps))
         seconds = time.process_time() - start
         rate = float(f"{1000 * size / seconds:.4g}")
         rows.append({"replicas": size, "cpu seconds": float(f"{seconds:.4g}"), "replica-steps per second": rate})

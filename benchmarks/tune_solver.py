@@ -17,7 +17,7 @@ Networks without a solution are left out. The verdict is about the tuned method 
     python -m benchmarks tune_solver --quick    # smaller collection, one K, few optimiser steps; under a minute
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -27,11 +27,11 @@ import numpy as np
 import optax
 from matplotlib.figure import Figure
 
+import jaxgran as jg
 from benchmarks.networks import GRAINS, INFEASIBLE, Network, collection
 from benchmarks.output import Output
 from jaxgran.contact.delassus import delassus_product, diagonal, spectral_bound
 from jaxgran.contact.network import Contacts
-from jaxgran.contact.projected_methods import METHODS, Method
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
@@ -51,7 +51,7 @@ def run(output: Output) -> None:
     out = [k // _ALIKE[g] % 2 == 1 if g in _ALIKE else k >= len(groups[g]) // 2 for g, k in places]
     train = [network for network, kept in zip(networks, out, strict=True) if not kept]
     tunings = [tuned(kind, train, depth, steps) for kind in STOCK for depth in depths]
-    products = {name: measured(networks, *rule, cap) for name, rule in contestants(tunings).items()}
+    products = {name: measured(networks, method, cap) for name, method in contestants(tunings).items()}
     print(f"{sum(out)} held-out networks, to {TOLERANCES}: median and 90th percentile of products, share converged")
     spreads = {}
     for name, costs in ((name, costs[out]) for name, costs in products.items()):  # a failure is infinitely dear
@@ -117,29 +117,50 @@ def tuned(kind: str, networks: list[Network], iterations: int, steps: int) -> di
     return {"kind": kind, "K": iterations, "after": after, "losses": losses, **before}
 
 
-def contestants(tunings: list[dict[str, Any]]) -> dict[str, tuple[str, Any]]:
-    """Method and numbers of all that are compared; the solver hands a method its relaxation, here all three numbers."""
-
-    def propose(now: Any, at: jax.Array) -> tuple[jax.Array, jax.Array]:
-        (k,) = now.memory
-        return now.point + at[1] * k / (k + at[2]) * (now.point - now.previous), at[0]
-
-    extra: dict[Any, Method] = METHODS
-    extra["momentum"] = Method(spectral_bound, (0.0,), propose, lambda now, *_: (now.memory[0] + 1,))
-    extra["restarted"] = Method(spectral_bound, (0.0,), propose, METHODS["nesterov"].learn)
-    rules: dict[str, tuple[str, Any]] = {name: (name, 1.8) for name in ("jacobi", "nesterov", DEFAULT)}
-    rules["nesterov, no restart"] = "momentum", STOCK["momentum"]
-    both = {", no restart": "momentum", ", restart": "restarted"}
+def contestants(tunings: list[dict[str, Any]]) -> dict[str, jg.ProjectedMethod]:
+    """All methods that are compared."""
+    rules: dict[str, jg.ProjectedMethod] = {
+        "jacobi": jg.Jacobi(),
+        "nesterov": jg.Nesterov(),
+        DEFAULT: jg.BarzilaiBorwein(),
+        "nesterov, no restart": Momentum(numbers=jnp.array(STOCK["momentum"])),
+    }
+    both = {", no restart": Momentum, ", restart": Restarted}
     for t in tunings:
-        for ending, method in (both if t["kind"] == "momentum" else {"": "momentum"}).items():
-            rules[f"tuned {t['kind']}, K = {t['K']}{ending}"] = method, t["after"]
+        for ending, method in (both if t["kind"] == "momentum" else {"": Momentum}).items():
+            rules[f"tuned {t['kind']}, K = {t['K']}{ending}"] = method(numbers=jnp.array(t["after"]))
     return rules
 
 
-def measured(networks: list[Network], method: Any, at: Any, cap: int) -> np.ndarray:
+@dataclass(frozen=True)
+class Momentum(jg.ProjectedMethod):
+    """A step of length τ from p + s k/(k + r) (p − p_before)."""
+
+    numbers: Any = None  # τ, s, r
+
+    def init(self, approach: jax.Array) -> Any:
+        return 0.0
+
+    def propose(self, now: Any) -> tuple[jax.Array, jax.Array]:
+        k, (tau, share, delay) = now.memory, self.numbers
+        return now.point + share * k / (k + delay) * (now.point - now.previous), tau
+
+    def learn(self, now: Any, *_: Any) -> Any:
+        return now.memory + 1
+
+
+@dataclass(frozen=True)
+class Restarted(Momentum):
+    """The same with Nesterov's restarts."""
+
+    learn = jg.Nesterov.learn
+
+
+def measured(networks: list[Network], method: jg.ProjectedMethod, cap: int) -> np.ndarray:
     """Products with W until each residual is reached, (networks, tolerances); infinite if it is not within the cap."""
-    once = jax.jit(lambda contacts, t: solve(contacts, GRAINS, 1.0, t, cap, jnp.array(at), method, jnp.asarray(True)))
-    tried = [[once(network.contacts, tolerance) for tolerance in TOLERANCES] for network in networks]
+    once = jax.jit(lambda contacts, solver: solve(contacts, GRAINS, 1.0, solver, jnp.asarray(True)))
+    solvers = [replace(method, tolerance=tolerance, max_steps=cap) for tolerance in TOLERANCES]
+    tried = [[once(network.contacts, solver) for solver in solvers] for network in networks]
     return np.array([[float(x.iterations) if x.status == Status.ok else np.inf for x in pair] for pair in tried])
 
 

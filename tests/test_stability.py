@@ -100,7 +100,9 @@ def pressure(variant: str, alpha: float, nu: float, timestep: float, state: Stat
     state = jax.tree.map(lambda x: x.astype(flow.timestep.dtype), state)
     blocks = []
     for _ in range(16):
-        state, tally = stability.advance(flow, state, jnp.int32(round(0.25 / timestep)))
+        state, tally = stability.advance(
+            flow, state, jnp.int32(round(0.25 / timestep)), solver=stability.solver_of(variant)
+        )
         assert tally.status == Status.ok
         blocks.append(float(averages(tally, state.side**2, stability.GRAINS, flow.shear_rate)["pressure"]))
     return float(np.mean(blocks)), float(np.std(blocks, ddof=1) / 4)
@@ -121,5 +123,5 @@ def collisions(variant: str, timestep: float) -> int:
     state = State(Grains(radii, 4 * radii**2), positions, velocities, np.asarray(54.0), np.asarray(0.0))
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), state)
     steps = jnp.int32(np.ceil(4 * gap / timestep) + 4)
-    state, tally = stability.advance(flow, state, steps)
+    state, tally = stability.advance(flow, state, steps, solver=stability.solver_of(variant))
     return int(tally.collisions)

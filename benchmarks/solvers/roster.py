@@ -2,12 +2,12 @@
 
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 from benchmarks.collection.compare import Prepare, projected, swept
 from benchmarks.solvers.numba_engine import by_cluster
 from benchmarks.solvers.single_precision import projected_in_float32
-from jaxgran.model.choices import Solver as Method
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, SOLVERS
 
 DEFAULT = "barzilai-borwein"
 MACHINE_CODE = "numba engine"
@@ -27,16 +27,14 @@ def own() -> dict[str, Solver]:
     """The solvers of this program, and plain Gauss–Seidel sweeps."""
     settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
     settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
-    methods = {
-        name: Solver(
-            partial(projected, name, **settings.get(name, {})), "products with W", settings.get(name, {}), True
-        )
-        for name in get_args(Method)
-    }
+    methods = {}
+    for name, method in SOLVERS.items():
+        chosen = settings.get(name, {})
+        methods[name] = Solver(partial(projected, method(**chosen)), "products with W", chosen, True)
     return {
         MACHINE_CODE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
         **methods,
-        f"{DEFAULT}, float32": Solver(partial(projected_in_float32, DEFAULT), "products with W", {}, True),
+        f"{DEFAULT}, float32": Solver(partial(projected_in_float32, DEFAULT_SOLVER), "products with W", {}, True),
         "Gauss–Seidel": Solver(swept, "sweeps", {}, True),
     }
 

@@ -1,5 +1,6 @@
 """The projected methods in single precision."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -7,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.collection import Entry
-from benchmarks.collection.compare import Answer, Solve, solved_network
+from benchmarks.collection.compare import CAP, Answer, Solve, solved_network
 from benchmarks.collection.make import padded
+from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.model.status import Status
 
 
-def projected_in_float32(method: str, entry: Entry, tolerance: float) -> Solve:
+def projected_in_float32(method: ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
     """As ``benchmarks.collection.compare.projected``, with all numbers of the problem in single precision."""
     network = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, padded(entry.problem))
     count = len(entry.problem.approach)
-    call = partial(solved_network, network, method, jnp.float32(tolerance), jnp.float32(1.8))
+    call = partial(solved_network, network, replace(method, tolerance=tolerance, max_steps=CAP))
 
     def solve() -> Answer | None:
         solution = jax.block_until_ready(call())

@@ -134,7 +134,7 @@ def pairs(contacts: Contacts) -> list[tuple[int, int]]:
 
 def impulses_of(problem: Problem) -> np.ndarray:
     """The solution to 1e-9."""
-    solution = _solved(padded(problem), tolerance=1e-9, max_iterations=100_000)
+    solution = _solved(padded(problem), solver=jg.BarzilaiBorwein(1e-9, 100_000))
     return np.asarray(solution.impulses)[: len(problem.approach)]
 
 
