@@ -19,11 +19,10 @@ import jaxgran as jg
 from benchmarks import rival_numba
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics import advance, jax_engine
-from jaxgran.dynamics.engine import select_engine
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
-from jaxgran.sampling.batch import advance_batch, replicated
+from jaxgran.sampling.batch import advance_batch, for_replicas, in_lockstep, replicated
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
 REPLICAS, GRAINS, STRAIN = 1000, 256, 0.2
@@ -62,14 +61,17 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
     """Replica-steps per second from the same states: the fastest of three calls each, in turn."""
     flow = jg.ShearFlow(grains=GRAINS, restitution=alpha, packing_fraction=nu, timestep=dt)
     state = jg.prepare(flow, jax.random.key(0), equilibrate=5.0)
-    forward = jax.jit(advance.advance)
+    forward = jax.jit(jg.advance)
     distinct = [state := forward(flow, state, jnp.int32(round(APART / dt)))[0] for _ in range(DISTINCT)]
     batch = jax.tree.map(lambda *x: jnp.stack([x[n % DISTINCT] for n in range(replicas)]), *distinct)
     flows = jax.tree.map(lambda x: jnp.full(replicas, x), flow)
-    steps = round(STRAIN / dt)
+    steps, numerics = round(STRAIN / dt), for_replicas(DEFAULT_NUMERICS, replicas)
     few = steps // PLAIN_SHARE
     ways = {  # what is done in a call, and how many replica-steps that is
-        "taken": (lambda: advance_batch(flows, batch, jnp.full(replicas, steps)), steps * replicas),
+        "taken": (
+            lambda: advance_batch(flows, numerics, batch, jnp.full(replicas, steps)),
+            steps * replicas,
+        ),
         "plain": (lambda: plain(flows, batch, jnp.full(replicas, few)), few * replicas),
         "rival": (partial(rivals, flow, distinct, steps), steps * DISTINCT),
     }
@@ -81,11 +83,15 @@ def compare(alpha: float, nu: float, dt: float, replicas: int) -> dict:
             if turn:
                 seconds[name].append(time.perf_counter() - start)
     speeds = {name: done / min(seconds[name]) for name, (_, done) in ways.items()}
-    taken = select_engine(flow, state)
+    taken = select_engine(flow, DEFAULT_NUMERICS, state).name
     return {"alpha": alpha, "nu": nu, "dt": dt, "engine": taken, **speeds, "ratio": speeds["taken"] / speeds["rival"]}
 
 
-plain = jax.jit(lambda flows, states, steps: replicated(jax_engine.advance)(flows, states, steps))
+def _plain_replica(flow: jg.ShearFlow, state: jg.State, steps: jax.Array) -> tuple[jg.State, jg.Tally]:
+    return jg.advance(flow, state, steps, engine=jg.Jax())
+
+
+plain = jax.jit(lambda *arguments: replicated(_plain_replica, in_lockstep())(*arguments))
 
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:

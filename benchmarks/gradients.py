@@ -10,6 +10,7 @@ neighbouring runs, and fits the exponent of its growth.
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packi
 GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-6, 1.2, 48, 6
 DIFFERENCE = 1e-4  # between the restitutions of two neighbouring runs
 HORIZON = 100.0  # |∂(state)/∂α| at which a change of α by 0.01 moves the grains by a diameter
+SOLVER = jg.BarzilaiBorwein(tolerance=1e-9, max_steps=20_000)
 STEPS, MANY_STEPS, REPEATS = 100, 1000, 15
 COSTS = ((64, 0.6, 0.7), (256, 0.6, 0.7), (64, 0.3, 0.75))  # grains, restitution, packing fraction; dt = 1e-3
 
@@ -32,17 +34,18 @@ COSTS = ((64, 0.6, 0.7), (256, 0.6, 0.7), (64, 0.3, 0.75))  # grains, restitutio
 def prepared(grains: int, alpha: float, nu: float, timestep: float, seed: int = 0):
     """A flow for derivatives and a state of it."""
     state = jg.prepare(jg.ShearFlow(grains, alpha, nu, 1e-3), jax.random.key(seed), 2.0)
-    return jg.ShearFlow(grains, alpha, nu, timestep, tolerance=1e-9, max_iterations=20_000), state
+    return jg.ShearFlow(grains, alpha, nu, timestep), state
 
 
 def cost(grains: int, alpha: float, nu: float) -> dict:
     """Median seconds of an advance and of its derivatives in turn, and bytes of the gradient of a long one."""
     flow, state = prepared(grains, alpha, nu, 1e-3)
-    events = int(jax.jit(jg.count_events)(flow, state, jnp.int32(STEPS)))
+    events = int(jax.jit(partial(jg.count_events, solver=SOLVER))(flow, state, jnp.int32(STEPS)))
 
     def energy(restitution, velocities, number: int | None, steps: int = STEPS):
         start = replace(state, velocities=velocities)
-        end, _ = jg.advance(replace(flow, restitution=restitution), start, jnp.int32(steps), True, number)
+        changed = replace(flow, restitution=restitution)
+        end, _ = jg.advance(changed, start, jnp.int32(steps), True, number, solver=SOLVER)
         return jnp.sum(end.velocities**2)
 
     at = (jnp.asarray(alpha), state.velocities)
@@ -84,7 +87,7 @@ def followed(alpha: float, nu: float, runs: int) -> dict:
     for seed in range(runs):
         flow, state = prepared(GRAINS, alpha, nu, TIMESTEP, seed)
         for name, moving in (("moving", True), ("fixed", False)):
-            grown = growth(flow, state, STRAIN, POINTS, moving)
+            grown = growth(flow, state, STRAIN, POINTS, moving, solver=SOLVER)
             rows[name].append(np.asarray(grown.derivative).tolist())
         rows["difference"].append(np.asarray(differences(flow, state)).tolist())
     strain = np.asarray(grown.strain)
@@ -113,7 +116,9 @@ def differences(flow, state):
 
     def part(states, _):
         pair = [
-            jg.advance(replace(flow, restitution=flow.restitution + sign * DIFFERENCE / 2), each, steps)[0]
+            jg.advance(replace(flow, restitution=flow.restitution + sign * DIFFERENCE / 2), each, steps, solver=SOLVER)[
+                0
+            ]
             for sign, each in zip((1, -1), states, strict=True)
         ]
         moved = displacement(pair[0].positions, pair[1].positions, pair[0].side, pair[0].tilt)

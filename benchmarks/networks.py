@@ -91,11 +91,8 @@ def further(packing_fraction: float, restitution: float, state: jg.State, strain
 
 
 def _flow(grains: int, packing_fraction: jax.Array, restitution: jax.Array) -> jg.ShearFlow:
-    """Traced numbers are not judged: one of the flows is denser than a user may ask for.
-
-    The solver is named, so that the networks stay what they are when the default changes.
-    """
-    return jg.ShearFlow(grains, restitution, packing_fraction, TIMESTEP, solver="nesterov")
+    """Traced numbers are not judged: one of the flows is denser than a user may ask for."""
+    return jg.ShearFlow(grains, restitution, packing_fraction, TIMESTEP)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -105,7 +102,9 @@ def _packed(grains: int, packing_fraction: jax.Array, key: jax.Array) -> jg.Stat
 
 @jax.jit
 def _advanced(state: jg.State, packing_fraction: jax.Array, restitution: jax.Array, steps: jax.Array) -> jg.State:
-    return jg.advance(_flow(state.grains.radii.size, packing_fraction, restitution), state, steps)[0]
+    """The solver is named, so that the networks stay what they are when the default changes."""
+    flow = _flow(state.grains.radii.size, packing_fraction, restitution)
+    return jg.advance(flow, state, steps, solver=jg.Nesterov())[0]
 
 
 @jax.jit

@@ -15,6 +15,7 @@ Every pair that touches is a contact of every step. Restitution is zero.
     python -m benchmarks pulse --quick   # a shorter strip and fewer tolerances, half a minute
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,12 +24,12 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+import jaxgran as jg
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.output import Output
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution, solve
-from jaxgran.model.choices import Solver
 from jaxgran.model.status import Status
 
 ROWS, LENGTH = 4, 100  # discs across, and along
@@ -38,6 +39,11 @@ TOLERANCES = (0.3, 1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6)
 FLOOR = 1e-6  # smallest error of the force that is drawn
 DRAWN = (0.3, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances of the first panel
 SWEEPS = "Gauss–Seidel"
+METHODS = {
+    "barzilai-borwein": jg.BarzilaiBorwein(max_steps=MOST_ITERATIONS),
+    "nesterov": jg.Nesterov(max_steps=MOST_ITERATIONS),
+    "jacobi": jg.Jacobi(max_steps=MOST_ITERATIONS, relaxation=1.0),
+}
 SMALLEST = {"barzilai-borwein": 1e-6, "nesterov": 1e-6, "jacobi": 1e-3, SWEEPS: 1e-4}  # below, minutes to run
 MOST_ITERATIONS = 1_000_000
 STYLES = {
@@ -90,9 +96,9 @@ def network(made: Strip, velocities: np.ndarray) -> Contacts:
     )
 
 
-@partial(jax.jit, static_argnames=("discs", "method"))
-def _solved(contacts: Contacts, discs: int, tolerance: float, method: Solver) -> Solution:
-    return solve(contacts, discs, 0.0, tolerance, MOST_ITERATIONS, 1.0, method, jnp.bool_(True))
+@partial(jax.jit, static_argnames="discs")
+def _solved(contacts: Contacts, discs: int, solver: jg.ProjectedMethod) -> Solution:
+    return solve(contacts, discs, 0.0, solver, jnp.bool_(True))
 
 
 class Pushed(NamedTuple):
@@ -127,7 +133,7 @@ def pushed(made: Strip, method: str, tolerance: float, steps: int) -> Pushed:
         if method == SWEEPS:
             solution = gauss_seidel(contacts, discs, tolerance, MOST_ITERATIONS, 0.0)
         else:
-            solution = _solved(contacts, discs, tolerance, method)  # type: ignore[arg-type]
+            solution = _solved(contacts, discs, replace(METHODS[method], tolerance=tolerance))
         status = Status(int(solution.status))
         if status != Status.ok:
             raise RuntimeError(f"{method} has failed at a tolerance of {tolerance:g}: {status.name}.")

@@ -38,9 +38,9 @@ CROSSINGS = (1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # dt √
 COARSE_GRID = (0.3, 0.6, 0.75, 0.8, 0.82, 0.83, 0.84), CROSSINGS[3:9]  # of all variants but the default
 VARIANTS = {
     "default": {},
-    "Jacobi, ω = 1.8": {"solver": "jacobi", "relaxation": 1.8},
-    "Jacobi, ω = 2": {"solver": "jacobi", "relaxation": 2.0},
-    "Jacobi with diag W, ω = 1": {"solver": "jacobi-diagonal", "relaxation": 1.0},
+    "Jacobi, ω = 1.8": {"solver": jg.Jacobi(relaxation=1.8)},
+    "Jacobi, ω = 2": {"solver": jax.tree.map(lambda x: 2.0 if x == 1.8 else x, jg.Jacobi())},  # is not accepted
+    "Jacobi with diag W, ω = 1": {"solver": jg.JacobiDiagonal(relaxation=1.0)},
     "float32": {"dtype": "float32"},
 }
 DRAWN = (("default", 0.0), ("default", 0.5), ("default", 0.9)), tuple((name, 0.5) for name in tuple(VARIANTS)[1:4])
@@ -90,15 +90,23 @@ def run(output: Output) -> list[dict]:
 
 def unjudged(variant: str, alpha: float, nu: float, **numbers: float) -> jg.ShearFlow:
     """A flow whose numbers are not judged, in the precision of a variant: leaves of a pytree never are."""
-    choice = {"activation": "midpoint", "solver": "barzilai-borwein", "dtype": "float64"} | VARIANTS[variant]
-    dtype, fixed = choice.pop("dtype"), {name: choice.pop(name) for name in ("activation", "solver")}
-    numbers = {"restitution": alpha, "packing_fraction": nu} | choice | numbers
+    activation, dtype = (
+        VARIANTS[variant].get(name, x) for name, x in (("activation", "midpoint"), ("dtype", "float64"))
+    )
+    numbers = {"restitution": alpha, "packing_fraction": nu} | numbers
 
     def leaf(path, value) -> jax.Array:
-        name = path[-1].name
-        return jnp.asarray(numbers.get(name, value), "int32" if name == "max_iterations" else dtype)
+        return jnp.asarray(numbers.get(path[-1].name, value), dtype)
 
-    return jax.tree_util.tree_map_with_path(leaf, jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3, **fixed))
+    flow = jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3, activation=activation)
+    return jax.tree_util.tree_map_with_path(leaf, flow)
+
+
+def solver_of(variant: str) -> jg.ProjectedMethod:
+    """The solver of a variant, in its precision."""
+    dtype = VARIANTS[variant].get("dtype", "float64")
+    solver = VARIANTS[variant].get("solver", jg.BarzilaiBorwein())
+    return jax.tree.map(lambda x: jnp.asarray(x, "int32" if isinstance(x, int) else dtype), solver)
 
 
 def prepared(alpha: float, nu: float) -> tuple[jg.State, float]:
@@ -118,8 +126,8 @@ def prepared(alpha: float, nu: float) -> tuple[jg.State, float]:
     temperatures = []
     for strain, crossing in PREPARATION:
         dt = crossing / np.sqrt(energy(state) / GRAINS)
-        flow = unjudged("default", alpha, nu, timestep=dt, max_iterations=500)
-        state, tally = advance(flow, state, jnp.int32(round(strain / dt)))
+        flow = unjudged("default", alpha, nu, timestep=dt)
+        state, tally = advance(flow, state, jnp.int32(round(strain / dt)), solver=jg.BarzilaiBorwein(max_steps=500))
         temperatures.append(float(averages(tally, state.side**2, GRAINS, flow.shear_rate)["granular_temperature"]))
     return state, float(np.mean(temperatures[-8:]))
 
@@ -155,7 +163,7 @@ def cell(variant: str, alpha: float, nu: float, crossing: float, state: jg.State
     outcome, failed_after, whole = "ok", np.nan, None
     for steps, end in zip(np.diff(edges, prepend=0), edges, strict=True):
         before = energy(state)
-        state, tally = advance(flow, state, jnp.int32(steps))
+        state, tally = advance(flow, state, jnp.int32(steps), solver=solver_of(variant))
         whole = tally if whole is None else whole + tally
         now = jg.Status(int(tally.status)).name
         if tally.status <= jg.Status.deep_overlap and tally.largest_overlap > DEEP_OVERLAP:

@@ -47,7 +47,7 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
     def call(*arguments):
         leaves, structure = jax.tree.flatten(arguments)
         folder = _folder()
-        if folder is None or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if folder is None or any(isinstance(leaf, Tracer) for leaf in leaves) or _has_foreign_class(structure):
             return jitted(*arguments)
         key = (structure, tuple(map(jax.typeof, leaves)))
         if key not in programs:
@@ -67,6 +67,13 @@ def _folder() -> Path | None:
     folder = jax.config.values["jax_compilation_cache_dir"]
     single = folder and jax.default_backend() == "cpu" and jax.device_count() == 1
     return Path(folder) / "programs" if single else None
+
+
+def _has_foreign_class(structure: Any) -> bool:
+    """Whether an argument is of a class from outside, such as a user's solver, whose source is not in the key."""
+    node = structure.node_data()
+    foreign = node is not None and node[0].__module__.partition(".")[0] not in ("builtins", "jaxgran")
+    return foreign or any(map(_has_foreign_class, structure.children()))
 
 
 def _flags() -> str:

@@ -132,7 +132,7 @@ plt.show()
 # %%
 figure, axis = plt.subplots(figsize=(5, 3.4), layout="constrained")
 for restitution, style in ((0.5, "--"), (0.9, "-")):
-    flow = jg.ShearFlow(32 if quick else 64, restitution, 0.6, 1e-4, tolerance=1e-9)
+    flow = jg.ShearFlow(32 if quick else 64, restitution, 0.6, 1e-4)
     grown = growth(flow, jg.prepare(replace(flow, timestep=1e-3), jax.random.key(1), 2.0), 0.5 if quick else 1.0, 40)
     axis.semilogy(grown.strain, grown.derivative, style, color="0.2", label=rf"$\alpha={restitution}$")
 axis.axhline(100, color="0.6", ls=":", lw=1)

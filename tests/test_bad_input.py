@@ -540,7 +540,12 @@ def test_a_truncated_map_is_refused_wherever_it_ends(share: float) -> None:
         assert files(Path(name)) == {"torn.nc"}
 
 
-ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until steady"}
+ALIKE = {
+    "solver_requested": "barzilai-borwein",
+    "solver_parameters": '{"tolerance": 1e-4, "max_steps": 5000}',
+    "engine_requested": "auto",
+    "equilibrate": "until steady",
+}
 
 
 @pytest.mark.parametrize(
@@ -552,10 +557,10 @@ ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until 
         *[("strain", value) for value in ("long", 1e30, [1.0, 2.0])],
         *[
             (name, value)
-            for name in ("solver", "activation", "engine")
+            for name in ("solver_requested", "activation", "engine_requested")
             for value in (3, "other", ["midpoint", "touching"])
         ],
-        *[("tolerance", value) for value in (2.0, "auto ", [1e-3, 1e-4])],
+        *[("solver_parameters", value) for value in (2.0, "{", "[1]", '{"tolerance": 2.0}', '{"damping": 1.0}')],
         *[("equilibrate", value) for value in ("soon", -1.0, 1e30)],
         ("error", 7.0),
     ],
@@ -566,7 +571,7 @@ def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any,
     data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
     outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
-    assert name in outcome.err
+    assert name.partition("_")[0] in outcome.err
     assert files(tmp_path) == {"old.nc"}
 
 

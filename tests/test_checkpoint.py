@@ -250,6 +250,7 @@ def test_a_second_writer_is_refused_until_the_first_has_ended_however_it_did(out
 import time
 from pathlib import Path
 from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.maps.settings import MapSettings
 import jax
 jax.config.update("jax_enable_x64", True)

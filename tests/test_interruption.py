@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from flows import GRAINS
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.numba_engine import ffi
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
@@ -23,11 +24,11 @@ FLOW = ShearFlow(GRAINS, 0.7, 0.7, 1e-3)
 
 def test_machine_code_that_is_stopped_ends_as_failed_and_runs_again(engines, flowing) -> None:
     advance, state = engines["numba"], flowing(0.7)
-    end, whole = advance(FLOW, state, 1000)
+    end, whole = advance(FLOW, state, 1000, BarzilaiBorwein())
     with ffi.stopped():
-        _, cut = advance(FLOW, state, 1000)
+        _, cut = advance(FLOW, state, 1000, BarzilaiBorwein())
     assert cut.outcome == Status.failed and cut.steps < 1000
-    again, tally = advance(FLOW, state, 1000)
+    again, tally = advance(FLOW, state, 1000, BarzilaiBorwein())
     assert tally.outcome == whole.outcome == Status.ok
     np.testing.assert_array_equal(again.positions, end.positions)
 

@@ -7,6 +7,7 @@ from scipy.special import ndtr
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
 from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_contact, velocity_distribution
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.observables import averages
@@ -138,7 +139,7 @@ def test_binary_stress_and_collision_rate_of_a_flow_follow_from_its_pairs(flowin
     flow = ShearFlow(GRAINS, 0.9, 0.6, 1e-3)
     state = flowing(0.6)
     seen = snapshot_series(flow, state, STRAIN, SNAPSHOTS)[1]
-    _, tally = run(flow, state, round(STRAIN / flow.timestep))
+    _, tally = run(flow, state, round(STRAIN / flow.timestep), solver=BarzilaiBorwein())
     by_contacts = averages(tally, state.side**2, GRAINS, 1.0)
     np.testing.assert_allclose(by_contacts["force_ratio"], 1, atol=0.02)
     found = near_contact(seen, shell=0.08)

@@ -76,5 +76,5 @@ def collisions(variant: str, timestep: float) -> int:
     state = State(Grains(radii, 4 * radii**2), positions, velocities, np.asarray(54.0), np.asarray(0.0))
     state = jax.tree.map(lambda x: jnp.asarray(x, dtype), state)
     steps = jnp.int32(np.ceil(4 * gap / timestep) + 4)
-    state, tally = stability.advance(flow, state, steps)
+    state, tally = stability.advance(flow, state, steps, solver=stability.solver_of(variant))
     return int(tally.collisions)

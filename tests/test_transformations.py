@@ -88,6 +88,8 @@ WITHOUT_ARRAYS = {
         "ratio_contours",
         "ratio_curves",
     ),
+    *("BarzilaiBorwein", "Jacobi", "JacobiCount", "JacobiDiagonal", "Nesterov", "ProjectedMethod"),
+    *("Jax", "Numba", "Pallas"),
     *(
         "Tracks",
         "read_tracks",

@@ -4,10 +4,12 @@ A solver is a function ``prepare(entry, tolerance)`` that returns a function ``s
 a problem, such as building its matrices or compiling, belongs into ``prepare`` and is not timed. ``solve`` returns the
 impulses at restitution zero, (contacts,), or ``Answer(impulses, products)`` if it counts products with W or their
 equals, or None where it finds that there is no solution. It has a limit of its own, so that it ends. Whether it
-succeeded is not its own word: the residual of the natural map must be at most the tolerance.
+succeeded is not its own word: the residual of the natural map must be at most the tolerance. A ``ProjectedMethod``
+stands for itself.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -61,14 +63,17 @@ class Row(NamedTuple):
 
 
 def compare(
-    solvers: Mapping[str, Prepare], entries: Sequence[Entry], tolerance: float = 1e-6, timings: int = 3
+    solvers: Mapping[str, Prepare | jg.ProjectedMethod],
+    entries: Sequence[Entry],
+    tolerance: float = 1e-6,
+    timings: int = 3,
 ) -> list[Row]:
     """Every solver on every problem, problem by problem, so that all meet the same load of the machine."""
     return [_row(name, prepare, entry, tolerance, timings) for entry in entries for name, prepare in solvers.items()]
 
 
-def _row(name: str, prepare: Prepare, entry: Entry, tolerance: float, timings: int) -> Row:
-    solve = prepare(entry, tolerance)
+def _row(name: str, prepare: Prepare | jg.ProjectedMethod, entry: Entry, tolerance: float, timings: int) -> Row:
+    solve = (partial(projected, prepare) if isinstance(prepare, jg.ProjectedMethod) else prepare)(entry, tolerance)
     solve()  # compiles
     seconds, answer = timed(solve, timings)
     impulses, products = answer if isinstance(answer, Answer) else (answer, np.nan)
@@ -86,10 +91,10 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
     return float(jg.contact_residuals(network, jnp.asarray(filled)).natural_map)
 
 
-def projected(method: str, entry: Entry, tolerance: float, relaxation: float = 1.8) -> Solve:
-    """A projected method of this program, compiled for one of few shapes; ω is that of the Jacobi methods."""
+def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
+    """A projected method, compiled for one of few shapes, with a tolerance and ``CAP`` in place of its own."""
     network, count = padded(entry.problem), len(entry.problem.approach)
-    call = partial(solved_network, network, method, jnp.asarray(tolerance), jnp.asarray(relaxation))
+    call = partial(solved_network, network, replace(method, tolerance=tolerance, max_steps=CAP))
 
     def solve() -> Answer | None:
         solution = jax.block_until_ready(call())
@@ -100,12 +105,10 @@ def projected(method: str, entry: Entry, tolerance: float, relaxation: float = 1
     return solve
 
 
-@partial(jax.jit, static_argnums=1)
-def solved_network(
-    network: jg.ContactNetwork, method: str, tolerance: jax.Array, relaxation: jax.Array
-) -> jg.ContactSolution:
-    """The solution of a network, with the cap of these methods."""
-    return jg.solve_contacts(network, method=method, tolerance=tolerance, max_iterations=CAP, relaxation=relaxation)
+@jax.jit
+def solved_network(network: jg.ContactNetwork, solver: jg.ProjectedMethod) -> jg.ContactSolution:
+    """The solution of a network."""
+    return jg.solve_contacts(network, solver=solver)
 
 
 def swept(entry: Entry, tolerance: float) -> Solve:
@@ -121,8 +124,8 @@ def swept(entry: Entry, tolerance: float) -> Solve:
 
 
 OURS: dict[str, Prepare] = {
-    "barzilai-borwein": partial(projected, "barzilai-borwein"),
-    "nesterov": partial(projected, "nesterov"),
+    "barzilai-borwein": partial(projected, jg.BarzilaiBorwein()),
+    "nesterov": partial(projected, jg.Nesterov()),
     "Gauss–Seidel": swept,
 }
 

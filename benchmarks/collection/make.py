@@ -27,7 +27,7 @@ from jaxgran.contact.delassus import spectral_bound
 from jaxgran.contact.problem import as_contacts
 
 UNIQUE, WORST = 1e-20, 1e-13  # natural residuals: above the first a solution is not unique, the last is refused
-_GUESS = {"tolerance": 1e-10, "max_iterations": 500_000}
+_GUESS = jg.BarzilaiBorwein(tolerance=1e-10, max_steps=500_000)
 
 
 def run(output: Output, fclib: Path | None = None) -> None:
@@ -62,7 +62,7 @@ def proved(problem: Problem) -> Solved:
     Raises:
       ArithmeticError: neither could be proved.
     """
-    guess = _guess(padded(problem), **_GUESS)
+    guess = _guess(padded(problem), solver=_GUESS)
     count = len(problem.approach)
     result = obstructed(problem) if guess.status == jg.Status.infeasible else None
     if result is None:

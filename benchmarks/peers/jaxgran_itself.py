@@ -25,15 +25,15 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
         packing_fraction=flow.packing_fraction,
         timestep=timestep,
         shear_rate=flow.shear_rate,
-        tolerance=TOLERANCES[curve],
     )
+    solver, strain = jg.BarzilaiBorwein(TOLERANCES[curve]), duration * flow.shear_rate
     grains = Grains(jnp.asarray(discs.radii), jnp.asarray(discs.masses))
     arrays = (np.asarray(x, float) for x in (discs.positions, discs.velocities, discs.side, discs.tilt))
     state = jg.State(grains, *map(jnp.asarray, arrays))  # no weak types, or the second call would compile again
 
     def advance() -> Stress:
         nonlocal state
-        state, sample = jax.block_until_ready(jg.sample(law, state, duration * flow.shear_rate, blocks=1))
+        state, sample = jax.block_until_ready(jg.sample(law, state, strain, blocks=1, solver=solver))
         sample = jax.tree.map(np.asarray, sample)
         averages = sample.averages
         return Stress(float(averages["pressure"]), float(averages["shear_stress"]))

@@ -2,11 +2,11 @@
 
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 from benchmarks.collection.compare import Prepare, projected, swept
 from benchmarks.solvers.numba_engine import by_cluster
-from jaxgran.model.choices import Solver as Method
+from jaxgran.contact.projected_methods import SOLVERS
 
 DEFAULT = "barzilai-borwein"
 NUMBA_ENGINE = "numba engine"
@@ -26,12 +26,10 @@ def our_solvers() -> dict[str, Solver]:
     """The solvers of this program, and plain Gauss–Seidel sweeps."""
     settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
     settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
-    methods = {
-        name: Solver(
-            partial(projected, name, **settings.get(name, {})), "products with W", settings.get(name, {}), True
-        )
-        for name in get_args(Method)
-    }
+    methods = {}
+    for name, method in SOLVERS.items():
+        chosen = settings.get(name, {})
+        methods[name] = Solver(partial(projected, method(**chosen)), "products with W", chosen, True)
     return {
         NUMBA_ENGINE: Solver(by_cluster, "sweeps or products with W of the slowest cluster", {}, True),
         **methods,

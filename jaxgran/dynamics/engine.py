@@ -97,11 +97,17 @@ Engine = Jax | Numba | Pallas
 def engine_named(name: str) -> Engine | None:
     """The engine by its name on the command line and in files; None for "auto".
 
+    Raises:
+      InputError: no engine has this name.
+
     Examples:
       >>> engine_named("numba"), engine_named("auto")
       (Numba(), None)
     """
-    return {"auto": None, **{kind.name: kind() for kind in (Jax, Numba, Pallas)}}[name]
+    engines: dict[str, Engine | None] = {"auto": None, **{kind.name: kind() for kind in (Jax, Numba, Pallas)}}
+    if str(name) not in engines:
+        raise InputError(f"engine must be {', '.join(engines)}, not {short_repr(name)}.")
+    return engines[str(name)]
 
 
 @jax.tree_util.register_dataclass

@@ -104,8 +104,11 @@ def _solver_of(data: xr.Dataset) -> Any:
     """The solver that was asked for; name and numbers where its class is not of this package."""
     from jaxgran.contact.projected_methods import SOLVERS
 
-    name, numbers = data.attrs["solver_requested"], data.attrs["solver_parameters"]
-    return SOLVERS[name](**json.loads(numbers)) if name in SOLVERS else f"{name} {numbers}"
+    name, numbers = str(data.attrs["solver_requested"]), str(data.attrs["solver_parameters"])
+    try:
+        return SOLVERS[name](**json.loads(numbers)) if name in SOLVERS else f"{name} {numbers}"
+    except (TypeError, json.JSONDecodeError):
+        raise InputError(f"solver_parameters must be those of {name}, not {short_repr(numbers)}.") from None
 
 
 def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None, str]:
