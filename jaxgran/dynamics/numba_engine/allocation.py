@@ -14,7 +14,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from jaxgran.dynamics.numba_engine.compilation import compiled
+from jaxgran.dynamics.numba_engine.compilation import inline_njit
 from jaxgran.dynamics.numba_engine.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
 from jaxgran.dynamics.tally import NUMBERS
 
@@ -59,7 +59,7 @@ integers, doubles = _array_of(types.int64), _array_of(types.float64)
 _signed, _unsigned = _array_of(types.int32), _array_of(types.uint32)
 
 
-@compiled
+@inline_njit
 def _part(memory, items, size):
     """The address of a part for so many items of so many bytes; ``memory`` is (1,), the address of what is left."""
     address = memory[0]
@@ -67,7 +67,7 @@ def _part(memory, items, size):
     return address
 
 
-@compiled
+@inline_njit
 def _pairs_of(memory, count):
     room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
     slots, cells = (room + LANES) // LANES * LANES, max(9, 2 * count)
@@ -87,7 +87,7 @@ def _pairs_of(memory, count):
     )
 
 
-@compiled
+@inline_njit
 def _network_of(memory, count):
     """Contacts of discs form a planar graph, so there are at most 3 N of them."""
     size = 3 * count
@@ -102,7 +102,7 @@ def _network_of(memory, count):
     )
 
 
-@compiled
+@inline_njit
 def _clusters_of(memory, count, turns):
     """``turns`` is memory of others, which the solver may change."""
     size = 3 * count
@@ -122,7 +122,7 @@ def _clusters_of(memory, count, turns):
     )
 
 
-@compiled
+@inline_njit
 def arrays_of(memory, count):
     """All arrays for so many grains, as they are before the first step, and whether the block has room for them.
 

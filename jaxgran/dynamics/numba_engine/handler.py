@@ -6,11 +6,12 @@ and results are (size, extensions, count, types, pointers); a buffer is (size, e
 frame that comes with an extension asks for the version that is spoken.
 """
 
+import numba
 from llvmlite import binding as llvm
-from numba import njit, types
+from numba import types
 
 from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles, integers
-from jaxgran.dynamics.numba_engine.compilation import OPTIONS, compiled
+from jaxgran.dynamics.numba_engine.compilation import OPTIONS, inline_njit
 from jaxgran.dynamics.numba_engine.layout import CAPACITY, INPUTS, RESULTS, STATUS
 from jaxgran.dynamics.numba_engine.loop import advance_loop
 
@@ -29,18 +30,18 @@ define i64 @%s(i64 %%frame) {
 _VERSION = 4  # word of the interface: the minor version in the upper half, and the major one, 0, in the lower
 
 
-@compiled
+@inline_njit
 def _word(address, k):
     """Word k of a structure."""
     return integers(address, (k + 1,))[k]
 
 
-@compiled
+@inline_njit
 def _data(buffers, k):
     return _word(_word(buffers, k), _DATA)
 
 
-@compiled
+@inline_njit
 def _length(buffers, k, axis):
     return _word(_word(_word(buffers, k), _DIMS), axis)
 
@@ -80,7 +81,7 @@ def _handler(frame, stop):
 
 def object_code(symbol: str, stop: str, machine: llvm.TargetMachine) -> bytes:
     """The handler and all that it calls as an object file for a processor, with the word that stops it."""
-    made = njit(types.int64(types.int64, types.int64), **OPTIONS)(_handler)
+    made = numba.njit(types.int64(types.int64, types.int64), **OPTIONS)(_handler)
     (kept,) = made.overloads.values()
     (code,) = made.inspect_llvm().values()
     module = llvm.parse_assembly(code + _ENTRY % (stop, symbol, kept.fndesc.mangled_name, stop))
