@@ -85,7 +85,7 @@ def _advance_jvp(
 
 
 def register_numba() -> None:
-    """Tell XLA where the numba engine is, which is compiled at its first use."""
+    """Register the numba engine with XLA; it is compiled at its first use on a machine."""
     from jaxgran.dynamics.numba_engine import ffi
 
     ffi.register()
@@ -100,7 +100,7 @@ def numba(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
 def call_numba(
     flow: ShearFlow, state: State, steps: Array, solved: Array | int = 0, room: int = 0
 ) -> tuple[State, RunningSums, Array, Array]:
-    """What one call of the numba engine leaves.
+    """Run the numba engine once.
 
     Args:
       flow, state, steps: as in ``advance``.
@@ -108,7 +108,7 @@ def call_numba(
       room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
 
     Returns:
-      The state at the end, the running sums, the results in the order of ``numba.layout``, and the records.
+      The state at the end, the running sums, the results in the order of ``numba_engine.layout``, and the records.
     """
     from jaxgran.dynamics.numba_engine import layout
     from jaxgran.dynamics.numba_engine.ffi import TARGET

@@ -14,7 +14,7 @@ from jaxgran.contact import law
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract"},
-    "_nrt": False,  # no runtime of numba, which would have to be imported
+    "_nrt": False,  # private, but no public option leaves out the calls into numba's runtime, which is not loaded
     "no_cpython_wrapper": True,  # nothing here is called from Python
     "no_cfunc_wrapper": True,
 }
