@@ -9,6 +9,7 @@ printed and written as JSON and PNG. Compilation is reported apart.
 """
 
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp

@@ -1,14 +1,18 @@
 """The numba engine is compiled anew when any of its sources changes, and runs without a place to keep it."""
 
 import os
+import re
 import shutil
 from pathlib import Path
 
+import jax
+import jaxlib
 import pytest
 
 import jaxgran
-from jaxgran.dynamics.numba_engine import ffi
+from jaxgran.dynamics.numba_engine import ffi, handler
 from jaxgran.files import read_cached, write_cached
+from jaxgran.model.checks import InputError
 
 PACKAGE = Path(jaxgran.__file__).parent
 
@@ -45,7 +49,7 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
     assert ffi.object_file() == kept
     compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
     imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
-    assert compiled_here | imported <= set(sources)
+    assert compiled_here and compiled_here | imported <= set(sources)
 
 
 def test_a_constant_and_a_function_of_other_folders_change_the_file(of_copy: Path) -> None:
@@ -95,3 +99,58 @@ def test_a_cache_that_cannot_be_written_is_an_error_of_the_file_system(tmp_path:
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(OSError):
         write_cached(tmp_path / "file" / "numba" / "code.o", b"code", 1)
+
+
+def words(structure: str) -> dict[str, int]:
+    """Offset of each field of a structure of XLA's C interface in words, as the header of this jaxlib has it."""
+    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text(encoding="utf-8")
+    header = re.sub(r"//.*", "", header)
+    body = re.search(rf"struct {structure} {{(.*?)}}", header, re.DOTALL)
+    offset, found = 0, {}
+    for kind, name in re.findall(r"(\w+ ?\**) ?(\w+);", body[1]):
+        found[name] = offset
+        nested = f"struct {kind.strip()} {{" in header  # not a pointer
+        offset += len(words(kind.strip())) if nested else 1
+    return found
+
+
+def test_the_handler_reads_the_call_frame_where_this_jaxlib_has_it() -> None:
+    frame, buffer = words("XLA_FFI_CallFrame"), words("XLA_FFI_Buffer")
+    assert frame["extension_start"] == handler.EXTENSION_START
+    assert frame["args"] + words("XLA_FFI_Args")["args"] == handler.ARGS
+    assert frame["rets"] + words("XLA_FFI_Rets")["rets"] == handler.RETS
+    assert (buffer["data"], buffer["dims"]) == (handler.DATA, handler.DIMS)
+    assert words("XLA_FFI_Metadata_Extension")["metadata"] == handler.METADATA
+    assert words("XLA_FFI_Metadata")["api_version"] + words("XLA_FFI_Api_Version")["major_version"] == (
+        handler.API_VERSION
+    )
+
+
+def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str, *_: object, **__: object) -> None:
+        raise jax.errors.JaxRuntimeError(f"handler registration for {name} failed")
+
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
+    with pytest.raises(InputError, match=f"engine must be jax with jaxlib {jaxlib.__version__}, not numba: handler"):
+        ffi._register.__wrapped__()
+
+
+@pytest.mark.slow
+def test_a_changed_constant_and_a_changed_function_take_effect(copy: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    before, _ = outcome(copy, cache)
+    assert before.startswith("deep_overlap ")
+    changed(copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
+    after, _ = outcome(copy, cache)
+    assert after == before.replace("deep_overlap", "ok")
+    changed(copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
+    status, overlap = outcome(copy, cache)[0].split()
+    assert status == "ok" and float(overlap) == 2 * float(before.split()[1])
+
+
+@pytest.mark.slow
+def test_a_process_without_a_cache_compiles_for_itself(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    found, told = outcome(PACKAGE.parent, tmp_path / "file")
+    assert found.startswith("deep_overlap ")
+    assert "the numba engine is compiled anew in every process" in told and "cannot be written" in told

@@ -94,7 +94,7 @@ def _advance_compiled_jvp(
 
 
 def register_numba() -> None:
-    """Tell XLA where the numba engine is, which is compiled at its first use."""
+    """Register the numba engine with XLA; it is compiled at its first use on a machine."""
     from jaxgran.dynamics.numba_engine import ffi
 
     ffi.register()
@@ -117,7 +117,7 @@ def call_numba(
       room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
 
     Returns:
-      The state at the end, the running sums, the results in the order of ``numba.layout``, and the records.
+      The state at the end, the running sums, the results in the order of ``numba_engine.layout``, and the records.
     """
     from jaxgran.dynamics.numba_engine import layout
     from jaxgran.dynamics.numba_engine.ffi import TARGET

@@ -1,4 +1,4 @@
-"""The engine for processors: one loop of numba engine, compiled by numba and called by XLA.
+"""The engine for processors: one time loop, compiled by numba and called by XLA.
 
 It imports `contact` and `model`, and the table of the running sums. Begin with `loop`.
 """

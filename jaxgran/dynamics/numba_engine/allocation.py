@@ -1,7 +1,7 @@
 """The arrays of the numba engine, cut from one block of memory.
 
-XLA provides the block with the results of a call. So the numba engine never asks for memory, and needs nothing of the
-runtime of its compiler.
+XLA provides the block with the results of a call. So the numba engine never allocates, and needs no runtime of numba.
+That is why an intrinsic makes the arrays, by ``numba.np.arrayobj``: the public ``numba.carray`` needs the runtime.
 """
 
 # pyright: reportCallIssue=false
@@ -14,7 +14,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-from jaxgran.dynamics.numba_engine.compilation import compiled
+from jaxgran.dynamics.numba_engine.compilation import inline_njit
 from jaxgran.dynamics.numba_engine.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
 from jaxgran.dynamics.tally import NUMBERS
 
@@ -33,7 +33,7 @@ class Arrays(NamedTuple):
 
 
 def _array_of(kind: types.Type) -> Any:
-    """A function of an address and a shape, for the array of this kind there; nobody counts its references."""
+    """An intrinsic ``array(address, shape)``: an array of this dtype over existing memory, without reference counts."""
 
     @intrinsic
     def array(context, address, shape):
@@ -55,89 +55,90 @@ def _array_of(kind: types.Type) -> Any:
     return array
 
 
-integers, doubles = _array_of(types.int64), _array_of(types.float64)
-_signed, _unsigned = _array_of(types.int32), _array_of(types.uint32)
+integers_at, doubles_at = _array_of(types.int64), _array_of(types.float64)
+_signed_at, _unsigned_at = _array_of(types.int32), _array_of(types.uint32)
 
 
-@compiled
-def _part(memory, items, size):
-    """The address of a part for so many items of so many bytes; ``memory`` is (1,), the address of what is left."""
+@inline_njit
+def _reserve(memory, count, size):
+    """Bump allocator: reserve ``count * size`` bytes; ``memory`` is (1,), the address of the first free byte."""
     address = memory[0]
-    memory[0] += (items * size + 7) // 8 * 8
+    memory[0] += (count * size + 7) // 8 * 8
     return address
 
 
-@compiled
+@inline_njit
 def _pairs_of(memory, count):
     room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
     slots, cells = (room + LANES) // LANES * LANES, max(9, 2 * count)
     return Pairs(
-        _unsigned(_part(memory, 2 * slots, 4), (2, slots)),
-        doubles(_part(memory, 2 * slots, 8), (2, slots)),
-        _signed(_part(memory, 3 * slots, 4), (3, slots)),
-        _unsigned(_part(memory, 2 * room, 4), (2 * room,)),
-        _unsigned(_part(memory, count + 1, 4), (count + 1,)),
-        _unsigned(_part(memory, cells + 1, 4), (cells + 1,)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        doubles(_part(memory, 3 * count, 8), (3, count)),
-        _unsigned(_part(memory, slots, 4), (slots,)),
-        doubles(_part(memory, 5 * LANES, 8), (5, LANES)),
-        _signed(_part(memory, 3 * LANES, 4), (3, LANES)),
+        _unsigned_at(_reserve(memory, 2 * slots, 4), (2, slots)),
+        doubles_at(_reserve(memory, 2 * slots, 8), (2, slots)),
+        _signed_at(_reserve(memory, 3 * slots, 4), (3, slots)),
+        _unsigned_at(_reserve(memory, 2 * room, 4), (2 * room,)),
+        _unsigned_at(_reserve(memory, count + 1, 4), (count + 1,)),
+        _unsigned_at(_reserve(memory, cells + 1, 4), (cells + 1,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        doubles_at(_reserve(memory, 3 * count, 8), (3, count)),
+        _unsigned_at(_reserve(memory, slots, 4), (slots,)),
+        doubles_at(_reserve(memory, 5 * LANES, 8), (5, LANES)),
+        _signed_at(_reserve(memory, 3 * LANES, 4), (3, LANES)),
     )
 
 
-@compiled
+@inline_njit
 def _network_of(memory, count):
     """Contacts of discs form a planar graph, so there are at most 3 N of them."""
     size = 3 * count
     return Network(
-        _unsigned(_part(memory, size, 4), (size,)),
-        _unsigned(_part(memory, 2 * size, 4), (2, size)),
-        doubles(_part(memory, 5 * size, 8), (5, size)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        _signed(_part(memory, count, 4), (count,)),
-        _signed(_part(memory, count, 4), (count,)),
-        doubles(_part(memory, 2 * count, 8), (count, 2)),
+        _unsigned_at(_reserve(memory, size, 4), (size,)),
+        _unsigned_at(_reserve(memory, 2 * size, 4), (2, size)),
+        doubles_at(_reserve(memory, 5 * size, 8), (5, size)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _signed_at(_reserve(memory, count, 4), (count,)),
+        _signed_at(_reserve(memory, count, 4), (count,)),
+        doubles_at(_reserve(memory, 2 * count, 8), (count, 2)),
     )
 
 
-@compiled
+@inline_njit
 def _clusters_of(memory, count, turns):
-    """``turns`` is memory of others, which the solver may change."""
+    """``turns`` is an array of the network, which the solver may overwrite."""
     size = 3 * count
     return Clusters(
-        _unsigned(_part(memory, size, 4), (size,)),
-        _unsigned(_part(memory, size + 1, 4), (size + 1,)),
-        _unsigned(_part(memory, 2 * size, 4), (2 * size,)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        _signed(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, size, 4), (size,)),
-        _unsigned(_part(memory, 2 * size, 4), (size, 2)),
-        doubles(_part(memory, 8 * size, 8), (size, 8)),
-        doubles(_part(memory, 5 * size, 8), (size, 5)),
+        _unsigned_at(_reserve(memory, size, 4), (size,)),
+        _unsigned_at(_reserve(memory, size + 1, 4), (size + 1,)),
+        _unsigned_at(_reserve(memory, 2 * size, 4), (2 * size,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _signed_at(_reserve(memory, count, 4), (count,)),
+        _unsigned_at(_reserve(memory, size, 4), (size,)),
+        _unsigned_at(_reserve(memory, 2 * size, 4), (size, 2)),
+        doubles_at(_reserve(memory, 8 * size, 8), (size, 8)),
+        doubles_at(_reserve(memory, 5 * size, 8), (size, 5)),
         turns,
-        doubles(_part(memory, 3 * count, 8), (count, 3)),
+        doubles_at(_reserve(memory, 3 * count, 8), (count, 3)),
     )
 
 
-@compiled
+@inline_njit
 def arrays_of(memory, count):
-    """All arrays for so many grains, as they are before the first step, and whether the block has room for them.
+    """All arrays for ``count`` grains, as they are before the first step, and whether the block has room for them.
 
     ``memory`` is (1,), the address of a block of ``WORDS + WORDS_PER_GRAIN · count`` words.
     """
     end = memory[0] + 8 * (WORDS + WORDS_PER_GRAIN * count)
-    grains = Grains(doubles(_part(memory, 4 * count, 8), (count, 4)), doubles(_part(memory, 2 * count, 8), (count, 2)))
+    motion, constants = _reserve(memory, 4 * count, 8), _reserve(memory, 2 * count, 8)
+    grains = Grains(doubles_at(motion, (count, 4)), doubles_at(constants, (count, 2)))
     pairs, network = _pairs_of(memory, count), _network_of(memory, count)
     clusters = _clusters_of(memory, count, network.kicks)  # the kicks are gathered after the solves
     order = Order(
-        _unsigned(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, count, 4), (count,)),
-        _unsigned(_part(memory, count + 2, 4), (count + 2,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _unsigned_at(_reserve(memory, count, 4), (count,)),
+        _unsigned_at(_reserve(memory, count + 2, 4), (count + 2,)),
     )
-    step_sums = doubles(_part(memory, NUMBERS, 8), (NUMBERS,))
+    step_sums = doubles_at(_reserve(memory, NUMBERS, 8), (NUMBERS,))
     fits = memory[0] <= end
     for g in range(count if fits else 0):
         network.degree[g] = network.loaded[g] = 0

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import LAW, compiled
+from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     ACROSS,
     BEGINS,
@@ -34,7 +34,7 @@ _NEVER = float(NEVER)
 _TOGETHER = 8  # pairs whose steps are computed together
 
 
-@compiled
+@inline_njit
 def pair_motion(p, t, flow, grains, pairs):
     """Both grains of a pair, its separation at the time t since the search, and its relative velocity."""
     motion, images = grains.motion, pairs.images
@@ -46,7 +46,7 @@ def pair_motion(p, t, flow, grains, pairs):
     return i, j, dx, dy, ux, uy
 
 
-@compiled
+@inline_njit
 def predict_contact_steps(count, t, earliest, horizon, flow, grains, pairs):
     """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are not struck.
 
@@ -71,7 +71,7 @@ def predict_contact_steps(count, t, earliest, horizon, flow, grains, pairs):
             calendar[ENDS, p] = entries[ENDS, n]
 
 
-@compiled
+@inline_njit
 def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     """The entries of the calendar of a pair."""
     dt, theta = flow.dt, flow.theta
@@ -97,14 +97,14 @@ def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
     )
 
 
-@compiled
+@inline_njit
 def _as_step(number):
     """The number as a step of the calendar: -1 for what is past or no number, and never beyond its end."""
     number = number if number > -1.0 else -1.0
     return number if number < MANY else MANY
 
 
-@compiled
+@inline_njit
 def clear_calendar(found, pairs):
     """Fill the slots behind the pairs found up to whole ``LANES``; returns the number of these blocks."""
     blocks = (found + LANES - 1) // LANES
@@ -113,7 +113,7 @@ def clear_calendar(found, pairs):
     return blocks
 
 
-@compiled
+@inline_njit
 def next_contact_step(blocks, pairs):
     """The next step in which some contact approaches."""
     calendar = pairs.calendar
@@ -123,7 +123,7 @@ def next_contact_step(blocks, pairs):
     return strike
 
 
-@compiled
+@inline_njit
 def contacts_of_step(k, blocks, pairs, met):
     """Write the pairs that are contacts in a step; more than there is room for are counted, not kept."""
     calendar = pairs.calendar

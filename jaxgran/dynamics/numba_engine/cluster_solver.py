@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from jaxgran.contact.law import JAMMED_RESPONSE, LONGEST_STRIDE, PROGRESS, WINDOW
-from jaxgran.dynamics.numba_engine.compilation import LAW, called, compiled
+from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     BEST,
@@ -49,7 +49,7 @@ _PARTS = 8
 _RELAXATION = np.minimum(1 + 0.075 * np.log2(np.maximum(np.arange(641), 1)), 1.7)
 
 
-@compiled
+@inline_njit
 def solve_cluster(m, target, most_iterations, grains, network, clusters):
     """Write the impulses p₀ of cluster m at restitution zero.
 
@@ -78,7 +78,7 @@ def solve_cluster(m, target, most_iterations, grains, network, clusters):
     return iterations, squared, outcome
 
 
-@compiled
+@inline_njit
 def _take_contacts(start, size, grains, network, clusters):
     """Write what the contacts of a cluster bring to the solver, one of each part of the cluster in turn."""
     source, places, ends, rows, turns = clusters.source, clusters.places, clusters.ends, clusters.rows, clusters.turns
@@ -105,7 +105,7 @@ def _take_contacts(start, size, grains, network, clusters):
             n = np.uint64(start) + begin
 
 
-@called
+@njit
 def _is_jammed(size, clusters):
     """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at a solution."""
     rows, ends, turns = clusters.rows, clusters.ends, clusters.turns
@@ -118,7 +118,7 @@ def _is_jammed(size, clusters):
     return moved < JAMMED_RESPONSE * felt
 
 
-@compiled
+@inline_njit
 def _sweep(size, target, most_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared residual.
 
@@ -154,7 +154,7 @@ def _sweep(size, target, most_sweeps, clusters):
     return sweeps, squared
 
 
-@called
+@njit
 def _descend(size, target, most_iterations, clusters):
     """The guarded method of Barzilai and Borwein, from the impulses where the sweeps ended.
 

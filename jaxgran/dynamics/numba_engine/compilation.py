@@ -6,29 +6,29 @@ from collections.abc import Callable
 from types import FunctionType, ModuleType
 from typing import Any
 
+import numba
 import numpy as np
-from numba import njit
 
 from jaxgran.contact import law
 
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"contract"},
-    "_nrt": False,  # no runtime of numba, which would have to be imported
+    "_nrt": False,  # private, but no public option leaves out the calls into numba's runtime, which is not loaded
     "no_cpython_wrapper": True,  # nothing here is called from Python
     "no_cfunc_wrapper": True,
 }
-# Arrays are handed on by value, some hundred words a call, so what runs in every step becomes part of its caller.
-compiled: Callable[[Callable], Any] = njit(forceinline=True, **OPTIONS)
-called: Callable[[Callable], Any] = njit(**OPTIONS)  # what runs seldom
+# Structures of arrays are passed by value, some hundred words a call, so functions of every step are inlined.
+inline_njit: Callable[[Callable], Any] = numba.njit(forceinline=True, **OPTIONS)
+njit: Callable[[Callable], Any] = numba.njit(**OPTIONS)  # functions that are seldom called
 
 
-@compiled
+@inline_njit
 def _where(condition, yes, no):
     return yes if condition else no
 
 
-@compiled
+@inline_njit
 def _maximum(a, b):
     return a if a > b else b
 
@@ -40,7 +40,7 @@ def _compiled_law(module: ModuleType) -> dict[str, Any]:
         name: f for name, f in inspect.getmembers(module, inspect.isfunction) if f.__module__ == module.__name__
     }
     for name, function in functions.items():
-        names[name] = compiled(FunctionType(function.__code__, names, name))
+        names[name] = inline_njit(FunctionType(function.__code__, names, name))
     return {name: names[name] for name in functions}
 
 

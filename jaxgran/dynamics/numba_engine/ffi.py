@@ -1,8 +1,8 @@
-"""The numba engine for XLA: compiled once, kept as an object file, and registered as a foreign function.
+"""Loads the numba engine from an object file, compiles it if there is none, and registers it with XLA.
 
 The name of the file is a hash of all that its content depends on: the sources that are compiled together, the compiler
-and the processor. So a change in any of them compiles anew, in a user's cache and in the tests. A kept file is loaded
-without the compiler. If the cache cannot be written, every process compiles, with a warning.
+and the processor. So a change in any of them gives another file, in a user's cache and in the tests. An object file is
+loaded without importing numba. If the cache cannot be written, every process compiles, with a warning.
 """
 
 import ctypes
@@ -23,11 +23,12 @@ from llvmlite import binding as llvm
 
 from jaxgran.caches import cache_folder, users_folder
 from jaxgran.files import file_lock, read_cached, write_cached
+from jaxgran.model.checks import InputError
 
 TARGET = "jaxgran_advance"
-_STOP = "jaxgran_stop"  # a word in the memory of the numba engine; it runs while this is zero
+_STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is zero
 _LOCK = Lock()
-_MOST_KEPT = 8  # versions of the numba engine in the cache
+_MOST_KEPT = 8  # object files in the cache
 _IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
@@ -48,7 +49,7 @@ def sources() -> list[Path]:
 
 
 def object_file() -> Path:
-    """Where the numba engine is kept: in the folder of the caches, or in that of numba's environment variable."""
+    """Path of the object file: in the cache folder, or in that of numba's environment variable."""
     words = [version("numba"), version("llvmlite"), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()]
     digest = hashlib.sha256("\n".join([*words, os.environ.get("NUMBA_OPT", "")]).encode())
     for path in sources():
@@ -58,7 +59,11 @@ def object_file() -> Path:
 
 
 def register() -> None:
-    """Compile the numba engine, or load what is kept of it, and tell XLA where it is; once in a process."""
+    """Load the numba engine, or compile it, and register it with XLA; once in a process.
+
+    Raises:
+      InputError: this jaxlib does not support the version of the foreign function interface that the engine reads.
+    """
     with _LOCK:
         _register()
 
@@ -80,13 +85,14 @@ def _register() -> None:
     engine.finalize_object()
     _ENGINES.append(engine)
     _STOP_WORDS.append(ctypes.c_int64.from_address(engine.get_global_value_address(_STOP)))
-    new = ctypes.pythonapi.PyCapsule_New
-    new.restype, new.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    jax.ffi.register_ffi_target(TARGET, new(engine.get_function_address(TARGET), None, None), platform="cpu")
+    try:
+        jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(engine.get_function_address(TARGET)), platform="cpu")
+    except jax.errors.JaxRuntimeError as error:
+        raise InputError(f"engine must be jax with jaxlib {version('jaxlib')}, not numba: {error}") from error
 
 
 def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
-    """The numba engine, compiled and kept if possible."""
+    """Compile the numba engine, and write the object file if possible."""
     from jaxgran.dynamics.numba_engine.handler import object_code
 
     content = object_code(TARGET, _STOP, machine)
@@ -96,7 +102,7 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
         if parent_process() is not None:  # which warns too
             return content
         warnings.warn(
-            f"the numba engine is compiled anew in every process, in about 15 s: the cache folder "
+            "the numba engine is compiled anew in every process, in about 15 s: the cache folder "
             f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
             "one that can.",
             stacklevel=3,
@@ -106,7 +112,7 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
 
 @contextmanager
 def stopped() -> Iterator[None]:
-    """All numba engine that runs in this process ends within the block, with the status ``failed``."""
+    """Within this block every running call of the numba engine ends, with the status ``failed``."""
     for word in _STOP_WORDS:
         word.value = 1
     try:
@@ -116,5 +122,5 @@ def stopped() -> Iterator[None]:
             word.value = 0
 
 
-_ENGINES: list[llvm.ExecutionEngine] = []  # of this process; they own the memory of the numba engine
+_ENGINES: list[llvm.ExecutionEngine] = []  # they own the memory of the loaded code
 _STOP_WORDS: list[ctypes.c_int64] = []

@@ -1,21 +1,41 @@
-"""The numba engine as XLA calls it, through its foreign function interface, and its compilation to an object file.
+"""The function that XLA calls, and its compilation. Only this file knows XLA's binary interface.
 
-A call frame and its buffers are structures of words of eight bytes, see ``xla/ffi/api/c_api.h``, whose layout is kept
-from version to version. A frame is (size, extensions, interface, context, stage, arguments, results, ...); arguments
-and results are (size, extensions, count, types, pointers); a buffer is (size, extensions, dtype, data, rank, dims). A
-frame that comes with an extension asks for the version that is spoken.
+It reads version 0.2 of the C interface of XLA's foreign functions, ``xla/ffi/api/c_api.h`` in the folder
+``jax.ffi.include_dir()``. ``jax.ffi`` registers the address of a compiled function, which must decode this interface
+itself; the decoder that comes with jaxlib needs a C++ compiler. Structures are read in words of eight bytes:
+
+==============================  ========================================================
+structure                       words
+==============================  ========================================================
+``XLA_FFI_CallFrame``           1 extension_start, 9 args.args, 14 rets.rets
+``XLA_FFI_Buffer``              3 data, 5 dims
+``XLA_FFI_Extension_Base``      1 type, in the lower half
+``XLA_FFI_Metadata_Extension``  3 metadata
+``XLA_FFI_Metadata``            3 api_version: major in the lower half, minor in the upper
+==============================  ========================================================
+
+These words are the same in versions 0.2 to 0.4, which jaxlib 0.9 to 0.11 speak. When the function is registered, XLA
+calls it with a metadata extension, and asks for the version that it was written for. XLA refuses one that it no longer
+supports, and then `ffi.register` raises an InputError.
 """
 
+import numba
 from llvmlite import binding as llvm
-from numba import njit, types
+from numba import types
 
-from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles, integers
-from jaxgran.dynamics.numba_engine.compilation import OPTIONS, compiled
+from jaxgran.dynamics.numba_engine.allocation import arrays_of, doubles_at, integers_at
+from jaxgran.dynamics.numba_engine.compilation import OPTIONS, inline_njit
 from jaxgran.dynamics.numba_engine.layout import CAPACITY, INPUTS, RESULTS, STATUS
 from jaxgran.dynamics.numba_engine.loop import advance_loop
 
-_EXTENSIONS, _INTERFACE, _ARGUMENTS, _RESULTS = 1, 2, 9, 14  # words of a frame
-_DATA, _DIMS = 3, 5  # words of a buffer
+API_MAJOR, API_MINOR = 0, 2
+EXTENSION_START, ARGS, RETS = 1, 9, 14  # words of a call frame
+DATA, DIMS = 3, 5  # words of a buffer
+_TYPE, METADATA = 1, 3  # words of an extension
+API_VERSION = 3  # word of the metadata
+_METADATA_EXTENSION = 1  # type of the extension that asks for the metadata
+
+# numba returns through a pointer, and passes exceptions through another; nothing here raises one.
 _ENTRY = """
 @%s = global i64 0
 define i64 @%s(i64 %%frame) {
@@ -25,37 +45,39 @@ define i64 @%s(i64 %%frame) {
   %%returned = load i64, ptr %%result
   ret i64 %%returned
 }
-"""  # numba returns through a pointer; nothing here raises an exception
-_VERSION = 4  # word of the interface: the minor version in the upper half, and the major one, 0, in the lower
+"""
 
 
-@compiled
+@inline_njit
 def _word(address, k):
-    """Word k of a structure."""
-    return integers(address, (k + 1,))[k]
+    """Word k of the structure at an address."""
+    return integers_at(address, (k + 1,))[k]
 
 
-@compiled
+@inline_njit
 def _data(buffers, k):
-    return _word(_word(buffers, k), _DATA)
+    return _word(_word(buffers, k), DATA)
 
 
-@compiled
+@inline_njit
 def _length(buffers, k, axis):
-    return _word(_word(_word(buffers, k), _DIMS), axis)
+    return _word(_word(_word(buffers, k), DIMS), axis)
 
 
 def _handler(frame, stop):
-    """``advance_loop``: arguments and results are buffers of a call frame; ``stop`` is the address of a word."""
-    extension = _word(frame, _EXTENSIONS)
-    if extension != 0:
-        metadata = integers(_word(extension, 3), (4,))
-        metadata[3] = _word(_word(frame, _INTERFACE), _VERSION) >> 32 << 32
+    """Call ``advance_loop`` with the buffers of a call frame; ``stop`` is the address of a word.
+
+    Returns 0, the null pointer, which XLA reads as success.
+    """
+    extension = _word(frame, EXTENSION_START)
+    if extension != 0 and _word(extension, _TYPE) & 0xFFFFFFFF == _METADATA_EXTENSION:
+        metadata = integers_at(_word(extension, METADATA), (API_VERSION + 1,))
+        metadata[API_VERSION] = API_MINOR << 32 | API_MAJOR
         return 0
-    given, made = _word(frame, _ARGUMENTS), _word(frame, _RESULTS)
-    grains = _length(given, 2, 0)
-    results, memory = doubles(_data(made, 2), (RESULTS,)), integers(_data(made, 3), (1,))
-    memory[0] = _data(made, 3) + 8  # what is left begins behind this number
+    args, rets = _word(frame, ARGS), _word(frame, RETS)
+    grains = _length(args, 2, 0)
+    results, memory = doubles_at(_data(rets, 2), (RESULTS,)), integers_at(_data(rets, 3), (1,))
+    memory[0] = _data(rets, 3) + 8  # the first free byte is behind this number
     arrays, fits = arrays_of(memory, grains)
     if not fits:  # the bounds in ``layout`` are wrong
         for n in range(RESULTS):
@@ -63,24 +85,30 @@ def _handler(frame, stop):
         results[STATUS] = CAPACITY
         return 0
     advance_loop(
-        doubles(_data(given, 0), (grains, 2)),
-        doubles(_data(given, 1), (grains, 2)),
-        doubles(_data(given, 2), (grains,)),
-        doubles(_data(given, 3), (grains,)),
-        doubles(_data(given, 4), (INPUTS,)),
-        doubles(_data(made, 0), (grains, 2)),
-        doubles(_data(made, 1), (grains, 2)),
+        doubles_at(_data(args, 0), (grains, 2)),
+        doubles_at(_data(args, 1), (grains, 2)),
+        doubles_at(_data(args, 2), (grains,)),
+        doubles_at(_data(args, 3), (grains,)),
+        doubles_at(_data(args, 4), (INPUTS,)),
+        doubles_at(_data(rets, 0), (grains, 2)),
+        doubles_at(_data(rets, 1), (grains, 2)),
         results,
-        doubles(_data(made, 4), (_length(made, 4, 0), _length(made, 4, 1))),
+        doubles_at(_data(rets, 4), (_length(rets, 4, 0), _length(rets, 4, 1))),
         arrays,
-        integers(stop, (1,)),
+        integers_at(stop, (1,)),
     )
     return 0
 
 
 def object_code(symbol: str, stop: str, machine: llvm.TargetMachine) -> bytes:
-    """The handler and all that it calls as an object file for a processor, with the word that stops it."""
-    made = njit(types.int64(types.int64, types.int64), **OPTIONS)(_handler)
+    """Compile the handler, and all that it calls, to an object file for a processor.
+
+    Args:
+      symbol: name of the function that XLA calls.
+      stop: name of the word that stops it.
+      machine: the processor.
+    """
+    made = numba.njit(types.int64(types.int64, types.int64), **OPTIONS)(_handler)
     (kept,) = made.overloads.values()
     (code,) = made.inspect_llvm().values()
     module = llvm.parse_assembly(code + _ENTRY % (stop, symbol, kept.fndesc.mangled_name, stop))

@@ -25,7 +25,7 @@ from jaxgran.dynamics.numba_engine.calendar import (
     predict_contact_steps,
 )
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
-from jaxgran.dynamics.numba_engine.compilation import LAW, called, compiled
+from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
     CAPACITY,
     EPSILON,
@@ -67,7 +67,7 @@ _PAIRS_PER_GRAIN = 2.7  # expected within the skin: wide lists cost the events, 
 _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 
-@called
+@njit
 def advance_loop(
     positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, records, arrays, stop
 ):
@@ -179,7 +179,7 @@ def advance_loop(
     results[STATUS], results[TILT], results[SOLVED], results[RECORDED] = status, tilt, solved, recorded
 
 
-@called
+@njit
 def _take_grains(positions, velocities, radii, masses, places, rate, grains):
     """Take the grains, with velocities of the laboratory; returns the largest diameter and whether all is finite."""
     motion, constants = grains.motion, grains.constants
@@ -195,7 +195,7 @@ def _take_grains(positions, velocities, radii, masses, places, rate, grains):
     return largest, finite
 
 
-@compiled
+@inline_njit
 def _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, results):
     """Solve the contacts of a step and add them to the sums; returns the number of their grains, and the status."""
     hits, squared_scale, deepest = make_network(contacts, t, flow, grains, pairs, network)
@@ -217,7 +217,7 @@ def _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, res
     return hits, outcome
 
 
-@compiled
+@inline_njit
 def _strike(hits, t, rate, grains, network, clusters, kinetic, fastest):
     """Change the velocities of the grains that were struck; returns the sums and the speed that follow from them.
 
@@ -246,7 +246,7 @@ def _strike(hits, t, rate, grains, network, clusters, kinetic, fastest):
     return (xx, xy, yy), fastest, finite
 
 
-@compiled
+@inline_njit
 def _list_struck(k, hits, contacts, overfull, pairs, network):
     """List the pairs of the struck grains, each once, for a new prediction; clears the impulses. Returns how many."""
     kicks, touched, loaded, met = network.kicks, network.touched, network.loaded, network.met
@@ -273,7 +273,7 @@ def _list_struck(k, hits, contacts, overfull, pairs, network):
     return np.int64(count)
 
 
-@compiled
+@inline_njit
 def _move(t, grains):
     """Move the grains to where they are at the time t since the search."""
     motion = grains.motion
@@ -282,7 +282,7 @@ def _move(t, grains):
         motion[g, Y] += motion[g, VY] * t
 
 
-@called
+@njit
 def _deliver(places, rate, grains, new_positions, new_velocities):
     """Positions and peculiar velocities of the grains, in the order in which they were given."""
     motion = grains.motion

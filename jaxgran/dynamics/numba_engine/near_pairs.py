@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from jaxgran.dynamics.numba_engine.compilation import called, compiled
+from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
 
 LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
@@ -12,13 +12,13 @@ _NARROWER = 12  # lists that are tried with ever narrower skins, where pairs are
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
 
-@compiled
+@inline_njit
 def skin_loss(fastest, rate, distance):
     """How much of its skin a list may lose in unit time, where pairs are within a distance."""
     return 2 * fastest * (1 + LIFE) + rate * distance / 2
 
 
-@called
+@njit
 def put_in_order(positions, side, tilt, order):
     """Write an order that keeps neighbours close in memory: row by row, where a flow outgrows the caches."""
     given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
@@ -40,7 +40,7 @@ def put_in_order(positions, side, tilt, order):
         starts[cells[g]] += 1
 
 
-@compiled
+@inline_njit
 def bring_into_cell(grains, side, tilt, rate):
     """Bring the grains into the cell, at the same peculiar velocities; returns the largest peculiar speed."""
     motion = grains.motion
@@ -56,7 +56,7 @@ def bring_into_cell(grains, side, tilt, rate):
     return math.sqrt(fastest)
 
 
-@called
+@njit
 def search(grains, pairs, side, tilt, largest, skin):
     """Write the pairs with a gap within a skin, which is made narrower where there is no room for all of them.
 
@@ -74,7 +74,7 @@ def search(grains, pairs, side, tilt, largest, skin):
     return kept, skin, found <= room
 
 
-@called
+@njit
 def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
     """Write the pairs with a gap within the skin, and their images; what there is no room for is only counted."""
     most = math.sqrt(pairs.starts.size - 1)
@@ -85,7 +85,7 @@ def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
     return _pairs_of_all(grains, pairs, side, tilt, skin, room)
 
 
-@compiled
+@inline_njit
 def _sort_into_cells(grains, pairs, side, tilt, up, along):
     """Sort the grains into cells row by row, those of a cell at ``starts[cell] : starts[cell + 1]``."""
     motion, constants = grains.motion, grains.constants
@@ -109,7 +109,7 @@ def _sort_into_cells(grains, pairs, side, tilt, up, along):
     starts[up * along] = motion.shape[0]
 
 
-@compiled
+@inline_njit
 def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
     """Pairs within each cell, with its right neighbour, and with the three above it."""
     starts, sorted_grains, places = pairs.starts, pairs.sorted, pairs.places
@@ -145,7 +145,7 @@ def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
     return found
 
 
-@compiled
+@inline_njit
 def _pairs_of_all(grains, pairs, side, tilt, skin, room):
     """Pairs of a cell that is too narrow for others within it, by nearest images."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
@@ -165,7 +165,7 @@ def _pairs_of_all(grains, pairs, side, tilt, skin, room):
     return found
 
 
-@compiled
+@inline_njit
 def _index_pairs(pairs, found):
     """The pairs of grain g are those in ``of_grain[offsets[g] : offsets[g + 1]]``."""
     ends, offsets, of_grain = pairs.ends, pairs.offsets, pairs.of_grain
@@ -186,7 +186,7 @@ def _index_pairs(pairs, found):
     offsets[0] = 0
 
 
-@compiled
+@inline_njit
 def kinetic_sums(grains, rate):
     """Σ m c_x c_x, Σ m c_x c_y and Σ m c_y c_y, just after a search."""
     motion, constants = grains.motion, grains.constants

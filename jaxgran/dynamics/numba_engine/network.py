@@ -3,7 +3,7 @@
 import math
 
 from jaxgran.dynamics.numba_engine.calendar import pair_motion
-from jaxgran.dynamics.numba_engine.compilation import compiled
+from jaxgran.dynamics.numba_engine.compilation import inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
@@ -19,7 +19,7 @@ from jaxgran.dynamics.numba_engine.layout import (
 )
 
 
-@compiled
+@inline_njit
 def make_network(contacts, t, flow, grains, pairs, network):
     """Write the contacts of a step and their grains; returns their number, Σ min(0, u⁻)² and the deepest overlap."""
     met, ends, rows, degree, touched = network.met, network.ends, network.rows, network.degree, network.touched
@@ -44,7 +44,7 @@ def make_network(contacts, t, flow, grains, pairs, network):
     return hits, scale, deepest
 
 
-@compiled
+@inline_njit
 def solve_isolated(contacts, grains, network):
     """Write the impulses of isolated pairs; returns the number of the other contacts."""
     ends, rows, degree, constants = network.ends, network.rows, network.degree, grains.constants
@@ -59,7 +59,7 @@ def solve_isolated(contacts, grains, network):
     return coupled
 
 
-@compiled
+@inline_njit
 def find_clusters(contacts, hits, network, clusters):
     """Find the clusters in which a contact approaches, each from such a contact outwards, neighbours after neighbours.
 
@@ -104,7 +104,7 @@ def find_clusters(contacts, hits, network, clusters):
     return found
 
 
-@compiled
+@inline_njit
 def gather_kicks(contacts, hits, one_plus_alpha, network):
     """Add up the impulses on every grain, and its contacts that carry one."""
     ends, rows, touched, kicks, loaded = network.ends, network.rows, network.touched, network.kicks, network.loaded

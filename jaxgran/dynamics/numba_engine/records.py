@@ -7,7 +7,7 @@ not wrapped. A list of near pairs begins with a record without contacts, so no f
 
 import math
 
-from jaxgran.dynamics.numba_engine.compilation import called
+from jaxgran.dynamics.numba_engine.compilation import njit
 from jaxgran.dynamics.numba_engine.layout import (
     ACTED,
     APPROACH,
@@ -30,7 +30,7 @@ from jaxgran.dynamics.numba_engine.layout import (
 )
 
 
-@called
+@njit
 def record_flight(record, step, acted, tilt, t, rate, grains, places):
     """Record the grains at the time t since the search, without contacts; ``acted``: whether those have been."""
     motion = grains.motion
@@ -43,7 +43,7 @@ def record_flight(record, step, acted, tilt, t, rate, grains, places):
         record[at + 2], record[at + 3] = motion[g, VX] - rate * y, motion[g, VY]
 
 
-@called
+@njit
 def record_contacts(record, contacts, one_plus_alpha, places, network):
     """Add the contacts of a step and their impulses to its record."""
     ends, rows = network.ends, network.rows

@@ -1,6 +1,6 @@
 """The running sums of the numba engine, in one row of numbers ordered by the table of ``dynamics.tally``."""
 
-from jaxgran.dynamics.numba_engine.compilation import LAW, compiled
+from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     APPROACH,
     DISTANCE,
@@ -27,7 +27,7 @@ _UNCONVERGED, _COUNTS = place_of("unconverged"), place_of("residual_counts")
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
-@compiled
+@inline_njit
 def add_flight(sums, steps, flight, turned, kinetic):
     """Add a flight of so many steps, with Σ m c ⊗ c at its beginning, and return that at its end.
 
@@ -43,7 +43,7 @@ def add_flight(sums, steps, flight, turned, kinetic):
     return xx + turned * (turned * yy - 2 * xy), xy - turned * yy, yy
 
 
-@compiled
+@inline_njit
 def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
     """Add what the contacts of one step contribute, by the law of a contact; ``step_sums`` is memory for it."""
     ends, rows, kicks, loaded, constants = network.ends, network.rows, network.kicks, network.loaded, grains.constants
@@ -79,7 +79,7 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
         sums[_FIRST_TERM + n] += step_sums[n]
 
 
-@compiled
+@inline_njit
 def add_solve(sums, iterations, residual, outcome, deepest):
     """Add one solve."""
     place = 0
