@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import EXACT, GRAINS, OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
+from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi

@@ -133,24 +133,3 @@ def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monk
     monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
     with pytest.raises(InputError, match=f"engine must be jax with jaxlib {jaxlib.__version__}, not numba: handler"):
         ffi._register.__wrapped__()
-
-
-@pytest.mark.slow
-def test_a_changed_constant_and_a_changed_function_take_effect(copy: Path, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    before, _ = outcome(copy, cache)
-    assert before.startswith("deep_overlap ")
-    changed(copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
-    after, _ = outcome(copy, cache)
-    assert after == before.replace("deep_overlap", "ok")
-    changed(copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
-    status, overlap = outcome(copy, cache)[0].split()
-    assert status == "ok" and float(overlap) == 2 * float(before.split()[1])
-
-
-@pytest.mark.slow
-def test_a_process_without_a_cache_compiles_for_itself(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    found, told = outcome(PACKAGE.parent, tmp_path / "file")
-    assert found.startswith("deep_overlap ")
-    assert "the numba engine is compiled anew in every process" in told and "cannot be written" in told
