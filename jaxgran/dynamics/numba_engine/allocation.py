@@ -61,7 +61,7 @@ _signed, _unsigned = _array_of(types.int32), _array_of(types.uint32)
 
 @compiled
 def _part(memory, items, size):
-    """The address of a part for so many items of so many bytes; ``memory`` is (1,), the address of what is left."""
+    """Bump allocator: reserve ``items * size`` bytes; ``memory`` is (1,), the next free address."""
     address = memory[0]
     memory[0] += (items * size + 7) // 8 * 8
     return address
@@ -103,8 +103,8 @@ def _network_of(memory, count):
 
 
 @compiled
-def _clusters_of(memory, count, turns):
-    """``turns`` is memory of others, which the solver may change."""
+def _clusters_of(memory, count, dv):
+    """Arrays of the solver; ``dv`` is shared with others."""
     size = 3 * count
     return Clusters(
         _unsigned(_part(memory, size, 4), (size,)),
@@ -117,7 +117,7 @@ def _clusters_of(memory, count, turns):
         _unsigned(_part(memory, 2 * size, 4), (size, 2)),
         doubles(_part(memory, 8 * size, 8), (size, 8)),
         doubles(_part(memory, 5 * size, 8), (size, 5)),
-        turns,
+        dv,
         doubles(_part(memory, 3 * count, 8), (count, 3)),
     )
 
