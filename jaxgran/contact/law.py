@@ -1,6 +1,6 @@
 """The law of a contact: arithmetic that every engine shares.
 
-These functions take numbers or arrays and have no branches on values. The plain engine and the thread block call them
+These functions take numbers or arrays and have no branches on values. The engines ``Jax`` and ``Pallas`` call them
 with arrays of JAX; the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What
 branches, such as the search for the next contact or a solver, is written for each engine, and tests compare them.
 

@@ -174,10 +174,8 @@ def _descend(size, target, most_iterations, clusters):
     for c in range(size):
         nx, ny = rows[c, MU_NX] * rows[c, INVERSE_MU], rows[c, MU_NY] * rows[c, INVERSE_MU]
         i, j = ends[c, FIRST], ends[c, SECOND]
-        inverse_mass_i, inverse_mass_j = (
-            rows[c, INVERSE_MU_MI] / rows[c, INVERSE_MU],
-            rows[c, INVERSE_MU_MJ] / rows[c, INVERSE_MU],
-        )
+        inverse_mass_i = rows[c, INVERSE_MU_MI] / rows[c, INVERSE_MU]
+        inverse_mass_j = rows[c, INVERSE_MU_MJ] / rows[c, INVERSE_MU]
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j

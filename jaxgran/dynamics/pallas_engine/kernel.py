@@ -1,6 +1,6 @@
 """The engine for NVIDIA GPUs: the advance of one replica as one kernel, with a thread for each grain.
 
-The plain engine starts a few dozen kernels in every step that it visits, and a batch waits for its slowest replica at
+The engine ``Jax`` starts a few dozen kernels in every step that it visits, and a batch waits for its slowest replica at
 each. Here all steps are in one kernel, written in Pallas. A replica goes at its own pace, and its numbers stay in
 registers and in the nearest caches.
 

@@ -21,9 +21,7 @@ from jaxgran.model.status import Status
 
 NEAR = 20  # near grains that a grain has room for
 X, Y, CX, CY, RADIUS, INVERSE_MASS, GIVEN = range(7)  # rows of what is given; the first four are those of ``shared``
-DV_X, DV_Y, WIDTH, SHARED = range(
-    4, 8
-)  # changes of velocity by impulses; the share λ/m of a grain in the spectral bound
+DV_X, DV_Y, WIDTH, SHARED = range(4, 8)  # changes of velocity; a grain's share λ/m in the spectral bound
 TOUCHING, LOADED, COUNTS = range(3)  # contacts of a grain, and those that carry an impulse
 NX, NY, APPROACH, DISTANCE, IMPULSE, RESPONSE, STEP, CHANGE, BEST, BOUND, NETWORK = range(11)  # of a contact
 
