@@ -58,8 +58,8 @@ MISTAKES = (
     Mistake(
         "mass of the other grain",
         "jaxgran/dynamics/numba_engine/cluster_solver.py",
-        "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mj, 0.0",
-        "rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mi, 0.0",
+        "rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = mobility * mi, mobility * mj, 0.0",
+        "rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = mobility * mi, mobility * mi, 0.0",
         "an impulse changes the velocity of a grain by its own mass",
         _ENGINES,
     ),
@@ -74,8 +74,8 @@ MISTAKES = (
     Mistake(
         "mean square of a strain",
         "jaxgran/contact/law.py",
-        "return xx - turned * xy + turned * turned / 3 * yy, xy - turned / 2 * yy, yy",
-        "return xx - turned * xy + turned * turned / 2 * yy, xy - turned / 2 * yy, yy",
+        "return xx - strain * xy + strain * strain / 3 * yy, xy - strain / 2 * yy, yy",
+        "return xx - strain * xy + strain * strain / 2 * yy, xy - strain / 2 * yy, yy",
         "the kinetic stress is the exact mean along a flight; all engines share this line, so they agree",
         ("test_tally.py", *_ENGINES),
     ),
@@ -98,8 +98,8 @@ MISTAKES = (
     Mistake(
         "sign of a changed approach",
         "jaxgran/contact/solver.py",
-        "wanted = jnp.where(pressing, -(turned + change.approach), 0)",
-        "wanted = jnp.where(pressing, -(turned - change.approach), 0)",
+        "wanted = jnp.where(pressing, -(response_change + change.approach), 0)",
+        "wanted = jnp.where(pressing, -(response_change - change.approach), 0)",
         "derivatives of the impulses are those of finite differences",
         ("test_gradients.py",),
     ),

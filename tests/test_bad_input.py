@@ -560,7 +560,7 @@ ALIKE = {
             for name in ("solver_requested", "activation", "engine_requested")
             for value in (3, "other", ["midpoint", "touching"])
         ],
-        *[("solver_parameters", value) for value in (2.0, "{", "[1]", '{"tolerance": 2.0}', '{"damping": 1.0}')],
+        *[("solver_parameters", value) for value in (2.0, "{", "[1]", '{"damping": 1.0}')],
         *[("equilibrate", value) for value in ("soon", -1.0, 1e30)],
         ("error", 7.0),
     ],

@@ -1,6 +1,6 @@
 """The law of a contact: arithmetic that every engine shares.
 
-These functions take numbers or arrays and have no branches on values. The plain engine and the thread block call them
+These functions take numbers or arrays and have no branches on values. The engines ``Jax`` and ``Pallas`` call them
 with arrays of JAX; the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What
 branches, such as the search for the next contact or a solver, is written for each engine, and tests compare them.
 
@@ -85,9 +85,9 @@ def flight_of(cx: Number, cy: Number, strain: Number, flight: Number, shear_rate
     return dx, cy * flight, cx - shear_rate * flight * cy
 
 
-def kinetic_means(xx: Number, xy: Number, yy: Number, turned: Number) -> tuple[Number, Number, Number]:
-    """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``turned``, in which c_x falls by γ̇ c_y t."""
-    return xx - turned * xy + turned * turned / 3 * yy, xy - turned / 2 * yy, yy
+def kinetic_means(xx: Number, xy: Number, yy: Number, strain: Number) -> tuple[Number, Number, Number]:
+    """Means of c_x c_x, c_x c_y and c_y c_y over a flight of strain ``strain``, in which c_x falls by γ̇ c_y t."""
+    return xx - strain * xy + strain * strain / 3 * yy, xy - strain / 2 * yy, yy
 
 
 def residual_target(scale: Number, tolerance: Number, shear_rate: Number, epsilon: Number) -> Number:
@@ -133,7 +133,7 @@ def contact_terms(
       overlap: overlap in σ, not negative.
       approach: relative normal velocity u⁻ before the step.
       half_change: half its change by the impulses, (u⁺ − u⁻)/2.
-      bounce: 1 + α.
+      one_plus_alpha: 1 + α.
       impulse, binary_impulse: p = (1 + α) p₀, and the same if the collision were binary.
       clustered: the impulse p where the contact is in a cluster, otherwise 0.
       used, loaded, approaching: 1 where it is a contact, carries an impulse, approaches; otherwise 0.

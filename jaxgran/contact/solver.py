@@ -155,13 +155,13 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
         return jnp.where(good, change, jnp.nan)
 
     change = tangents[0]
-    _, turned = jax.jvp(lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,))
-    wanted = jnp.where(pressing, -(turned + change.approach), 0)
+    _, response_change = jax.jvp(lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,))
+    wanted = jnp.where(pressing, -(response_change + change.approach), 0)
     impulse_change = lax.custom_linear_solve(of_pressing, wanted, solved, symmetric=True)
     none: Any = np.zeros((), jax.dtypes.float0)
     return solution, Solution(
         impulses=impulse_change,
-        response=turned + delassus_product(contacts, impulse_change, grains),
+        response=response_change + delassus_product(contacts, impulse_change, grains),
         residual=jnp.zeros_like(solution.residual),
         iterations=none,
         status=none,

@@ -34,7 +34,7 @@ class PairMotion(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What the time loop of the plain engine carries."""
+    """What the time loop of the engine ``Jax`` carries."""
 
     lists: PairLists
     pairs: PairMotion

@@ -1,4 +1,4 @@
-"""Ctrl-C while compiled code runs: the wait for its results ends at once, and so does the numba engine."""
+"""Ctrl-C while compiled code runs: the wait for its results ends at once, and the numba engine stops."""
 
 import sys
 import time
@@ -14,8 +14,8 @@ T = TypeVar("T")
 def waited(results: T) -> T:
     """The results when they are computed.
 
-    Ctrl-C, or whatever raises a KeyboardInterrupt, ends all numba engine of the process within a step of its flow.
-    The engine "jax" cannot be stopped: what it was asked for is computed beside what follows, and lost.
+    A KeyboardInterrupt, as by Ctrl-C, stops every run of the numba engine in this process within one step. The engine
+    ``Jax`` cannot be stopped: it finishes in the background, and its results are discarded.
     """
     try:
         return jax.block_until_ready(results)

@@ -1,7 +1,7 @@
-"""Advances one replica and sums what a function of the user's finds, with the numba engine or the engine "jax".
+"""Advances one replica and sums what a user's function observes, with the engine ``Numba`` or ``Jax``.
 
-The numba engine knows nothing of the function. It records the steps that it visits until its room is full; then JAX
-applies the function to the records, and the numba engine goes on. So only the function is compiled, and not an engine.
+The numba engine does not call the function. It records the steps that it visits until the buffer of records is full;
+then JAX applies the function to the records, and the engine continues. So only the function is compiled, not an engine.
 """
 
 from functools import partial

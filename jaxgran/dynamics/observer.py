@@ -1,4 +1,4 @@
-"""User sums: what a function of the user's finds in every time step, summed while the flow advances.
+"""User sums: what a user's function observes in every time step, summed while the flow advances.
 
 The engine jumps over the steps in which no contact approaches. Such a flight is observed once, at its beginning and
 without contacts, and counts as the number of its steps. A step whose contacts act is observed with their network and

@@ -139,7 +139,7 @@ class RunningSums(NamedTuple):
     solve      (numbers,)
     largest    (numbers,)
     status     ()           the worst status
-    user_sums  pytree       what a function of the user's has found, see ``observer``; () where there is none
+    user_sums  pytree       sums of what a user's function observes, see ``observer``; () without one
     =========  ===========  ========================================================================================
     """
 
@@ -156,7 +156,7 @@ class RunningSums(NamedTuple):
         return self._named("duration")
 
     def joined(self, later: "RunningSums") -> "RunningSums":
-        """These sums and those of what followed, but the user's, which are those of the latter."""
+        """Sum with a later segment; the user's sums come from that segment."""
         return RunningSums(
             self.flight + later.flight,
             self.contact + later.contact,

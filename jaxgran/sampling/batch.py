@@ -173,7 +173,7 @@ def advance_batch(flow: ShearFlow, numerics: Numerics, state: State, steps: Arra
 
 
 def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:
-    """The drive with a report of the replica-steps after each call; the drive itself without ``report``."""
+    """The same advance with a report of the replica-steps after each call; unchanged without ``report``."""
     if report is None:
         return drive
 

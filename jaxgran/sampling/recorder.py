@@ -22,11 +22,11 @@ Keep = Callable[[Snapshot, int], None]  # called with a frame and the number of 
 
 
 class Recorder:
-    """Takes frames of a replica while a drive advances it.
+    """Takes frames of a replica while it is advanced.
 
-    Frames are taken at the start and then at equal numbers of time steps. If a frame falls inside a call of the drive,
-    the call is made in two parts, and the sums differ by rounding. In a flow of many collisions, rounding leads to
-    another trajectory of the same flow. If all frames fall on the ends of calls, all results are the same bit for bit.
+    Frames are taken at the start and then at equal numbers of time steps. If a frame falls inside an advance, the
+    advance is split, and the sums differ by rounding. In a flow of many collisions, rounding leads to another trajectory
+    of the same flow. If all frames fall on the ends of advances, all results are the same bit for bit.
 
     Args:
       every: strain from frame to frame, rounded to whole time steps, at least one.
@@ -38,7 +38,7 @@ class Recorder:
         self.frames = self.steps = 0
 
     def recording(self, drive: AdvanceBatch) -> AdvanceBatch:
-        """A drive of a batch of one replica that records frames; the first call starts a new series."""
+        """The advance of a batch of one replica, recording frames; the first call starts a new series."""
         self.frames = self.steps = 0
         return partial(self._driven, drive)
 

@@ -103,8 +103,8 @@ def _network_of(memory, count):
 
 
 @inline_njit
-def _clusters_of(memory, count, turns):
-    """``turns`` is an array of the network, which the solver may overwrite."""
+def _clusters_of(memory, count, dv):
+    """``dv`` is an array of the network, which the solver may overwrite."""
     size = 3 * count
     return Clusters(
         _unsigned_at(_reserve(memory, size, 4), (size,)),
@@ -117,7 +117,7 @@ def _clusters_of(memory, count, turns):
         _unsigned_at(_reserve(memory, 2 * size, 4), (size, 2)),
         doubles_at(_reserve(memory, 8 * size, 8), (size, 8)),
         doubles_at(_reserve(memory, 5 * size, 8), (size, 5)),
-        turns,
+        dv,
         doubles_at(_reserve(memory, 3 * count, 8), (count, 3)),
     )
 

@@ -18,24 +18,24 @@ from jaxgran.dynamics.numba_engine.layout import (
     BEST,
     BOUND,
     CHANGE,
-    DRIVE,
     FIRST,
     IMPULSE,
     INFEASIBLE,
     INVERSE_MASS,
+    INVERSE_MU,
+    INVERSE_MU_MI,
+    INVERSE_MU_MJ,
     ITERATION_LIMIT,
-    MOBILITY,
+    MU_NX,
+    MU_NY,
+    MU_U,
     NONFINITE,
     NX,
     NY,
     OK,
-    PULL_X,
-    PULL_Y,
     RESPONSE,
     SECOND,
     STEP,
-    TURN_I,
-    TURN_J,
     P,
 )
 
@@ -81,7 +81,7 @@ def solve_cluster(m, target, most_iterations, grains, network, clusters):
 @inline_njit
 def _take_contacts(start, size, grains, network, clusters):
     """Write what the contacts of a cluster bring to the solver, one of each part of the cluster in turn."""
-    source, places, ends, rows, turns = clusters.source, clusters.places, clusters.ends, clusters.rows, clusters.turns
+    source, places, ends, rows, dv = clusters.source, clusters.places, clusters.ends, clusters.rows, clusters.dv
     contacts, constants = network.rows, grains.constants
     one, last = np.uint64(1), np.uint64(start) + size
     length = size // np.uint64(_PARTS) + one if size >= 2 * _PARTS else one  # of a part
@@ -94,10 +94,10 @@ def _take_contacts(start, size, grains, network, clusters):
         mobility = mi + mj
         reduced_mass = 1 / mobility
         places[c], ends[c, FIRST], ends[c, SECOND] = place, i, j
-        rows[c, PULL_X], rows[c, PULL_Y] = contacts[NX, place] * reduced_mass, contacts[NY, place] * reduced_mass
-        rows[c, DRIVE], rows[c, MOBILITY] = contacts[APPROACH, place] * reduced_mass, mobility
-        rows[c, TURN_I], rows[c, TURN_J], rows[c, P] = mobility * mi, mobility * mj, 0.0
-        turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0
+        rows[c, MU_NX], rows[c, MU_NY] = contacts[NX, place] * reduced_mass, contacts[NY, place] * reduced_mass
+        rows[c, MU_U], rows[c, INVERSE_MU] = contacts[APPROACH, place] * reduced_mass, mobility
+        rows[c, INVERSE_MU_MI], rows[c, INVERSE_MU_MJ], rows[c, P] = mobility * mi, mobility * mj, 0.0
+        dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         c += one
         n += length
         if n >= last:
@@ -108,13 +108,13 @@ def _take_contacts(start, size, grains, network, clusters):
 @njit
 def _is_jammed(size, clusters):
     """Whether impulses have grown without moving anything: pᵀWp is far below −pᵀu⁻, which it is at a solution."""
-    rows, ends, turns = clusters.rows, clusters.ends, clusters.turns
+    rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     moved = felt = 0.0
     for c in range(size):
         i, j = ends[c, FIRST], ends[c, SECOND]
-        fall = rows[c, PULL_X] * (turns[j, 0] - turns[i, 0]) + rows[c, PULL_Y] * (turns[j, 1] - turns[i, 1])
-        moved -= rows[c, P] * fall * rows[c, MOBILITY]
-        felt -= rows[c, P] * rows[c, DRIVE] * rows[c, MOBILITY]
+        fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (dv[j, 1] - dv[i, 1])
+        moved -= rows[c, P] * fall * rows[c, INVERSE_MU]
+        felt -= rows[c, P] * rows[c, MU_U] * rows[c, INVERSE_MU]
     return moved < JAMMED_RESPONSE * felt
 
 
@@ -123,23 +123,23 @@ def _sweep(size, target, most_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared residual.
 
     The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc p, u), so a sweep
-    estimates the norm for nothing; that of one state decides. ``turns`` are the changes of the grains' velocities.
+    estimates the norm for nothing; that of one state decides. ``dv`` are the changes of the grains' velocities.
     """
-    rows, ends, turns = clusters.rows, clusters.ends, clusters.turns
+    rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     relaxation = _RELAXATION[min(size, np.uint64(_RELAXATION.size - 1))]
     sweeps, squared, going = 0, math.inf, True
     while going:
         seen = 0.0
         for c in range(size):  # without a branch, which would be mispredicted
             i, j = ends[c, FIRST], ends[c, SECOND]
-            ix, iy, jx, jy = turns[i, 0], turns[i, 1], turns[j, 0], turns[j, 1]
-            pull_x, pull_y, old = rows[c, PULL_X], rows[c, PULL_Y], rows[c, P]
-            change = max(relaxation * (pull_x * (jx - ix) + pull_y * (jy - iy) - rows[c, DRIVE]), -old)
+            ix, iy, jx, jy = dv[i, 0], dv[i, 1], dv[j, 0], dv[j, 1]
+            mu_nx, mu_ny, old = rows[c, MU_NX], rows[c, MU_NY], rows[c, P]
+            change = max(relaxation * (mu_nx * (jx - ix) + mu_ny * (jy - iy) - rows[c, MU_U]), -old)
             rows[c, P] = old + change
-            push_i, push_j = change * rows[c, TURN_I], change * rows[c, TURN_J]
-            turns[i, 0], turns[i, 1] = ix + push_i * pull_x, iy + push_i * pull_y
-            turns[j, 0], turns[j, 1] = jx - push_j * pull_x, jy - push_j * pull_y
-            error = change * rows[c, MOBILITY]
+            push_i, push_j = change * rows[c, INVERSE_MU_MI], change * rows[c, INVERSE_MU_MJ]
+            dv[i, 0], dv[i, 1] = ix + push_i * mu_nx, iy + push_i * mu_ny
+            dv[j, 0], dv[j, 1] = jx - push_j * mu_nx, jy - push_j * mu_ny
+            error = change * rows[c, INVERSE_MU]
             seen += error * error
         sweeps += 1
         going = sweeps < most_sweeps and seen < math.inf
@@ -147,8 +147,8 @@ def _sweep(size, target, most_sweeps, clusters):
             squared = 0.0
             for c in range(size):
                 i, j = ends[c, FIRST], ends[c, SECOND]
-                fall = rows[c, PULL_X] * (turns[j, 0] - turns[i, 0]) + rows[c, PULL_Y] * (turns[j, 1] - turns[i, 1])
-                error = min(rows[c, P], rows[c, DRIVE] - fall) * rows[c, MOBILITY]
+                fall = rows[c, MU_NX] * (dv[j, 0] - dv[i, 0]) + rows[c, MU_NY] * (dv[j, 1] - dv[i, 1])
+                error = min(rows[c, P], rows[c, MU_U] - fall) * rows[c, INVERSE_MU]
                 squared += error * error
             going &= not squared <= target
     return sweeps, squared
@@ -160,26 +160,27 @@ def _descend(size, target, most_iterations, clusters):
 
     Returns the products with W and the squared residual of the best iterate, whose impulses are in ``stiff``.
     """
-    rows, stiff, ends, turns, matrices = clusters.rows, clusters.stiff, clusters.ends, clusters.turns, clusters.matrices
+    rows, stiff, ends, dv, matrices = clusters.rows, clusters.stiff, clusters.ends, clusters.dv, clusters.matrices
     for c in range(size):
         for end in range(2):
             matrices[ends[c, end], 0] = matrices[ends[c, end], 1] = matrices[ends[c, end], 2] = 0.0
     for c in range(size):
-        nx, ny = rows[c, PULL_X] * rows[c, MOBILITY], rows[c, PULL_Y] * rows[c, MOBILITY]
+        nx, ny = rows[c, MU_NX] * rows[c, INVERSE_MU], rows[c, MU_NY] * rows[c, INVERSE_MU]
         for end in range(2):
             g = ends[c, end]
             matrices[g, 0] += nx * nx
             matrices[g, 1] += nx * ny
             matrices[g, 2] += ny * ny
     for c in range(size):
-        nx, ny = rows[c, PULL_X] * rows[c, MOBILITY], rows[c, PULL_Y] * rows[c, MOBILITY]
+        nx, ny = rows[c, MU_NX] * rows[c, INVERSE_MU], rows[c, MU_NY] * rows[c, INVERSE_MU]
         i, j = ends[c, FIRST], ends[c, SECOND]
-        inverse_mass_i, inverse_mass_j = rows[c, TURN_I] / rows[c, MOBILITY], rows[c, TURN_J] / rows[c, MOBILITY]
+        inverse_mass_i = rows[c, INVERSE_MU_MI] / rows[c, INVERSE_MU]
+        inverse_mass_j = rows[c, INVERSE_MU_MJ] / rows[c, INVERSE_MU]
         width_i = largest_eigenvalue(matrices[i, 0], matrices[i, 1], matrices[i, 2])
         width_j = largest_eigenvalue(matrices[j, 0], matrices[j, 1], matrices[j, 2])
         bound = width_i * inverse_mass_i + width_j * inverse_mass_j
         stiff[c, BOUND], stiff[c, STEP], stiff[c, CHANGE], stiff[c, BEST] = bound, 0.0, 0.0, rows[c, P]
-        stiff[c, RESPONSE] = nx * (turns[i, 0] - turns[j, 0]) + ny * (turns[i, 1] - turns[j, 1])
+        stiff[c, RESPONSE] = nx * (dv[i, 0] - dv[j, 0]) + ny * (dv[i, 1] - dv[j, 1])
     stride, momentum, before, best, squared = 1.0, -1, math.inf, math.inf, math.inf
     iterations = 0
     while iterations == 0 or (iterations < most_iterations and not squared <= target and squared < math.inf):
@@ -188,25 +189,25 @@ def _descend(size, target, most_iterations, clusters):
             i, j = ends[c, FIRST], ends[c, SECOND]
             old, bound = rows[c, P], stiff[c, BOUND]
             at = old + push * stiff[c, STEP]
-            slope = stiff[c, RESPONSE] + push * stiff[c, CHANGE] + rows[c, DRIVE] * rows[c, MOBILITY]
+            slope = stiff[c, RESPONSE] + push * stiff[c, CHANGE] + rows[c, MU_U] * rows[c, INVERSE_MU]
             new = max(0.0, at - stride * slope / bound)
             descent += (at - new) * (new - old) * bound
             stiff[c, STEP] = new - old
             rows[c, P] = new
-            turns[i, 0] = turns[i, 1] = turns[j, 0] = turns[j, 1] = 0.0
+            dv[i, 0] = dv[i, 1] = dv[j, 0] = dv[j, 1] = 0.0
         for c in range(size):
             i, j, press = ends[c, FIRST], ends[c, SECOND], rows[c, P]
-            push_i, push_j = press * rows[c, TURN_I], press * rows[c, TURN_J]
-            turns[i, 0] += push_i * rows[c, PULL_X]
-            turns[i, 1] += push_i * rows[c, PULL_Y]
-            turns[j, 0] -= push_j * rows[c, PULL_X]
-            turns[j, 1] -= push_j * rows[c, PULL_Y]
+            push_i, push_j = press * rows[c, INVERSE_MU_MI], press * rows[c, INVERSE_MU_MJ]
+            dv[i, 0] += push_i * rows[c, MU_NX]
+            dv[i, 1] += push_i * rows[c, MU_NY]
+            dv[j, 0] -= push_j * rows[c, MU_NX]
+            dv[j, 1] -= push_j * rows[c, MU_NY]
         squared = mixed = long = short = 0.0
         for c in range(size):
             i, j, bound = ends[c, FIRST], ends[c, SECOND], stiff[c, BOUND]
-            pull = rows[c, PULL_X] * (turns[i, 0] - turns[j, 0]) + rows[c, PULL_Y] * (turns[i, 1] - turns[j, 1])
-            response = pull * rows[c, MOBILITY]
-            error = min(rows[c, P], pull + rows[c, DRIVE]) * rows[c, MOBILITY]
+            pull = rows[c, MU_NX] * (dv[i, 0] - dv[j, 0]) + rows[c, MU_NY] * (dv[i, 1] - dv[j, 1])
+            response = pull * rows[c, INVERSE_MU]
+            error = min(rows[c, P], pull + rows[c, MU_U]) * rows[c, INVERSE_MU]
             step, change = stiff[c, STEP], response - stiff[c, RESPONSE]
             stiff[c, CHANGE], stiff[c, RESPONSE] = change, response
             squared += error * error

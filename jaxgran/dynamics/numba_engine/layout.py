@@ -23,7 +23,8 @@ WAITING, DONE = 1, 2  # of a grain in the search of clusters; 0 before it is rea
 ACROSS, ROW = range(2)  # rows of the images: r_i − r_j − (across, row·L) is the separation
 STRIKES, BEGINS, ENDS = range(3)  # rows of the calendar, in steps since the search
 NX, NY, APPROACH, DISTANCE, IMPULSE = range(5)  # rows of the network
-PULL_X, PULL_Y, DRIVE, MOBILITY, TURN_I, TURN_J, P = range(7)  # columns of what a contact brings to the solver
+# Columns of a contact in the solver: μ n, μ u⁻, 1/μ, 1/(μ m_i), 1/(μ m_j) and p, with the reduced mass μ.
+MU_NX, MU_NY, MU_U, INVERSE_MU, INVERSE_MU_MI, INVERSE_MU_MJ, P = range(7)
 AT_STEP, ACTED, CONTACTS, TILTED, RECORD_HEAD = range(5)  # columns of a record; behind them its grains and contacts
 RECORD_OF_GRAIN, RECORD_OF_CONTACT = 4, 7  # numbers of a record for each grain, and for each contact
 RESPONSE, STEP, CHANGE, BEST, BOUND = range(5)  # columns of the same for a stiff cluster
@@ -115,7 +116,7 @@ class Clusters(NamedTuple):
     source: (contacts,) places in the network; those of cluster m at ``starts[m] : starts[m + 1]``; of_grain:
     (2 contacts,) contacts of the grains, those of grain g from ``offsets[g]`` on; queue, reached: (grains,) for the
     search of clusters. Of the cluster that is solved: places: (contacts,) in the network; ends: (contacts, 2) grains;
-    rows: (contacts, 8); stiff: (contacts, 5); turns: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
+    rows: (contacts, 8); stiff: (contacts, 5); dv: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
     """
 
     source: Any
@@ -128,5 +129,5 @@ class Clusters(NamedTuple):
     ends: Any
     rows: Any
     stiff: Any
-    turns: Any
+    dv: Any
     matrices: Any

@@ -1,6 +1,6 @@
 """The time loop of the numba engine: the advance of one replica from contact to contact.
 
-The loop does what the plain engine does, contact for contact, with the same rule, impulses to the same tolerance and
+The loop does what the engine ``Jax`` does, contact for contact, with the same rule, impulses to the same tolerance and
 the same sums. It differs in what it visits:
 
 - *Search.* One list of near pairs is found through a grid of cells (``near_pairs``). It is valid as long as the fastest

@@ -28,19 +28,19 @@ _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst
 
 
 @inline_njit
-def add_flight(sums, steps, flight, turned, kinetic):
+def add_flight(sums, steps, flight, strain, kinetic):
     """Add a flight of so many steps, with Σ m c ⊗ c at its beginning, and return that at its end.
 
-    ``turned`` is the strain of the flight, in which c_x falls by γ̇ c_y t.
+    ``strain`` is the strain of the flight, in which c_x falls by γ̇ c_y t.
     """
     xx, xy, yy = kinetic
-    mean_xx, mean_xy, mean_yy = kinetic_means(xx, xy, yy, turned)
+    mean_xx, mean_xy, mean_yy = kinetic_means(xx, xy, yy, strain)
     sums[_DURATION] += flight
     sums[_STEPS] += steps
     sums[_KINETIC] += flight * mean_xx
     sums[_KINETIC + 1] += flight * mean_xy
     sums[_KINETIC + 2] += flight * mean_yy
-    return xx + turned * (turned * yy - 2 * xy), xy - turned * yy, yy
+    return xx + strain * (strain * yy - 2 * xy), xy - strain * yy, yy
 
 
 @inline_njit

@@ -1,6 +1,6 @@
 """The engine for NVIDIA GPUs: the advance of one replica as one kernel, with a thread for each grain.
 
-The plain engine starts a few dozen kernels in every step that it visits, and a batch waits for its slowest replica at
+The engine ``Jax`` starts a few dozen kernels in every step that it visits, and a batch waits for its slowest replica at
 each. Here all steps are in one kernel, written in Pallas. A replica goes at its own pace, and its numbers stay in
 registers and in the nearest caches.
 
@@ -246,7 +246,7 @@ def _event(thread: Thread, grains: int, now: _Carry) -> _Carry:
         lambda: _collide(thread, motion, flown, lists, flight, counts),
         lambda: (flown, counts, flow.ok),
     )
-    flown = Motion(*thread.tell((X, Y, CX, CY), flown))
+    flown = Motion(*thread.publish((X, Y, CX, CY), flown))
     lists = lists._replace(
         strain=lists.strain + rate * flight, age=lists.age + flight, slack=lists.slack - loss * flight
     )
@@ -281,7 +281,7 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
     x, y = _positions(thread, motion, lists)
     rows = jnp.floor(y / side)
     x, y = x - rows * tilt * side, y - rows * side
-    x, y = thread.tell((X, Y), (x - jnp.floor((x - tilt * y) / side) * side, y))
+    x, y = thread.publish((X, Y), (x - jnp.floor((x - tilt * y) / side) * side, y))
     block.moved[X, :], block.moved[Y, :] = x, y
 
     def listed(skin: Array) -> Array:
@@ -315,7 +315,7 @@ def _search(thread: Thread, count: int, fastest: Array, motion: Motion, lists: _
     _, skin, near, longest = lax.while_loop(
         lambda at: (at[0] < _NARROWER) & (at[3] > NEAR), narrowed, (jnp.int32(1), skin, near, jnp.max(near))
     )
-    at_rest = Motion(*thread.tell((X, Y, CX, CY), (jnp.zeros_like(x), jnp.zeros_like(y), motion.cx, motion.cy)))
+    at_rest = Motion(*thread.publish((X, Y, CX, CY), (jnp.zeros_like(x), jnp.zeros_like(y), motion.cx, motion.cy)))
     lists = _Lists(jnp.minimum(near, NEAR), jnp.minimum(longest, NEAR), tilt, 0 * side, 0 * side, skin, skin)
     return at_rest, lists, status_if(longest > NEAR, Status.capacity)
 
@@ -343,10 +343,10 @@ def _pair(thread: Thread, k: Array, motion: Motion, lists: _Lists) -> _Pair:
     block, rate = thread.block, thread.flow.shear_rate
     real = k < lists.near
     other = thread.read(block.near, k, mask=real)
-    x, y, cx, cy = (thread.ask(block.shared, row, other, real) for row in (X, Y, CX, CY))
+    x, y, cx, cy = (thread.gather(block.shared, row, other, real) for row in (X, Y, CX, CY))
     y = thread.read(block.apart, Y, k, mask=real) + (motion.y - y)
     x = thread.read(block.apart, X, k, mask=real) + (motion.x - x) + lists.strain * y
-    reach = thread.radius + thread.ask(block.given, RADIUS, other, real)
+    reach = thread.radius + thread.gather(block.given, RADIUS, other, real)
     return _Pair(real, other, x, y, motion.cx - cx + rate * y, motion.cy - cy, reach)
 
 

@@ -21,7 +21,7 @@ from jaxgran.model.status import Status
 
 NEAR = 20  # near grains that a grain has room for
 X, Y, CX, CY, RADIUS, INVERSE_MASS, GIVEN = range(7)  # rows of what is given; the first four are those of ``shared``
-PULL_X, PULL_Y, WIDTH, SHARED = range(4, 8)  # velocity changes by impulses; the share of a grain in the spectral bound
+DV_X, DV_Y, WIDTH, SHARED = range(4, 8)  # changes of velocity; a grain's share λ/m in the spectral bound
 TOUCHING, LOADED, COUNTS = range(3)  # contacts of a grain, and those that carry an impulse
 NX, NY, APPROACH, DISTANCE, IMPULSE, RESPONSE, STEP, CHANGE, BEST, BOUND, NETWORK = range(11)  # of a contact
 
@@ -63,7 +63,7 @@ class Block(NamedTuple):
     totals: Any  # (TOTALS,)
     status: Any  # (1,)
     sums: Any  # (SUMS, threads): what each grain adds to the sums, and the solves by residual
-    shared: Any  # (7, threads): what grains tell each other
+    shared: Any  # (7, threads): what threads publish to each other
     counts: Any  # (2, threads): the same of whole numbers
     near: Any  # (NEAR, threads): near grains
     apart: Any  # (2, NEAR, threads): separations of their nearest images at the search
@@ -98,11 +98,11 @@ class Thread(NamedTuple):
     flow: Flow
     wait: Callable[[], None]
 
-    def tell(self, rows: Sequence[int], values: Sequence[Array]) -> list[Array]:
-        """Write what other threads may ask for: numbers to ``shared``, whole numbers to ``counts``.
+    def publish(self, rows: Sequence[int], values: Sequence[Array]) -> list[Array]:
+        """Write what other threads may gather: floats to ``shared``, integers to ``counts``, between two barriers.
 
-        Returns the values as they have been written. These are to be used further: a product that a compiler fuses into
-        a later sum is not rounded as the others know it, and two grains would not see the same contact.
+        Returns the values as they have been written. Use these from here on: a product that the compiler fuses into a
+        later sum is rounded differently from what the others read, and two grains would not see the same contact.
         """
         self.wait()
         memory = [self.block.counts if value.dtype == jnp.int32 else self.block.shared for value in values]
@@ -111,16 +111,16 @@ class Thread(NamedTuple):
         self.wait()
         return [at[row, :] for at, row in zip(memory, rows, strict=True)]
 
-    def ask(self, memory: Any, row: int, other: Array, mask: Array) -> Array:
-        """What another thread has written."""
+    def gather(self, memory: Any, row: int, other: Array, mask: Array) -> Array:
+        """Read what another thread has published."""
         return triton.load(memory.at[row, other], mask=mask, other=0)
 
     def read(self, memory: Any, *place: Any, mask: Array) -> Array:
-        """What this thread has written to a place of its own."""
+        """Read a place that belongs to this thread."""
         return triton.load(memory.at[*place, self.number], mask=mask, other=0)
 
     def write(self, memory: Any, *place: Any, value: Array, mask: Array) -> None:
-        """Write to a place of its own."""
+        """Write to a place that belongs to this thread."""
         triton.store(memory.at[*place, self.number], value, mask=mask)
 
     def add(self, row: int, values: Sequence[Array]) -> None:

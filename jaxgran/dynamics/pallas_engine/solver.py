@@ -30,13 +30,13 @@ from jaxgran.dynamics.pallas_engine.memory import (
     BOUND,
     CHANGE,
     DISTANCE,
+    DV_X,
+    DV_Y,
     IMPULSE,
     INVERSE_MASS,
     LOADED,
     NX,
     NY,
-    PULL_X,
-    PULL_Y,
     RADIUS,
     RESIDUALS,
     RESPONSE,
@@ -75,7 +75,7 @@ def _contact(thread: Thread, m: Array, contacts: Array) -> _Contact:
     real = m < contacts
     nx, ny, approach = _read(thread, m, real, NX, NY, APPROACH)
     other = thread.read(thread.block.partners, m, mask=real)
-    inverse_mass = thread.ask(thread.block.given, INVERSE_MASS, other, real)
+    inverse_mass = thread.gather(thread.block.given, INVERSE_MASS, other, real)
     return _Contact(real, other, nx, ny, approach, thread.inverse_mass + inverse_mass)
 
 
@@ -92,8 +92,8 @@ def _write(thread: Thread, m: Array, mask: Array, values: dict[int, Array]) -> N
 def _response(thread: Thread, contact: _Contact, x: Array, y: Array) -> Array:
     """Change of a contact's relative normal velocity, where x and y are those of this grain's velocity."""
     shared = thread.block.shared
-    along = contact.nx * (x - thread.ask(shared, PULL_X, contact.other, contact.real))
-    return along + contact.ny * (y - thread.ask(shared, PULL_Y, contact.other, contact.real))
+    along = contact.nx * (x - thread.gather(shared, DV_X, contact.other, contact.real))
+    return along + contact.ny * (y - thread.gather(shared, DV_Y, contact.other, contact.real))
 
 
 def collided(
@@ -109,13 +109,13 @@ def collided(
     flow, block = thread.flow, thread.block
     one_plus_alpha = 1 + flow.restitution
     target = residual_target(jnp.sqrt(scale), flow.tolerance, flow.shear_rate, flow.epsilon)
-    thread.tell([TOUCHING], [contacts])
+    thread.publish([TOUCHING], [contacts])
     most, zero = jnp.max(contacts), jnp.zeros_like(motion.x)
 
     def isolate(m: Array, shape: tuple[Array, ...]) -> tuple[Array, ...]:
         """Write the impulses of isolated pairs, and add up n ⊗ n of the others."""
         contact = _contact(thread, m, contacts)
-        alone = (contacts == 1) & (thread.ask(block.counts, TOUCHING, contact.other, contact.real) == 1)
+        alone = (contacts == 1) & (thread.gather(block.counts, TOUCHING, contact.other, contact.real) == 1)
         impulse = jnp.maximum(0, -contact.approach) / jnp.where(contact.real, contact.mobility, 1)
         _write(thread, m, contact.real, {IMPULSE: jnp.where(alone, impulse, 0)})
         nx, ny = contact.nx, contact.ny
@@ -138,7 +138,7 @@ def collided(
 
     x, y, loaded = lax.fori_loop(0, most, pull, (zero, zero, jnp.zeros_like(contacts)))
     x, y = x * thread.inverse_mass, y * thread.inverse_mass
-    x, y, loaded = thread.tell((PULL_X, PULL_Y, LOADED), (x, y, loaded))
+    x, y, loaded = thread.publish((DV_X, DV_Y, LOADED), (x, y, loaded))
 
     def tally(m: Array, ok: Array) -> Array:
         """Add a contact to the sums."""
@@ -148,8 +148,8 @@ def collided(
         half_change = one_plus_alpha / 2 * _response(thread, contact, x, y)
         push, approaches = one_plus_alpha * impulse, contact.real & (approach < 0)
         single = jnp.where(approaches, -one_plus_alpha * approach / jnp.where(contact.real, contact.mobility, 1), 0)
-        clustered = (loaded > 1) | (thread.ask(block.counts, LOADED, contact.other, contact.real) > 1)
-        reach = thread.radius + thread.ask(block.given, RADIUS, contact.other, contact.real)
+        clustered = (loaded > 1) | (thread.gather(block.counts, LOADED, contact.other, contact.real) > 1)
+        reach = thread.radius + thread.gather(block.given, RADIUS, contact.other, contact.real)
         overlap = jnp.where(contact.real, jnp.maximum(reach - distance, 0), 0)
         flags = (flag.astype(nx.dtype) for flag in (contact.real, push > 0, approaches))
         terms = contact_terms(
@@ -204,11 +204,11 @@ def _descend(thread: Thread, contacts: Array, most: Array, width: Array, target:
       target: the squared residual to reach.
     """
     shared, flow = thread.block.shared, thread.flow
-    (width,) = thread.tell([WIDTH], [width])
+    (width,) = thread.publish([WIDTH], [width])
 
     def prepare(m: Array, ok: Array) -> Array:
         contact = _contact(thread, m, contacts)
-        bound = width + thread.ask(shared, WIDTH, contact.other, contact.real)
+        bound = width + thread.gather(shared, WIDTH, contact.other, contact.real)
         start = {row: jnp.zeros_like(bound) for row in (IMPULSE, RESPONSE, STEP, CHANGE, BEST)}
         _write(thread, m, contact.real, {BOUND: bound, **start})
         return ok
@@ -234,7 +234,7 @@ def _descend(thread: Thread, contacts: Array, most: Array, width: Array, target:
 
         x, y, descent = lax.fori_loop(0, most, move, (zero,) * 3)
         x, y = x * thread.inverse_mass, y * thread.inverse_mass
-        x, y = thread.tell((PULL_X, PULL_Y), (x, y))
+        x, y = thread.publish((DV_X, DV_Y), (x, y))
         even = now.iterations % 2 == 0
 
         def feel(m: Array, total: tuple[Array, ...]) -> tuple[Array, ...]:
