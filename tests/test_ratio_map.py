@@ -123,6 +123,12 @@ def test_every_step_of_every_replica_is_reported(results, reported) -> None:
     assert_every_step_is_reported(reported)
 
 
+def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
+    told: list[float] = []
+    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
+    assert_every_step_is_reported(told)
+
+
 @pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
 def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_steps(
     settings, second: Status, monkeypatch: pytest.MonkeyPatch
