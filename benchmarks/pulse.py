@@ -39,13 +39,13 @@ TOLERANCES = (0.3, 1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6)
 FLOOR = 1e-6  # smallest error of the force that is drawn
 DRAWN = (0.3, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances of the first panel
 SWEEPS = "Gauss–Seidel"
+SMALLEST = {"barzilai-borwein": 1e-6, "nesterov": 1e-6, "jacobi": 1e-3, SWEEPS: 1e-4}  # below, minutes to run
+MOST_ITERATIONS = 1_000_000
 METHODS = {
     "barzilai-borwein": jg.BarzilaiBorwein(max_steps=MOST_ITERATIONS),
     "nesterov": jg.Nesterov(max_steps=MOST_ITERATIONS),
     "jacobi": jg.Jacobi(max_steps=MOST_ITERATIONS, relaxation=1.0),
 }
-SMALLEST = {"barzilai-borwein": 1e-6, "nesterov": 1e-6, "jacobi": 1e-3, SWEEPS: 1e-4}  # below, minutes to run
-MOST_ITERATIONS = 1_000_000
 STYLES = {
     "barzilai-borwein": ("black", "o", "-"),
     "nesterov": ("tab:blue", "s", "--"),

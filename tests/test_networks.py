@@ -1,5 +1,7 @@
 """Where methods for the contact problem fail, and where they do not: laws on the collection of the benchmarks."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -10,6 +10,8 @@ from synthetic import one_sentence
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import collision, observed_advance
+from jaxgran.dynamics.engine import Jax, Numerics
+from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from flows import EXACT
 
+from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io.trajectory import (
     Trajectory,
@@ -26,7 +27,7 @@ from jaxgran.io.trajectory import (
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.batch import stack
+from jaxgran.sampling.batch import for_replicas, stack
 from jaxgran.sampling.recorder import Recorder
 
 GRAINS = pytest.GRAINS
