@@ -63,7 +63,7 @@ def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path:
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
-def fake_drive(flow, state: State, steps):
+def fake_drive(flow, numerics, state: State, steps):
     """Random numbers that depend on the state alone."""
     seed = int(np.asarray(state.positions).sum() * 1e6) % 2**31
     tally = random_tally(np.random.default_rng(seed), len(steps))
@@ -78,7 +78,7 @@ def small_state() -> State:
 def walk(drive, calls: int) -> list:
     state, seen = small_state(), []
     for k in range(calls):
-        state, tally = drive(None, state, np.array([k, k]))
+        state, tally = drive(None, None, state, np.array([k, k]))
         seen.append(jax.tree.map(np.asarray, tally))
     return [seen, jax.tree.map(np.asarray, state)]
 
@@ -103,7 +103,7 @@ def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
         Journal(path, [(0, 0), (2, 0)], fake_drive)
     journal = Journal(path, KEYS, fake_drive)
     with pytest.raises(CorruptFile, match="another run"):
-        journal(None, small_state(), np.array([5, 5]))
+        journal(None, None, small_state(), np.array([5, 5]))
 
 
 def test_a_folder_that_vanishes_does_no_harm(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monke
     journal = Journal(path, KEYS, fake_drive, seconds=0.01)
     for k in range(3):
         time.sleep(0.02)
-        journal(None, small_state(), np.array([k, k]))
+        journal(None, None, small_state(), np.array([k, k]))
     assert len(read_arrays(path)[0]["tallies"]) == 3
 
 

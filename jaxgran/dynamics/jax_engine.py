@@ -120,6 +120,7 @@ def count_events(
 
     Arguments and errors are those of ``advance``.
     """
+    require_advance(flow, state, steps)
     require_solver(solver)
     words = "count_events returns a whole number, which has no derivative."
     flow, solver, state = forward_only((flow, solver, state), words)
@@ -129,8 +130,7 @@ def count_events(
 
 
 def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, options: AdvanceOptions):
-    """Start and body of the loop of an advance, and whether it has to go on."""
-    require_advance(flow, state, steps)
+    """Start and body of the loop of an advance, and whether it has to continue."""
     dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
 
     def observer_at(lists: PairLists, velocities: Array) -> ObserveNow | None:

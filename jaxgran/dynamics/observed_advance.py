@@ -19,7 +19,7 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.advance import call_numba
 from jaxgran.dynamics.collision import Observe
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
-from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, observe_by_jax, require_advance
+from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, observe_by_jax
 from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
 from jaxgran.dynamics.tally import Tally, empty_sums, place_of
 from jaxgran.model.cell import wrap
@@ -41,7 +41,6 @@ def advance_observed(
     Raises:
       InputError: the engine asked for cannot do this, or the function returns something else than sums.
     """
-    require_advance(flow, state, steps)
     flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
     engine = select_engine(flow, numerics, state, "observe")
     if isinstance(engine, Jax) or _depends_on_traced(observe, flow, state):

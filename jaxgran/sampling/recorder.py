@@ -24,9 +24,9 @@ Keep = Callable[[Snapshot, int], None]  # called with a frame and the number of 
 class Recorder:
     """Takes frames of a replica while it is advanced.
 
-    Frames are taken at the start and then at equal numbers of time steps. If a frame falls inside an advance, the
-    advance is split, and the sums differ by rounding. Where collisions are many, rounding leads to another trajectory
-    of the same flow. If all frames fall on the ends of advances, all results are the same bit for bit.
+    Frames are taken at the start and then at equal numbers of time steps. If a frame falls inside an advance, it
+    is split, and the sums differ by rounding. In a flow of many collisions, rounding leads to another trajectory of the
+    same flow. If all frames fall on the ends of advances, all results are the same bit for bit.
 
     Args:
       every: strain from frame to frame, rounded to whole time steps, at least one.

@@ -318,7 +318,8 @@ def sample(
         if function is not None and not callable(function):
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
-        return waited(_sample(flow, numerics, state, strain, blocks, observe))
+        measured = _sample(flow, numerics, state, strain, blocks, observe)
+        return waited(measured)
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, numerics, state, strain))):
         raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
     return _sample_with_callback(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback)
@@ -375,7 +376,8 @@ def _sample_with_callback(
     """The sample, block by block, with a call of ``callback`` after each."""
     parts: list[Sample] = []
     for steps in np.asarray(steps_of_blocks):
-        state, part = waited(_sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe))
+        measured = _sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe)
+        state, part = waited(measured)
         parts.append(part)
         if callback(state, _joined(parts)):
             break
