@@ -250,9 +250,7 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
     way = (
         advance_module.advance_by_pallas if count == 16 else kernel.advance_by_pallas
     )  # the former is traced with the plain advance
-    advance = jax.vmap(
-        partial(way.advance_by_pallas, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS
-    )
+    advance = jax.vmap(partial(way, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS)
     with without_a_gpu():
         traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
         text = traced.lower(lowering_platforms=("cuda",)).as_text()
