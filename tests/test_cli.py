@@ -517,7 +517,7 @@ def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.out) == (3, "")
-    assert outcome.err.startswith("jaxgran: the restitution did not settle: it was last 0.")
+    assert "did not settle" in outcome.err
     assert one_sentence(outcome.err.rstrip("\n"))
 
 
