@@ -21,6 +21,6 @@ QUICK |= {"grains": 64, "seeds": 1, "timestep": 5e-4, "equilibrate": 1.0, "strai
 def run(output: Output) -> None:
     """Map, and write the dataset and all figures that a map has."""
     data = jg.ratio_map(**QUICK if output.quick else PRESETS["paper"], snapshots=True, workers=usable_cores())
-    data = data.assign_attrs(command="python -m benchmarks paper", commit=output.hardware["commit"])
+    data.attrs |= {"command": "python -m benchmarks paper", "commit": output.hardware["commit"]}
     write_dataset(data, output.path("paper", ".nc"))
     save_figures(data, output.path("paper", ""))

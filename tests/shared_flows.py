@@ -157,17 +157,3 @@ def solved():
         return compiled(network, 60, *numbers, method, jnp.asarray(active))
 
     return call
-
-
-@pytest.fixture
-def page() -> None:
-    """A test of what stands where on the page asks for it."""
-
-
-@pytest.fixture
-def layout_of_pages_alone(request, monkeypatch) -> None:
-    """Figures are laid out only in tests that ask for ``page``."""
-    if "page" not in request.fixturenames:
-        from drawn import leave_out_layout  # here, as it loads what draws
-
-        leave_out_layout(monkeypatch)

@@ -1,13 +1,11 @@
 """An engine has a name: it runs what it can, refuses in a sentence what it cannot, and stands in what it has made."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import xarray as xr
 from synthetic import one_sentence
 
 import jaxgran as jg
@@ -15,7 +13,7 @@ from jaxgran.dynamics import jax_engine
 from jaxgran.dynamics.engine import _warn_once, select_engine, solver_in_use
 from jaxgran.dynamics.tally import empty_tally
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.results import choices_of, differences, read_dataset, write_dataset
+from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.sampling import batch
@@ -210,17 +208,6 @@ def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
 
 def test_the_thread_block_solves_by_its_own_method() -> None:
     assert solver_in_use("pallas", "barzilai-borwein") == "barzilai-borwein"
-
-
-def test_files_from_before_the_engine_had_a_name_are_read_and_repeated(tmp_path: Path) -> None:
-    settings = replace(SETTINGS, solver="nesterov")
-    data = map_dataset(settings, {}, {})
-    old = {name: x for name, x in data.attrs.items() if "_asked" not in name and name != "engine"}
-    few = data[["force_ratio", "force_ratio_stderr", "status"]]
-    write_dataset(xr.Dataset(few.data_vars, few.coords, old | {"solver": "nesterov"}), tmp_path / "old.nc")
-    again = read_dataset(tmp_path / "old.nc")
-    assert MapSettings(**choices_of(again)) == settings
-    assert differences(again) == []
 
 
 @pytest.mark.slow

@@ -17,11 +17,12 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Bbox
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxgran.files import atomic_write
 from jaxgran.maps.schema import FINEST
@@ -39,6 +40,8 @@ NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
 _CAPTION = "caption"  # names the text under the axes
+_MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
+_LEAST_PLAIN = 1e-3  # smallest number that is written without a power of ten
 _SAVED: dict[str, dict[str, Any]] = {
     "png": {"pil_kwargs": {"compress_level": 3}},  # 3 % larger than by default, in three quarters of the time
     "pdf": {"metadata": {"CreationDate": None}},
@@ -211,13 +214,13 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def fix_layout(figure: Figure) -> None:
-    """Place all parts of a finished figure, once, so that distances on the page are known."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-            figure.set_layout_engine(None)  # with "none" Matplotlib would still draw twice, the first time for nothing
+def label_log_axis(axis: Axis) -> None:
+    """Put numbers at 1, 2 and 5 of each decade of a logarithmic axis, or at powers of ten over several decades."""
+    low, high = axis.get_view_interval()
+    every = LogFormatterSciNotation(minor_thresholds=(np.inf, np.inf))
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < _MANY_DECADES * low else (1,), numticks=9))
+    axis.set_major_formatter(every if low < _LEAST_PLAIN else StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def scientific(value: float) -> str:
@@ -250,8 +253,6 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
     """Set the tick style and write the caption under the axes; write "no measured values" where there are none."""
     for axes in figure.axes:
         axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=TICK_SIZE)
-        for spine in axes.spines.values():
-            spine.set_in_layout(False)  # the frame ends where the axes end, and to measure it takes long
         if not measured.any():
             box = {"facecolor": "white", "edgecolor": "none"}
             where = {"transform": axes.transAxes, "ha": "center"}
@@ -297,21 +298,11 @@ def writable_stem(stem: Path | str) -> Path:
 def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True) -> Path:
     """Write a figure in the format of its ending; a file that is there is replaced at the end.
 
-    The same figure gives the same file: no date and no random name is in it. Without its caption a figure is lower.
+    The same figure gives the same file: no date and no random name is in it.
     """
-    figure.set_dpi(dpi)
-    fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
     kind = path.suffix.removeprefix(".")
-    area = None if caption else _cut_caption(figure)
+    for text in figure.findobj(lambda artist: artist.get_gid() == _CAPTION):
+        text.set_visible(caption)
     with atomic_write(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
-        figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches=area, **_SAVED.get(kind, {}))
+        figure.savefig(temporary, format=kind, dpi=dpi, **_SAVED.get(kind, {}))
     return path
-
-
-def _cut_caption(figure: Figure) -> Bbox:
-    """Hide the caption, and return what is above it, in inches."""
-    width, height = figure.get_size_inches()
-    (caption,) = figure.findobj(lambda artist: artist.get_gid() == _CAPTION)
-    top = caption.get_window_extent().y1 / figure.dpi
-    caption.set_visible(False)
-    return Bbox.from_extents(0.0, top, width, height)
