@@ -17,6 +17,7 @@ from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
 from jaxgran.maps.instants import instant_variables
+from jaxgran.maps.points import PointGrid
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.model.checks import InputError
 from jaxgran.page.document import document
@@ -191,8 +192,8 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
 def test_page_of_120_points_of_a_thousand_grains_has_less_than_six_megabytes() -> None:
     data = ratio_dataset(10, 12)
     instants = dict.fromkeys(range(120), random_instant(0, 1000, 900))
-    variables = instant_variables(("packing_fraction", "restitution"), (12, 10), instants)
-    page = jg.explore(data.assign(variables))
+    variables = instant_variables(PointGrid(("packing_fraction", "restitution"), (12, 10)), instants)
+    page = jg.explore(xr.DataTree.from_dict({"/": data, "snapshots": xr.Dataset(variables)}))
     assert len(written(page)["instants"]) == 120
     assert len(page.text) < 6e6
 

@@ -1,10 +1,10 @@
-"""The instants that a map keeps with ``snapshots``: one of every point, taken after its sample.
+"""Instants, stored by a map with ``snapshots``: grains and forces of one replica of each point, after its sample.
 
-A replica is advanced from its last state by a short strain, and every time step of it is a snapshot. This is after the
-sample, so the numbers of a map are the same with and without instants.
+The replica is advanced from its last state by a short strain, over which the forces are averaged. The sample is not
+affected, so the averages of a map are the same with and without instants.
 
-Of each point the first good replica counts. A batch cannot see other batches, so it takes an instant of the first good
-replica of each of its points. The first good one of all is then among them.
+The stored instant is that of the first good seed of a point. Batches do not communicate, so each batch takes an instant
+of the first good replica of each of its points, and the map selects from them.
 """
 
 import math
@@ -29,8 +29,8 @@ WINDOW = 0.002
 """Strain over which the forces of an instant are averaged."""
 
 _MOST_STEPS = 1000  # of the window, where the time step is very short
-_BITS = 12  # binary digits that a file keeps of a number; the zeros after them need no space
-_POSITION_BITS = 18  # the same for positions, which are compared with a radius and may be 50 times as large
+_BITS = 12  # binary digits of a stored number; the zeros after them compress well
+_POSITION_BITS = 18  # of positions, which may be 50 times as large as a radius
 _PACKED = {"zlib": True, "shuffle": True, "complevel": 4}
 _NO_GRAIN = -1
 _GRAIN, _PAIR = ("grain",), ("pair",)
@@ -39,8 +39,8 @@ _MEANINGS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "y": ("position of a grain along the gradient, from the centre of the sheared cell", "sigma", _GRAIN),
     "radius": ("radius of a grain", "sigma", _GRAIN),
     "speed": ("peculiar speed of a grain", "sigma / t", _GRAIN),
-    "pair_i": ("first grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
-    "pair_j": ("second grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
+    "pair_i": ("first grain of a pair in contact, -1 after the last pair", "1", _PAIR),
+    "pair_j": ("second grain of a pair in contact, -1 after the last pair", "1", _PAIR),
     "force": ("mean force between the grains of a pair over the window", "m sigma / t^2", _PAIR),
     "clustered": ("whether most of the force of a pair acts within clusters of three or more grains", "1", _PAIR),
     "side": ("side of the cell", "sigma", ()),
@@ -128,8 +128,8 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[Instant | None]:
 def instant_variables(grid: PointGrid, instants: Mapping[int, Instant]) -> dict[str, xr.Variable]:
     """The group ``snapshots`` of a map, packed.
 
-    Points have different numbers of pairs, and may have different numbers of grains. Behind the last one, numbers of
-    grains are −1 and all other numbers NaN. A point without an instant has none.
+    Points have different numbers of pairs, and may have different numbers of grains. Unused elements are −1 for indices
+    of grains, and NaN otherwise.
 
     Args:
       grid: the dimensions of a point.

@@ -1,4 +1,4 @@
-"""A map as a page to look into: the plane, curves through a point, its numbers, and its grains."""
+"""A map as an interactive page: the plane, curves through a point, its numbers, and its grains."""
 
 from pathlib import Path
 

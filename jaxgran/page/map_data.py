@@ -1,4 +1,4 @@
-"""What a page of a map holds: every average at every point, with its errors, theory and status, and the instants."""
+"""The data of the page of a map: every average at every point, with its errors, theory and status, and the instants."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -29,7 +29,6 @@ _AXES = {
 _PLANE = ("packing_fraction", "restitution")
 _TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_ci95")
-_TOTAL = {"error_source": "total"}
 _LEFT_OUT = ("status", "point_grains")
 _NAMED = {"activation": get_args(Activation), "solver": get_args(Solver), "engine": get_args(Engine)}
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
@@ -49,7 +48,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
     again          what the command needs that measures a point again, if the map was made by this program
-    about, notes   sentences: what the numbers belong to, and what is left out
+    about, notes   sentences: parameters of the map, and what is left out
     =============  =====================================================================================
 
     Raises:
@@ -116,9 +115,7 @@ def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> It
     samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():
         columns = {
-            part: _column(data[there].isel(chosen).sel(_TOTAL, missing_dims="ignore"), data, dims)
-            for part, there in parts.items()
-            if there in data
+            part: _column(data[there].isel(chosen), data, dims) for part, there in parts.items() if there in data
         }
         if samples is not None:
             columns["samples"] = _column(samples, data, dims)
@@ -155,7 +152,9 @@ def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
 
 
 def _column(variable: xr.DataArray, data: xr.Dataset, dims: list[str]) -> np.ndarray:
-    """The values of a variable by point; one without numbers of grains, such as an estimate, is the same at all."""
+    """The values of a variable by point, or the total of an interval; one without numbers of grains is repeated."""
+    if "error_source" in variable.dims:
+        variable = variable.sel(error_source="total")
     missing = {name: data[name] for name in dims if name not in variable.dims}
     return variable.expand_dims(missing).transpose(*dims).values.astype(float).ravel()
 
@@ -204,9 +203,9 @@ def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | 
 
 
 def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
-    """Seeds, sampled strain of a seed at every point, and options; None where the file does not tell.
+    """Seeds, sampled strain of a seed at every point, and options; None if the file lacks them.
 
-    A reader will paste the command into a shell. So it has nothing but numbers, and names that this program knows.
+    The reader pastes the command into a shell, so it contains only numbers and known names.
     """
     if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "seeds/strain" not in data:
         return None
@@ -227,7 +226,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
 
 
 def _about(data: xr.Dataset) -> str:
-    """The sentence that says what the numbers belong to."""
+    """A sentence with the parameters that the axes do not show."""
     words = {"activation": "{} activation", "seeds": "{} seed" if data.attrs.get("seeds") == 1 else "{} seeds"}
     return _text(", ".join(form.format(data.attrs[name]) for name, form in words.items() if name in data.attrs))
 

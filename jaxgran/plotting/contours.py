@@ -25,7 +25,6 @@ from jaxgran.plotting.interpolation import interpolated, refined_axes
 
 _EXCESS_COLOUR = "#00803c"
 _EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
-_LEAST_CLEARANCE = 0.025  # of a labelled contour from others, over the size of the plane
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
@@ -57,9 +56,13 @@ def draw_levels(
     field: np.ma.MaskedArray,
     levels: Mapping[_Key, float],
     labelled: bool = True,
+    room: float = 0.0,
     **styles: Any,
 ) -> list[_Key]:
-    """Draw the contours of a field at increasing values, with their keys as labels; return the keys of those drawn."""
+    """Draw the contours of a field at increasing values, with their keys as labels; return the keys of those drawn.
+
+    A contour that is nowhere farther from the others than `room`, a share of the plane, has no label.
+    """
     low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
     crossed = [key for key, value in levels.items() if low < value < high]
     if not crossed:
@@ -67,7 +70,7 @@ def draw_levels(
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
     if labelled:
         texts = {value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()}
-        places = _label_places(drawn, x, y)
+        places = _label_places(drawn, x, y, room)
         for label in axes.clabel(
             drawn, fmt=texts, fontsize=SMALL_SIZE + 0.5, inline_spacing=2, manual=places, zorder=6
         ):
@@ -75,8 +78,8 @@ def draw_levels(
     return crossed
 
 
-def _label_places(drawn: QuadContourSet, x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:
-    """Return the point of each contour that is farthest from the others and the frame, unless that is too close."""
+def _label_places(drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, room: float) -> list[tuple[float, float]]:
+    """Return the point of each contour that is farthest from the others and the frame, if that is more than `room`."""
     corner, size = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
     curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / size for path in drawn.get_paths()]
     places = []
@@ -84,7 +87,7 @@ def _label_places(drawn: QuadContourSet, x: np.ndarray, y: np.ndarray) -> list[t
         others = np.concatenate([np.full((1, 2), np.inf), *curves[:k], *curves[k + 1 :]])
         apart = np.linalg.norm(curve[:, None] - others, axis=-1).min(axis=1)
         clearance = np.minimum(apart, np.minimum(curve, 1 - curve).min(axis=1) / 2)
-        if len(curve) and clearance.max() > _LEAST_CLEARANCE:
+        if len(curve) and clearance.max() > room:
             places.append(tuple(corner + size * curve[clearance.argmax()]))
     return places
 

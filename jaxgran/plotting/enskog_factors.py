@@ -34,9 +34,8 @@ PANELS = {
 """Factors of the map and the titles of their panels."""
 
 _NOTE = (
-    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d).\n"
-    "Enskog: independent isotropic Gaussian velocities at the measured temperature.\n"
-    "Black contours: measured over assumed, as a quotient less one (dashed where negative) or a factor"
+    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d). "
+    "Black contours: factor, or less one in % (dashed where negative)"
 )
 
 

@@ -1,8 +1,7 @@
 """The figures of a ratio map: curves of its ratios, contours of the excess over one, and the effect of dt.
 
-All are drawn from the dataset of :func:`jaxgran.ratio_map`. Curves and contours follow Figures 1 and 2 of Lois,
-Lemaître and Carlson, *Momentum transport in granular flows*. They show the largest number of grains and the shortest
-time step of a map that has several. The third figure shows the effect of the time step. The force ratio is ⟨F⟩/⟨F_bc⟩
+Curves and contours follow Figures 1 and 2 of Lois, Lemaître and Carlson, *Momentum transport in granular flows*. They
+show the largest number of grains and the shortest time step of a map that has several. The force ratio is ⟨F⟩/⟨F_bc⟩,
 and the excess is ⟨F⟩/⟨F_bc⟩ − 1. The shear-stress ratio is that of the contact stress to the binary stress, component
 xy. :func:`save_figures` also writes the figures of :mod:`jaxgran.plotting.size`, :mod:`jaxgran.plotting.theory` and
 :mod:`jaxgran.plotting.friction`.

@@ -1,4 +1,4 @@
-"""Figures that explain the force ratio: the errors of kinetic theory and their causes, and the share of clusters.
+"""The errors of kinetic theory and their two causes, and the share of the stress in clusters, over the plane.
 
 The figures show the largest number of grains and the shortest time step of a map that has several. The excess is
 ⟨F⟩/⟨F_bc⟩ − 1, that of the force ratio over one. In the plane of 1 − α and ν its contours are drawn on top of each
@@ -77,11 +77,7 @@ _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
 _LEAST_SHARE = 0.02  # share of clusters above which the error of interpolation is quoted, below the lowest level
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 _CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
-_THEORY_NOTE = (
-    "Black contours: error, as a quotient less one (dashed where negative) or a factor; (a) is (b) times (c).\n"
-    "Theory: Enskog balance of the second moments of anisotropic Gaussian velocities, per size class.\n"
-    "Binary: measured kinetic stress plus that of the contacts if all collisions were binary"
-)
+_THEORY_NOTE = "Black contours: quotient, or less one in % (dashed where negative); (a) = (b) × (c)"
 
 
 def has_theory(data: xr.Dataset) -> bool:
@@ -135,7 +131,8 @@ def theory_errors(data: MapData) -> Figure:
     The rows are pressure and shear stress. The columns are the total error, the part of the binary assumption and that
     of the closure, as in :func:`error_parts`. Black contours have the error as their label; they are dashed where the
     theory is too low. In dotted areas the error is smaller than its standard error. Green contours show the excess of
-    the force ratio.
+    the force ratio. The theory is the Enskog balance of the second moments of anisotropic Gaussian velocities, for each
+    size class.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) what :func:`error_parts` needs, `force_ratio` and
@@ -193,7 +190,7 @@ def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarr
         dots.set_linewidth(0.0)
     dashes = ["-" if level > 0.0 else "--" for level in ERROR_LEVELS.values()]
     style = {"colors": "black", "linewidths": 0.9, "linestyles": dashes, "zorder": 3}
-    draw_levels(axes, x, y, field, ERROR_LEVELS, **style)
+    draw_levels(axes, x, y, field, ERROR_LEVELS, room=0.025, **style)
     draw_plane(axes, data, field, np.isfinite(value))
     return hidden
 
