@@ -167,7 +167,7 @@ def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
     page = jg.explore(page_map())
     assert "hacked = 1</script>" not in page.text and "<img" not in page.text and "<u>name" not in page.text
     assert written(page)["title"] == MARKUP
-    assert written(page)["observables"][-1]["name"] == "own <u>name</u>"
+    assert "own <u>name</u>" in [one["name"] for one in written(page)["observables"]]
     assert f"<title>{html.escape(MARKUP)}</title>" in page.text
     assert page.text.count("<script") == page.text.count("</script>") == 3
 
@@ -186,7 +186,7 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
     again = map_data(data)["again"]
     assert again["options"] == "--activation midpoint --solver barzilai-borwein --tolerance 0.0001"
     assert_same_numbers(again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values)
-    assert map_data(data.assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
+    assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
 
 
 def test_page_of_120_points_of_a_thousand_grains_has_less_than_six_megabytes() -> None:

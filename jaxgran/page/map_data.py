@@ -29,6 +29,7 @@ _AXES = {
 _PLANE = ("packing_fraction", "restitution")
 _TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_ci95")
+_GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
 _LEFT_OUT = ("status", "point_grains")
 _NAMED = {"activation": get_args(Activation), "solver": get_args(Solver), "engine": get_args(Engine)}
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
@@ -137,10 +138,9 @@ def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None
 
 def _labels(names: list[str]) -> dict[str, str]:
     """Short names of variables: without their group, or with it at the end where another one has the same name."""
-    short = {name: name.split("/")[-1] for name in names}
-    counts = Counter(short.values())
-    alone = {name: end for name, end in short.items() if counts[end] == 1 or end == name}
-    return {name: alone.get(name, "_".join(reversed(name.split("/")))) for name in names}
+    split = {name: (name.split("/", 1) if name.startswith(_GROUPS) else ["", name]) for name in names}
+    counts = Counter(end for _, end in split.values())
+    return {name: f"{end}_{group}" if group and counts[end] > 1 else end for name, (group, end) in split.items()}
 
 
 def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
