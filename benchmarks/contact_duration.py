@@ -29,6 +29,7 @@ from benchmarks.event_driven import Law, averages, discs_of, sheared
 from benchmarks.output import Output
 from benchmarks.validation import EVENT_DRIVEN, OBSERVABLES
 from jaxgran.environment import usable_cores
+from jaxgran.maps.schema import path_of
 from jaxgran.statistics import standard_errors
 
 BLOCKS = 32  # of a sample, for its errors
@@ -127,7 +128,7 @@ def stepped(plan: Plan) -> list[dict]:
     rows = []
     for nu, alpha, dt in product(plan.packing_fraction, plan.restitution, plan.timesteps):
         here = data.sel(packing_fraction=nu, restitution=alpha, timestep=dt)
-        row = {x: [float(here[x]), float(here[f"{x}_stderr"])] for x in STEPPED}
+        row = {x: [float(here[f"{path_of(x)}{end}"]) for end in ("", "_stderr")] for x in STEPPED}
         rows.append({"flow": [nu, alpha], "time": dt, "status": jg.Status(int(here.status)).name} | row)
     return rows
 

@@ -25,7 +25,7 @@ import jaxgran as jg
 from benchmarks.fit_coverage import fit_all, peculiar_velocities, trajectories, with_noise
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
-from jaxgran.plotting.log_axis import number_log_axis
+from jaxgran.plotting.drawing import label_log_axis
 from jaxgran.sampling.prediction import kinetic_theory
 
 GRAINS, FITTED_FRAMES, FRAMES = 64, 50, 100
@@ -160,7 +160,7 @@ def picture(fits: list[dict], over_flows: list[dict], over_intervals: list[dict]
     right.set(xlabel="collisions of a disc between frames", xscale="log", yscale="log")
     right.set_title("α = 0.6, ν = 0.6", fontsize=10)
     for axis in (left.xaxis, middle.yaxis, right.xaxis, right.yaxis):
-        number_log_axis(axis, *axis.get_view_interval())
+        label_log_axis(axis)
     for axes in (left, middle, right):
         axes.legend(fontsize=8)
     return figure

@@ -25,7 +25,7 @@ FIGURES = {"curves": ratio_curves, "contours": ratio_contours, "theory": theory_
 def run(output: Output) -> None:
     """Map, and write the dataset and its main figures."""
     data = jg.ratio_map(**QUICK if output.quick else PRESETS["paper"], snapshots=True, workers=usable_cores())
-    data = data.assign_attrs(command="python -m benchmarks paper", commit=output.hardware["commit"])
+    data.attrs |= {"command": "python -m benchmarks paper", "commit": output.hardware["commit"]}
     write_dataset(data, output.path("paper", ".nc"))
     for name, draw in FIGURES.items():
         write(draw(data), output.path("paper", f"_{name}.png"), FILE_DPI, True)

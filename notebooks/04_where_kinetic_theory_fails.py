@@ -43,7 +43,7 @@ grains, strain, seeds = (64, 2.0, 1) if quick else (256, 8.0, 2)
 data = jg.ratio_map(
     restitution, packing_fraction, grains=grains, seeds=seeds, strain=strain, equilibrate=2.0 if quick else None
 )
-ratio = (data.theory_pressure / data.pressure).rename("pressure, theory over measured")
+ratio = (data["theory/pressure"] / data.pressure).rename("pressure, theory over measured")
 ratio.attrs = {"units": "1"}  # not those of the pressure
 ratio
 

@@ -42,7 +42,7 @@ timesteps = [1e-3, 3e-4] if quick else [1e-3, 3e-4, 1e-4, 3e-5]
 
 # %%
 flows = jg.ratio_map([0.2, 0.5], [0.6, 0.65], timestep=timesteps, grains=grains, seeds=seeds, **chosen)
-table = flows[["force_ratio", "force_ratio_stderr"]].sel(packing_fraction=0.6)
+table = flows.to_dataset()[["force_ratio", "force_ratio_stderr"]].sel(packing_fraction=0.6)
 table.round(4).to_dataframe().reset_index().drop(columns="packing_fraction")
 
 # %% [markdown]
@@ -54,8 +54,8 @@ table.round(4).to_dataframe().reset_index().drop(columns="packing_fraction")
 
 # %%
 factors = ["anisotropy", "chaos", "pairs", "binary"]
-loss = {name: flows[f"enskog_factor_pressure_{name}"].sel(packing_fraction=0.6) for name in factors}
-whole = flows.contact_pressure.sel(packing_fraction=0.6) / flows.enskog_pressure.sel(packing_fraction=0.6)
+loss = {name: flows[f"theory/enskog_factor_pressure_{name}"].sel(packing_fraction=0.6) for name in factors}
+whole = (flows["stresses/contact_pressure"] / flows["theory/enskog_pressure"]).sel(packing_fraction=0.6)
 split = xr.Dataset(loss).assign(product=whole)
 split.round(3).to_dataframe().reset_index().drop(columns="packing_fraction")
 
@@ -78,7 +78,7 @@ sizes = [64, 128] if quick else [100, 400, 1600]
 grown = jg.ratio_map([0.5], [0.6], grains=sizes, seeds=1, **chosen).isel(packing_fraction=0, restitution=0)
 share = grown.local_granular_temperature / grown.granular_temperature
 xr.Dataset(
-    {"chaos": grown.enskog_factor_pressure_chaos, "local over granular temperature": share}
+    {"chaos": grown["theory/enskog_factor_pressure_chaos"], "local over granular temperature": share}
 ).to_dataframe().round(3)
 
 # %% [markdown]

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 import typer.main
+from made_up_maps import with_variables
 from synthetic import random_replica
 
 from jaxgran.cli import app, fit, info, measure, run
@@ -78,10 +79,9 @@ def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseExce
 def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
     """Files of maps have the ratios and what is named: to write and read all variables takes a second or two."""
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
-    kept = {f"{name}{end}" for name in names for end in ("", "_stderr")} | {"status"}
-    patch.setattr(
-        results, "write_dataset", lambda data, path: whole(data[[name for name in data if name in kept]], path)
-    )
+    kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
+    kept |= {"status", "seeds/status", "seeds/strain", "seeds/sample_timestep"}
+    patch.setattr(results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path))
 
 
 def files(folder: Path) -> set[str]:

@@ -10,13 +10,7 @@ from matplotlib.colors import same_color
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.plotting import drawing, enskog_factors, map_figures, ratio, theory
-
-
-def leave_out_layout(patch: pytest.MonkeyPatch) -> None:
-    """Figures keep their parts where Matplotlib puts them first: the layout takes longer than all that is drawn."""
-    for module in (drawing, enskog_factors, ratio, theory):
-        patch.setattr(module, "fix_layout", lambda figure: figure.set_layout_engine("none"))
+from jaxgran.plotting import map_figures
 
 
 def legend_texts(figure: Figure) -> list[str]:
@@ -29,7 +23,7 @@ def caption(figure: Figure) -> str:
 
 def write_without_drawing(patch: pytest.MonkeyPatch) -> None:
     """Pictures are files of a few bytes, for tests of which files are written."""
-    patch.setattr(map_figures, "_draw", lambda draw, data, path, *_: Path(path).write_bytes(b"a picture"))
+    patch.setattr(map_figures, "write", lambda _, path, *__: Path(path).write_bytes(b"a picture"))
 
 
 class ContourLine(NamedTuple):

@@ -43,7 +43,9 @@ def made_up_map(seed: int | None = 0, scatter: float = 0.0, noise: float = 1.0) 
         shift = random.normal(size=value.shape) * np.hypot(error, scatter) if seed is not None else 0.0
         variables[name] = (dims, value * np.exp(shift))
         variables[f"{name}_stderr"] = (dims, value * np.exp(shift) * error)
-    data = xr.Dataset(variables, {"packing_fraction": list(NU), "restitution": list(ALPHA)}, {"timestep": 1e-3})
+    data = xr.Dataset(
+        variables, {"packing_fraction": list(NU), "restitution": list(ALPHA)}, {"timestep": 1e-3, "format_version": 2}
+    )
     shear_error = np.hypot(RELATIVE["pressure"], RELATIVE["macroscopic_friction"]) * noise
     data["shear_stress"] = data.pressure * data.macroscopic_friction
     return data.assign(shear_stress_stderr=data.shear_stress * shear_error)
@@ -67,7 +69,14 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
             "status": (dims, np.zeros(excess.shape, int), flags),
         },
         coords={"packing_fraction": nu, "restitution": alpha},
-        attrs={"timestep": 3e-4, "activation": "midpoint", "grains": 256, "seeds": 2, "strain": 5.0},
+        attrs={
+            "format_version": 2,
+            "timestep": 3e-4,
+            "activation": "midpoint",
+            "grains": 256,
+            "seeds": 2,
+            "strain": 5.0,
+        },
     )
 
 
@@ -124,7 +133,13 @@ def dense_map(
         "inertial_number_stderr": (dims, errors[0]),
         "macroscopic_friction": (dims, friction),
         "macroscopic_friction_stderr": (dims, errors[1]),
-        "friction_error_correlation": (dims, np.full(number.shape, correlation)),
+        "diagnostics/friction_error_correlation": (dims, np.full(number.shape, correlation)),
         "status": (dims, np.zeros(number.shape, int)),
     }
     return xr.Dataset(variables, {"packing_fraction": nu, "restitution": list(alphas)})
+
+
+def with_variables(data: xr.DataTree, *names: str) -> xr.DataTree:
+    """Return a map with only the named variables, as ``NAME`` or ``GROUP/NAME``."""
+    kept = {node.path: [x for x in node.data_vars if f"{node.path}/{x}".strip("/") in names] for node in data.subtree}
+    return xr.DataTree.from_dict({path: data[path].to_dataset()[chosen] for path, chosen in kept.items()})

@@ -31,7 +31,7 @@ _OPTIONS = (
 
 
 @cache
-def page_map() -> xr.Dataset:
+def page_map() -> xr.DataTree:
     """A map of 2 time steps × 2 × 3 points: one is bad, one was not run, and names and attributes hold markup."""
     settings = MapSettings(
         (0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=2, timestep=(1e-3, 5e-4), strain=2.0, snapshots=True
@@ -46,7 +46,8 @@ def page_map() -> xr.Dataset:
             results[point, 1] = random_replica(rng, settings, status)
     data = map_dataset(settings, results, {"title": MARKUP})
     own = data.force_ratio.assign_attrs(long_name=MARKUP, units="<i>σ</i>") ** 2
-    return data.assign({"own <u>name</u>": own.assign_attrs(long_name=MARKUP, units="<i>σ</i>")})
+    data["own <u>name</u>"] = own.assign_attrs(long_name=MARKUP, units="<i>σ</i>")
+    return data
 
 
 def made_up_film(frames: int = 5) -> Film:

@@ -290,8 +290,8 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "contours of a line": (lambda: jg.ratio_contours(ratio_dataset(alphas=1)), "at least two restitutions"),
     "one time step": (lambda: jg.ratio_against_timestep(ratio_dataset()), "at least two time steps"),
     "one number of grains": (lambda: jg.averages_against_grains(ratio_dataset()), "at least two numbers of grains"),
-    "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory_pressure"),
-    "no clusters": (lambda: jg.cluster_shares(ratio_dataset()), "it has no cluster_pressure_share"),
+    "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory/pressure"),
+    "no clusters": (lambda: jg.cluster_shares(ratio_dataset()), "it has no stresses/cluster_pressure_share"),
     "no friction": (lambda: jg.friction_figure(ratio_dataset()), "it has no inertial_number"),
     "too few dense points": (lambda: jg.friction_law(dense_map()), "at least 4 points of status ok"),
     "a report that is none": (partial(make_map, "report", 3), "report must be a function of one number"),
@@ -471,9 +471,9 @@ NO_MAPS: dict[str, xr.Dataset] = {
 def test_a_dataset_that_is_no_map_is_refused_by_every_figure(kind: str, tmp_path: Path) -> None:
     data = NO_MAPS[kind]
     for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
-        assert "must be the dataset of a ratio map" in verdict(draw, data)
-    assert "must be the dataset of a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
-    assert "must be the dataset of a ratio map" in verdict(jg.friction_law, data)
+        assert "must be a ratio map" in verdict(draw, data)
+    assert "must be a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
+    assert "must be a ratio map" in verdict(jg.friction_law, data)
     assert not files(tmp_path)
 
 

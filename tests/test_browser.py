@@ -189,7 +189,7 @@ def test_curves_have_the_values_errors_and_theory_of_the_dataset(map_page) -> No
         measured, theory = trace(map_page, chart, "measured"), trace(map_page, chart, "kinetic theory")
         np.testing.assert_allclose(measured["y"], line.pressure, rtol=5e-7)
         np.testing.assert_allclose(measured["error_y"]["array"], line.pressure_stderr, rtol=5e-7)
-        np.testing.assert_allclose(theory["y"], line.theory_pressure, rtol=5e-7)
+        np.testing.assert_allclose(theory["y"], line["theory/pressure"], rtol=5e-7)
 
 
 def test_controls_do_what_they_say(map_page) -> None:
@@ -198,10 +198,12 @@ def test_controls_do_what_they_say(map_page) -> None:
     at = page_map().sel(timestep=1e-3)
     np.testing.assert_allclose(trace(map_page, "plane", "observable")["z"], at.pressure, rtol=5e-7)
     map_page.find_element("id", "choose-quotient").click()
-    np.testing.assert_allclose(trace(map_page, "plane", "observable")["z"], at.pressure / at.theory_pressure, rtol=2e-6)
+    np.testing.assert_allclose(
+        trace(map_page, "plane", "observable")["z"], at.pressure / at["theory/pressure"], rtol=2e-6
+    )
     map_page.find_element("id", "choose-log").click()
     np.testing.assert_allclose(
-        trace(map_page, "plane", "observable")["z"], np.log10(at.pressure / at.theory_pressure), rtol=1e-5, atol=1e-6
+        trace(map_page, "plane", "observable")["z"], np.log10(at.pressure / at["theory/pressure"]), rtol=1e-5, atol=1e-6
     )
     assert map_page.execute_script("return element('against-nu').layout.yaxis.type") == "log"
     assert trace(map_page, "plane", "excess 0.05") is not None
@@ -269,7 +271,7 @@ def test_copied_are_the_table_and_a_command_that_runs(
     command = shlex.split(text)
     assert command[:2] == ["jaxgran", "map"] and "--strain" in command
     assert float(command[command.index("--strain") + 1]) == pytest.approx(
-        4 * float(page_map().strain_by_seed.sel(here(map_page)).mean()), rel=0.01
+        4 * float(page_map()["seeds/strain"].sel(here(map_page)).mean()), rel=0.01
     )
     measured = Mock(side_effect=SystemExit(0))
     monkeypatch.setattr("jaxgran.cli.map.measured", measured)

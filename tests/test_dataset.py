@@ -7,26 +7,31 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from made_up_maps import with_variables
 from synthetic import one_sentence, random_replica
 
-from jaxgran.maps.dataset import NOT_RUN, THEORY, map_dataset
+from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_dataset
+from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES, flattened, path_of
+from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.theory_variables import THEORY
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
-from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
+from jaxgran.sampling.enskog_factors import FACTORS, stress_factors
+from jaxgran.sampling.enskog_factors import STRESSES as FACTOR_STRESSES
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
-FEW = ["force_ratio", "force_ratio_stderr", "status"]
+FEW = ("force_ratio", "force_ratio_stderr", "status", "seeds/status")
 RUN = {"command": "jaxgran map", "wall_time_seconds": 12.0, "replica_steps_per_second": 1e5}
 
 
-POINTS_ALONE = 'data.drop_dims(["seed", "axis_a", "axis_b", "snapshot_grain", "snapshot_pair"], errors="ignore")'
+POINTS_ALONE = 'data.to_dataset().drop_dims(["error_source", "axis_a", "axis_b"])'
 
 
 @pytest.fixture(scope="module")
@@ -44,52 +49,94 @@ def results(settings) -> dict[Key, Replica]:
 
 
 @pytest.fixture(scope="module")
-def data(settings, results) -> xr.Dataset:
+def data(settings, results) -> xr.DataTree:
     return map_dataset(settings, results, RUN)
 
 
 @pytest.fixture(scope="module")
-def few(data) -> xr.Dataset:
-    """Some variables of the map, which are written in no time."""
-    return data[FEW]
+def few(data) -> xr.DataTree:
+    """The main variables of the map, which are written in no time."""
+    return with_variables(data, *FEW)
 
 
 def test_every_observable_has_its_dimensions_errors_and_values_by_seed(data) -> None:
-    assert data.sizes == {"packing_fraction": 2, "restitution": 2, "seed": SEEDS, "axis_a": 2, "axis_b": 2}
+    assert data.sizes == {"packing_fraction": 2, "restitution": 2, "axis_a": 2, "axis_b": 2, "error_source": 5}
     for name in OBSERVABLES:
-        tail = ("axis_a", "axis_b") if name in TENSORS else ()
-        assert data[name].dims == data[f"{name}_stderr"].dims == ("packing_fraction", "restitution", *tail)
-        assert data[f"{name}_by_seed"].dims == ("packing_fraction", "restitution", "seed", *tail)
+        tail, path = ("axis_a", "axis_b") if name in TENSORS else (), path_of(name)
+        assert data[path].dims == data[f"{path}_stderr"].dims == ("packing_fraction", "restitution", *tail)
+        assert data["seeds"][name].dims == ("packing_fraction", "restitution", "seed", *tail)
+
+
+def test_every_observable_has_one_place_and_the_root_is_printed_on_one_screen(data) -> None:
+    assert sorted((*CORE, *STRESSES, *DIAGNOSTICS)) == sorted(OBSERVABLES)
+    assert len(data.data_vars) <= 35
+    assert len(str(data.to_dataset()).splitlines()) <= 45
+
+
+def test_one_seed_has_no_values_by_seed(settings, results) -> None:
+    alone = map_dataset(replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, RUN)
+    assert set(alone["seeds"].data_vars) == {"status", "strain", "equilibration_strain", "sample_timestep"}
+
+
+def test_a_map_is_selected_and_written_as_any_data_of_xarray(data, tmp_path: Path) -> None:
+    assert data.force_ratio.identical(data["force_ratio"])
+    there = data.sel(restitution=0.5, packing_fraction=0.6)
+    assert there.force_ratio == data.force_ratio[1, 0] and there["seeds"].strain.dims == ("seed",)
+    data.to_netcdf(tmp_path / "map.nc", engine="netcdf4")
+    assert xr.load_datatree(tmp_path / "map.nc", engine="netcdf4").equals(data)
+    assert read_dataset(tmp_path / "map.nc").equals(data)
+    assert xr.load_dataset(tmp_path / "map.nc", engine="netcdf4").equals(data.to_dataset())
+    write_dataset(data, tmp_path / "map.nc")
+    alone = xr.load_dataset(tmp_path / "map.nc", group="theory", engine="netcdf4")
+    assert alone.equals(data["theory"].to_dataset())
+
+
+@pytest.mark.parametrize("version", [None, 1, 3])
+def test_a_file_of_another_format_is_refused_in_a_sentence(few, version: int | None, tmp_path: Path) -> None:
+    other = few.copy()
+    del other.attrs["format_version"]
+    if version is not None:
+        other.attrs["format_version"] = version
+    write_dataset(other, tmp_path / "map.nc")
+    with pytest.raises(ValueError, match="and this version of jaxgran reads format_version 2") as caught:
+        read_dataset(tmp_path / "map.nc")
+    assert one_sentence(str(caught.value))
 
 
 def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
+    data = flattened(data)
     assert all(data[name].attrs["long_name"] for name in data.variables)
     without = {name for name in data.variables if "units" not in data[name].attrs}
-    assert without == {"direction_a", "direction_b", "status", "status_by_seed"}
-    by_hand = {"timestep_by_seed": "1 / shear rate", "contact_force": "m sigma / t^2", "pressure_stderr": "m / t^2"}
-    by_hand |= {"pressure": "m / t^2", "granular_temperature": "m sigma^2 / t^2", "max_overlap": "sigma"}
+    assert without == {"axis_a", "axis_b", "error_source", "observable", "status", "seeds/status"}
+    by_hand = {
+        "seeds/sample_timestep": "1 / shear rate",
+        "contact_force": "m sigma / t^2",
+        "pressure_stderr": "m / t^2",
+    }
+    by_hand |= {"pressure": "m / t^2", "granular_temperature": "m sigma^2 / t^2", "diagnostics/max_overlap": "sigma"}
     assert {name: data[name].attrs["reduced_unit"] for name in by_hand} == by_hand
 
 
 def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
-    for name in set(OBSERVABLES) - set(TENSORS) - set(EXTREME_OBSERVABLES):
-        assert data[f"{name}_correlation_strain"].dims == data[name].dims
-    block = data.strain_by_seed.mean("seed") / BLOCKS  # made-up blocks are independent, and no less can be seen
-    lengths = (data.force_ratio_correlation_strain / block).values[0]
+    strains = data["diagnostics/correlation_strain"]
+    assert set(strains.observable.values) == set(OBSERVABLES) - set(TENSORS) - set(EXTREME_OBSERVABLES)
+    block = data["seeds/strain"].mean("seed") / BLOCKS  # made-up blocks are independent, and no less can be resolved
+    lengths = (strains.sel(observable="force_ratio") / block).values[0]
     assert np.all((lengths > 0.8) & (lengths < 4))
 
 
 def test_settings_that_ask_for_an_error_store_it_in_place_of_the_strain(settings, results) -> None:
     asked = map_dataset(replace(settings, error=0.02), results, RUN)
     assert asked.attrs["error"] == 0.02 and "strain" not in asked.attrs
-    np.testing.assert_array_equal(asked.strain_by_seed.shape, (2, 2, SEEDS))
+    np.testing.assert_array_equal(asked["seeds/strain"].shape, (2, 2, SEEDS))
 
 
 def test_prediction_stands_beside_what_is_measured(data) -> None:
     for name in THEORY:
-        assert data[f"theory_{name}"].dims == data[name].dims
-        assert data[f"theory_{name}"].attrs.get("reduced_unit") == data[name].attrs.get("reduced_unit")
-        for there in data[f"theory_{name}"].stack(point=data[name].dims).transpose("point"):
+        predicted = data["theory"][name]
+        assert predicted.dims == data[name].dims
+        assert predicted.attrs.get("reduced_unit") == data[name].attrs.get("reduced_unit")
+        for there in predicted.stack(point=data[name].dims).transpose("point"):
             theory = gaussian_moments(float(there.restitution), float(there.packing_fraction))
             assert float(there) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
 
@@ -97,12 +144,16 @@ def test_prediction_stands_beside_what_is_measured(data) -> None:
 def test_losses_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
     value, error = stress_factors(settings.flows()[0], samples)
-    here = data.sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
-    for stress in STRESSES:
+    here = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
+    for stress in FACTOR_STRESSES:
         for stored, name in [(f"enskog_{stress}", f"enskog_{stress}")] + [
             (f"enskog_factor_{stress}_{factor}", f"{stress}_{factor}") for factor in FACTORS
         ]:
-            assert data[stored].dims == data[f"{stored}_stderr"].dims == ("packing_fraction", "restitution")
+            assert (
+                data["theory"][stored].dims
+                == data["theory"][f"{stored}_stderr"].dims
+                == ("packing_fraction", "restitution")
+            )
             np.testing.assert_array_equal([here[stored], here[f"{stored}_stderr"]], [value[name], error[name]])
 
 
@@ -110,15 +161,15 @@ def test_elastic_flow_has_no_prediction() -> None:
     """Nothing balances the shear at α = 1."""
     data = map_dataset(MapSettings((0.5, 1.0), (0.6,), timestep=1e-5), {}, RUN)
     for name in THEORY:
-        assert np.isnan(data[f"theory_{name}"].values).tolist() == [[False, True]]
+        assert np.isnan(data["theory"][name].values).tolist() == [[False, True]]
 
 
 def test_values_stand_at_their_point_and_seed(data, results) -> None:
     for (point, seed), replica in results.items():
         there = {"packing_fraction": NUS[point // 2], "restitution": ALPHAS[point % 2], "seed": seed}
         for name in ("force_ratio", "pressure", "kinetic_stress"):
-            np.testing.assert_allclose(data[f"{name}_by_seed"].sel(there), replica.sample.averages[name], rtol=1e-12)
-        assert data.equilibration_strain_by_seed.sel(there) == replica.strain
+            np.testing.assert_allclose(data["seeds"][name].sel(there), replica.sample.averages[name], rtol=1e-12)
+        assert data["seeds/equilibration_strain"].sel(there) == replica.strain
 
 
 def test_point_is_the_ratio_of_the_sums_of_its_finite_seeds(data, results) -> None:
@@ -129,8 +180,8 @@ def test_point_is_the_ratio_of_the_sums_of_its_finite_seeds(data, results) -> No
         assert there.force_ratio == pytest.approx(ratio)
         moment = sum(t.contact_moment.sum(axis=0) for t in tallies)
         duration = sum(t.duration.sum() for t in tallies)
-        np.testing.assert_allclose(there.contact_stress, moment / duration / 100.0)
-        assert there.max_overlap == max(t.largest_overlap.max() for t in tallies)
+        np.testing.assert_allclose(there["stresses"].contact_stress, moment / duration / 100.0)
+        assert there["diagnostics"].max_overlap == max(t.largest_overlap.max() for t in tallies)
 
 
 def test_error_of_the_ratio_is_that_of_the_delta_method(data, results) -> None:
@@ -144,7 +195,7 @@ def test_error_of_the_ratio_is_that_of_the_delta_method(data, results) -> None:
 
 def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
     np.testing.assert_array_equal(data.status, [[Status.iteration_limit, Status.nonfinite], [Status.ok, NOT_RUN]])
-    for name in ("status", "status_by_seed"):
+    for name in ("status", "seeds/status"):
         values, meanings = data[name].attrs["flag_values"], data[name].attrs["flag_meanings"].split()
         assert dict(zip(values.tolist(), meanings, strict=True)) == {-1: "not_run", **{s.value: s.name for s in Status}}
         assert data[name].dtype == values.dtype
@@ -152,18 +203,18 @@ def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
 
 def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
     given_up = map_dataset(settings, {**results, (0, 0): None}, RUN)
-    assert given_up.status_by_seed[0, 0, 0] == given_up.status[0, 0] == Status.failed
-    assert np.isnan(given_up.force_ratio_by_seed[0, 0, 0]) and np.isfinite(given_up.force_ratio[0, 0])
+    assert given_up["seeds/status"][0, 0, 0] == given_up.status[0, 0] == Status.failed
+    assert np.isnan(given_up["seeds/force_ratio"][0, 0, 0]) and np.isfinite(given_up.force_ratio[0, 0])
     assert not is_finished(given_up)
 
 
 def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
-    missing = data.sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
-    assert (missing.status_by_seed == NOT_RUN).all()
+    missing = data["seeds"].sel(packing_fraction=0.6, restitution=0.9).isel(seed=[1, 2])
+    assert (missing.status == NOT_RUN).all()
     nothing = map_dataset(settings, {}, {})
     for name in OBSERVABLES:
-        assert np.isnan(missing[f"{name}_by_seed"]).all(), name
-        assert np.isnan(nothing[name]).all() and np.isnan(nothing[f"{name}_stderr"]).all(), name
+        assert np.isnan(missing[name]).all(), name
+        assert np.isnan(nothing[path_of(name)]).all() and np.isnan(nothing[f"{path_of(name)}_stderr"]).all(), name
     assert (nothing.status == NOT_RUN).all()
 
 
@@ -177,20 +228,20 @@ def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: 
     point = ("timestep", "packing_fraction", "restitution")
     for name in OBSERVABLES:
         tail = ("axis_a", "axis_b") if name in TENSORS else ()
-        assert data[name].dims == data[f"{name}_stderr"].dims == (*point, *tail)
-        assert data[f"{name}_by_seed"].dims == (*point, "seed", *tail)
+        assert data[path_of(name)].dims == data[f"{path_of(name)}_stderr"].dims == (*point, *tail)
+        assert data["seeds"][name].dims == (*point, "seed", *tail)
     assert data.status.dims == point
-    for name in ("status_by_seed", "equilibration_strain_by_seed"):
+    for name in ("seeds/status", "seeds/equilibration_strain"):
         assert data[name].dims == (*point, "seed")
     for (k, seed), replica in results.items():
         there = data.sel(timestep=timesteps[k // 2], packing_fraction=NUS[k % 2], restitution=ALPHAS[0])
-        np.testing.assert_allclose(there.pressure_by_seed[seed], replica.sample.averages["pressure"], rtol=1e-12)
+        np.testing.assert_allclose(there["seeds/pressure"][seed], replica.sample.averages["pressure"], rtol=1e-12)
         assert there.status == (Status.deep_overlap if k == 2 else Status.ok)
     assert data.attrs["timestep"] == data.timestep.values.tolist() == list(timesteps)
     assert data.timestep.attrs["reduced_unit"] == "1 / shear rate"
-    few = data[FEW]
+    few = with_variables(data, *FEW)
     write_dataset(few, tmp_path / "map.nc")
-    xr.testing.assert_equal(read_dataset(tmp_path / "map.nc"), few)
+    assert read_dataset(tmp_path / "map.nc").equals(few)
 
 
 def test_a_list_of_one_time_step_keeps_its_dimension() -> None:
@@ -222,11 +273,12 @@ def test_attributes_tell_every_parameter_of_the_run(settings, data) -> None:
 def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     write_dataset(data, tmp_path / "map.nc")
     again = read_dataset(tmp_path / "map.nc")
-    xr.testing.assert_equal(again, data)
-    for name in data.variables:
-        assert set(again[name].attrs) == set(data[name].attrs), name
-        for key, value in data[name].attrs.items():
-            np.testing.assert_array_equal(again[name].attrs[key], value)
+    assert again.equals(data)
+    stored, made = flattened(again), flattened(data)
+    for name in made.variables:
+        assert set(stored[name].attrs) == set(made[name].attrs), name
+        for key, value in made[name].attrs.items():
+            np.testing.assert_array_equal(stored[name].attrs[key], value)
     for key, value in data.attrs.items():
         np.testing.assert_array_equal(again.attrs[key], value)
     assert [path.name for path in tmp_path.iterdir()] == ["map.nc"]
@@ -333,15 +385,22 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
     for nu in NUS:
         for alpha in ALPHAS:
             point = data.sel(packing_fraction=nu, restitution=alpha)
-            numbers = {name: float(point[name]) for name in data.data_vars if point[name].ndim == 0}
+            point = flattened(point)
+            numbers = {
+                path.split("/")[-1]: float(x) for path, x in point.items() if x.ndim == 0 and "theory" not in path
+            }
             errors = {name: numbers.get(f"{name}_stderr", np.nan) for name in numbers}
             budget = error_budget(
                 numbers, errors, alpha, nu, settings.grains, settings.timestep, settings.solver.tolerance
             )
             for name, parts in budget.items():
-                for part, ending in (("timestep", "error_timestep"), ("size", "error_size"), ("error", "error")):
-                    assert numbers[f"{name}_{ending}"] == pytest.approx(float(getattr(parts, part)), nan_ok=True)
-                assert f"{name}_error" in data[name].attrs["ancillary_variables"].split()
+                for part in ("timestep", "size", "tolerance"):
+                    stored = float(point[f"{name}_ci95"].sel(error_source=part))
+                    assert stored == pytest.approx(float(getattr(parts, part)), nan_ok=True)
+                total, *others = point[f"{name}_ci95"].values
+                assert total == pytest.approx(float(parts.error), nan_ok=True)
+                assert total == pytest.approx(np.sqrt(np.sum(np.square(others))), nan_ok=True)
+                assert f"{name}_ci95" in data[name].attrs["ancillary_variables"].split()
 
 
 def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: Path) -> None:
@@ -357,17 +416,17 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
         point = found.sel(packing_fraction=nu, restitution=alpha)
         size = float(size_error(alpha, nu, grains))
         expected = size / (1 - size)
-        assert float(point.pressure_error_size / abs(point.pressure)) == pytest.approx(expected)
-    write_dataset(found[FEW], tmp_path / "map.nc")
+        assert float(point.pressure_ci95.sel(error_source="size") / abs(point.pressure)) == pytest.approx(expected)
+    write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
     assert MapSettings(**choices_of(read_dataset(tmp_path / "map.nc"))) == chosen
 
 
-def test_table_of_a_map_has_a_row_for_each_point(data: xr.Dataset) -> None:
+def test_table_of_a_map_has_a_row_for_each_point(data: xr.DataTree) -> None:
     tutorial = Path(__file__).parents[1] / "docs" / "tutorial.md"
     assert f"{POINTS_ALONE}.to_dataframe()" in tutorial.read_text(encoding="utf-8")
     table = eval(POINTS_ALONE, {"data": data}).to_dataframe()
     assert len(table) == len(ALPHAS) * len(NUS)
-    assert {name for name in OBSERVABLES if name not in TENSORS} <= set(table.columns)
+    assert {name for name in CORE if name not in TENSORS} <= set(table.columns)
     np.testing.assert_array_equal(
         table.loc[0.6, 0.9].pressure, data.pressure.sel(packing_fraction=0.6, restitution=0.9)
     )

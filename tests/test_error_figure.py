@@ -5,6 +5,7 @@ import pytest
 from drawn import caption, legend_texts
 from made_up_maps import ratio_dataset
 
+from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.errors import dominating_errors
 
@@ -17,12 +18,13 @@ def with_budget(largest: str | None):
     dims, value = data.force_ratio.dims, data.force_ratio.values
     for name in ("force_ratio", "pressure", "granular_temperature"):
         stderr = (0.001 if largest else 0.1) * value
+        parts = {"total": 0.2 * value, "sampling": 1.96 * stderr}
+        parts |= {part: (0.19 if part == largest else 0.001) * value for part in PARTS}
+        ci95 = np.stack([parts[source] for source in ERROR_SOURCES], axis=-1)
         data = data.assign(
-            {name: (dims, value), f"{name}_stderr": (dims, stderr), f"{name}_error": (dims, 0.2 * value)}
+            {name: (dims, value), f"{name}_stderr": (dims, stderr), f"{name}_ci95": ((*dims, "error_source"), ci95)}
         )
-        for part in PARTS:
-            data[f"{name}_error_{part}"] = (dims, (0.19 if part == largest else 0.001) * value)
-    return data
+    return data.assign_coords(error_source=list(ERROR_SOURCES))
 
 
 @pytest.mark.parametrize("largest", [None, *PARTS])
@@ -46,5 +48,5 @@ def test_a_point_without_a_value_has_no_mark() -> None:
 
 
 def test_a_map_without_a_budget_is_refused_in_a_sentence() -> None:
-    with pytest.raises(InputError, match="no error budget"):
+    with pytest.raises(InputError, match="it has no pressure, granular_temperature, force_ratio_ci95"):
         dominating_errors(ratio_dataset())

@@ -60,8 +60,8 @@ def test_a_worker_that_is_killed_is_replaced(lab: Lab) -> None:
     done = lab.finish(process)
     assert done.returncode == 0, done.stderr
     data = read_dataset(lab.folder / "worker.nc")
-    for name in (name for name in data.variables if name.endswith("_by_seed")):
-        xr.testing.assert_equal(data[name], lab.whole[name].isel(seed=[0]))
+    for name in data["seeds"].data_vars:
+        xr.testing.assert_equal(data["seeds"][name], lab.whole["seeds"][name].isel(seed=[0]))
 
 
 def test_a_map_that_is_interrupted_tells_the_command_that_continues_it(lab: Lab) -> None:

@@ -117,22 +117,8 @@ def test_levels_not_reached_are_named() -> None:
 def test_contours_have_a_band_of_the_error_of_interpolation_between_the_points() -> None:
     data = ratio_dataset(alphas=3, nus=3)
     assert "± interpolation" in legend_texts(ratio_contours(data))
-    assert "of the excess" in caption(ratio_contours(data)) and "found to" in caption(ratio_contours(data))
+    assert "interpolation error of the excess: median" in caption(ratio_contours(data))
     assert "± interpolation" not in legend_texts(ratio_contours(ratio_dataset(alphas=2, nus=2)))
-
-
-def test_error_bars_have_no_caps_over_the_marks() -> None:
-    containers = ratio_curves(ratio_dataset()).axes[0].containers
-    assert not any(container.lines[1] for container in containers)
-
-
-def test_labels_of_contours_lie_within_the_frame() -> None:
-    for data in (ratio_dataset(2, 2), ratio_dataset(3, 3)):
-        figure = ratio_contours(data.assign(force_ratio=data.force_ratio + 0.5 * (data.force_ratio - 1)))
-        frame = figure.axes[0].bbox.padded(1)
-        for text in figure.axes[0].texts:
-            box = text.get_window_extent()
-            assert frame.contains(*box.min) and frame.contains(*box.max)
 
 
 def test_error_bars_have_the_length_of_the_standard_error() -> None:
@@ -318,36 +304,6 @@ def test_time_steps_without_any_value_are_drawn() -> None:
     assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
 
 
-@pytest.mark.parametrize(("alphas", "nus"), [(4, 2), (10, 12)])
-def test_panels_of_time_steps_do_not_overlap(alphas: int, nus: int) -> None:
-    data = with_timesteps(ratio_dataset(alphas, nus), 1e-3, 3e-4, 1e-5)
-    data.status[0, 1, 0] = 1
-    figure = ratio_against_timestep(data)
-    figure.canvas.draw()
-    texts = [figure._supxlabel, figure._supylabel]
-    boxes = [artist.get_window_extent() for artist in (*texts, *figure.legends)]
-    boxes += [axes.get_tightbbox() for axes in figure.axes]
-    for k, box in enumerate(boxes):
-        assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
-        assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
-    for axes in figure.axes:
-        labels = [t.get_window_extent() for t in axes.get_xticklabels() if t.get_visible() and t.get_text()]
-        labels = [box for box in labels if axes.bbox.x0 <= (box.x0 + box.x1) / 2 <= axes.bbox.x1]
-        assert not any(box.overlaps(other) for k, box in enumerate(labels) for other in labels[:k])
-
-
-def test_nothing_overlaps_on_the_page() -> None:
-    data = ratio_dataset()
-    data.status[5, 0] = 1
-    for figure in (ratio_curves(with_stress_ratio(data)), ratio_contours(no_value(data, (5, 2)))):
-        figure.canvas.draw()
-        axes, text = [axes.get_tightbbox() for axes in figure.axes], figure._supxlabel.get_window_extent()
-        boxes = [*axes, text, *(legend.get_window_extent() for legend in figure.legends)]
-        for k, box in enumerate(boxes):
-            assert figure.bbox.padded(1).contains(*box.min) and figure.bbox.padded(1).contains(*box.max)
-            assert not any(box.overlaps(other.padded(-1)) for other in boxes[:k])
-
-
 def test_files_are_written_whole(tmp_path: Path) -> None:
     written = save_figures(ratio_dataset(), tmp_path / "my.map")
     assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
@@ -363,14 +319,13 @@ def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes,
     assert first.startswith(start) and first == second
 
 
-def test_a_picture_without_caption_has_the_same_axes_and_is_lower(tmp_path: Path) -> None:
+def test_a_picture_has_the_resolution_asked_for_with_and_without_caption(tmp_path: Path) -> None:
     sizes = {}
     for caption_, dpi in ((True, 100), (False, 100), (True, 50)):
         path, *_ = save_figures(ratio_dataset(alphas=1), tmp_path / "map", dpi=dpi, caption=caption_)
         sizes[caption_, dpi] = imread(path).shape[:2]
     assert sizes[True, 100] == tuple(2 * np.array(sizes[True, 50]))
-    assert sizes[False, 100][1] == sizes[True, 100][1]
-    assert 10 < sizes[True, 100][0] - sizes[False, 100][0] < 40
+    assert sizes[False, 100] == sizes[True, 100]
 
 
 @pytest.mark.parametrize("choice", [{"format": "gif"}, {"format": None}, {"dpi": 49}, {"dpi": 1e9}, {"dpi": "many"}])

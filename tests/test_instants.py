@@ -11,11 +11,11 @@ import xarray as xr
 from synthetic import random_instant, random_replica, snapshot_of
 
 from jaxgran.analysis.instant import averaged, instant_of
-from jaxgran.maps import instants
-from jaxgran.maps import ratio_map as sweep
+from jaxgran.maps import instants, ratio_map
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.instants import first_of_points, instant_variables
+from jaxgran.maps.points import PointGrid
 from jaxgran.maps.ratio_map import replicas
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
@@ -67,7 +67,7 @@ def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_insta
 
 def test_first_good_seed_of_every_point_has_an_instant_in_any_batch(with_instants) -> None:
     assert {key for key, replica in with_instants.items() if replica.instant} == {(0, 0), (1, 0)}
-    alone = sweep._run_task(replace(SETTINGS, snapshots=True), [(1, 0)])
+    alone = ratio_map._run_task(replace(SETTINGS, snapshots=True), [(1, 0)])
     jax.tree.map(np.testing.assert_array_equal, dict(alone)[1, 0], with_instants[1, 0])
 
 
@@ -114,36 +114,34 @@ def test_dataset_has_the_instant_of_each_point_and_keeps_it_through_a_file_and_a
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
     written = kept(settings)
     whole = map_dataset(settings, written, {})
-    names = [name for name in whole if str(name).startswith("snapshot_")]
-    write_dataset(whole[["force_ratio", "force_ratio_stderr", "status", *names]], tmp_path / "map.nc")
+    write_dataset(whole, tmp_path / "map.nc")
     data = read_dataset(tmp_path / "map.nc")
-    assert data.snapshot_x.dims == ("packing_fraction", "restitution", "snapshot_grain")
-    assert data.snapshot_force.dims == ("packing_fraction", "restitution", "snapshot_pair")
-    assert len(names) == 11 and all(data[name].attrs["long_name"] and data[name].attrs["units"] for name in names)
+    assert data["snapshots"].x.dims == ("packing_fraction", "restitution", "grain")
+    assert data["snapshots"].force.dims == ("packing_fraction", "restitution", "pair")
+    variables = data["snapshots"].data_vars.values()
+    assert len(variables) == 11 and all(one.attrs["long_name"] and one.attrs["units"] for one in variables)
     for point, found in first_of_points(written).items():
-        here = data.isel(packing_fraction=point // 2, restitution=point % 2)
-        grains, pairs = int((here.snapshot_radius > 0).sum()), int((here.snapshot_pair_i >= 0).sum())
+        here = data["snapshots"].isel(packing_fraction=point // 2, restitution=point % 2)
+        grains, pairs = int((here.radius > 0).sum()), int((here.pair_i >= 0).sum())
         assert (grains, pairs) == (len(found.radii), len(found.force))
-        np.testing.assert_allclose(here.snapshot_x[:grains], found.positions[:, 0], atol=2e-5)
-        np.testing.assert_allclose(here.snapshot_y[:grains], found.positions[:, 1], atol=2e-5)
+        np.testing.assert_allclose(here.x[:grains], found.positions[:, 0], atol=2e-5)
+        np.testing.assert_allclose(here.y[:grains], found.positions[:, 1], atol=2e-5)
         for name, values in (("radius", found.radii), ("speed", found.speed)):
-            np.testing.assert_allclose(here[f"snapshot_{name}"][:grains], values, rtol=2.0**-12)
-        np.testing.assert_allclose(here.snapshot_force[:pairs], found.force, rtol=2.0**-12)
-        np.testing.assert_array_equal(np.stack([here.snapshot_pair_i, here.snapshot_pair_j], -1)[:pairs], found.pairs)
-        np.testing.assert_array_equal(here.snapshot_clustered[:pairs], found.clustered)
-        assert (float(here.snapshot_side), float(here.snapshot_tilt)) == (10.0, 0.2)
-    empty = data.isel(packing_fraction=1, restitution=0)
-    assert np.isnan(empty.snapshot_side) and np.isnan(empty.snapshot_x).all() and (empty.snapshot_pair_i == -1).all()
+            np.testing.assert_allclose(here[name][:grains], values, rtol=2.0**-12)
+        np.testing.assert_allclose(here.force[:pairs], found.force, rtol=2.0**-12)
+        np.testing.assert_array_equal(np.stack([here.pair_i, here.pair_j], -1)[:pairs], found.pairs)
+        np.testing.assert_array_equal(here.clustered[:pairs], found.clustered)
+        assert (float(here.side), float(here.tilt)) == (10.0, 0.2)
+    empty = data["snapshots"].isel(packing_fraction=1, restitution=0)
+    assert np.isnan(empty.side) and np.isnan(empty.x).all() and (empty.pair_i == -1).all()
     assert MapSettings(**choices_of(data)) == settings
-    assert "snapshot_x" not in map_dataset(replace(settings, snapshots=False), written, {})
-    data.attrs.pop("snapshots")  # as in an older file
-    assert MapSettings(**choices_of(data)) == replace(settings, snapshots=False)
+    assert "snapshots" not in map_dataset(replace(settings, snapshots=False), written, {}).children
 
 
 def test_map_of_120_points_of_a_thousand_grains_has_less_than_three_megabytes(tmp_path: Path) -> None:
     """A quarter of it is written. The rest of the dataset takes half a megabyte."""
-    variables = instant_variables(("point",), (30,), {k: random_instant(k, 1000, 900) for k in range(30)})
-    write_dataset(xr.Dataset(variables), tmp_path / "map.nc")
+    variables = instant_variables(PointGrid(("point",), (30,)), {k: random_instant(k, 1000, 900) for k in range(30)})
+    write_dataset(xr.DataTree(xr.Dataset(variables)), tmp_path / "map.nc")
     assert 4 * (tmp_path / "map.nc").stat().st_size < 2.4e6
 
 
@@ -158,5 +156,5 @@ def test_instant_of_a_batch_that_continues_from_its_journal_is_the_same(
     monkeypatch.setattr("jaxgran.maps.journal.SECONDS", 0.0)
     for journal_there in (False, True):
         assert (tmp_path / "journal.nc").exists() == journal_there
-        done = dict(sweep._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
+        done = dict(ratio_map._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
         jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_instants[1, 0])

@@ -19,7 +19,7 @@ def uneven_map() -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
 def test_a_plane_has_no_error() -> None:
     data, x, y = uneven_map()
     np.testing.assert_allclose(interpolation_error(data, 2 + 3 * x - 5 * y), 0.0, atol=1e-13)
-    assert "found to 0 %" in left_out_note(data, [np.zeros_like(x)], "it")
+    assert "median 0 %" in left_out_note(data, [np.zeros_like(x)], "it")
 
 
 def test_error_of_a_parabola_is_that_of_its_interpolation() -> None:
@@ -45,6 +45,6 @@ def test_note_has_the_errors_of_points_that_are_left_out() -> None:
     x = 1 - data.restitution.values
     step = x[0] - x[1]
     note = left_out_note(data, [np.stack([x**2, x**2])], "the parabola")
-    assert note.endswith(f"half are found to {100 * step**2:.2g} % of the parabola, 9 of 10 to {100 * step**2:.2g} %")
+    assert note.endswith(f"of the parabola: median {100 * step**2:.2g} %, 90th percentile {100 * step**2:.2g} %")
     assert "too few" in left_out_note(ratio_dataset(2, 2), [np.ones((2, 2))], "nothing")
     assert "too few" in left_out_note(data, [np.stack([x**2, x**2])], "nothing", np.zeros((2, 7), bool))

@@ -247,17 +247,10 @@ def test_the_kernel_lowers_for_a_gpu(count, dtype, monkeypatch) -> None:
         return jax.ShapeDtypeStruct((replicas, *shape), dtype)
 
     state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
-<<<<<<< HEAD
     way = kernel if count > 16 else advance_module  # the latter is traced with the plain advance
     advance = jax.vmap(
         partial(way.advance_by_pallas, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS
     )
-=======
-    way = (
-        advance_module.advance_by_pallas if count == 16 else kernel.advance_by_pallas
-    )  # the former is traced with the plain advance
-    advance = jax.vmap(partial(way, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS)
->>>>>>> suite
     with without_a_gpu():
         traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
         text = traced.lower(lowering_platforms=("cuda",)).as_text()

@@ -12,7 +12,6 @@ from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import is_finished, read_dataset
-from jaxgran.maps.schema import ERROR_PARTS
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
@@ -28,8 +27,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
     Their own files have what is printed and what decides which pictures there are.
     """
     write_without_drawing(patch)
-    errors = {f"{name}_{ending}" for name in BUDGET for ending, _ in ERROR_PARTS.values()}
-    write_few_variables(patch, "timestep_by_seed", *BUDGET, *errors, *SHARES)
+    write_few_variables(patch, *BUDGET, *SHARES)
     patch.setattr(ratio_map_module, "replicas", made_up_replicas(BOTH))
 
 

@@ -58,7 +58,7 @@ def test_variance_of_a_point_is_that_of_friction_and_of_inertial_number_times_sq
 
 def test_a_map_that_does_not_know_the_correlation_of_its_errors_is_fitted_without_it() -> None:
     data = dense_map()
-    old = fit(data.drop_vars("friction_error_correlation"))
+    old = fit(data.drop_vars("diagnostics/friction_error_correlation"))
     np.testing.assert_array_equal(old.friction.parameters, fit(data).friction.parameters)
 
 

@@ -215,7 +215,7 @@ def _ratio_table(data, name: str, ratio, stderr) -> Table:
 
 def _large_system_table(data) -> Table:
     """The estimates for a large system, a row for each point."""
-    from jaxgran.maps.large_system import BOUNDS, LIMIT_SEEN
+    from jaxgran.maps.large_system import BOUNDS, CONVERGED
 
     title = f"Large systems at dt = {data.attrs['timestep']:g} / shear rate; ± bounds the error of sampling and size"
     columns = ["packing fraction", "restitution", *(name.replace("_", " ") for name in BOUNDS)]
@@ -225,8 +225,8 @@ def _large_system_table(data) -> Table:
             point = data.sel(packing_fraction=nu, restitution=alpha)
             cells = []
             for name in BOUNDS:
-                value, error = float(point[f"{name}_large_system"]), float(point[f"{name}_large_system_error"])
-                no_limit = int(point[f"{name}_converged"]) == LIMIT_SEEN["no_converged"]
-                cells.append("no limit seen" if no_limit else with_error(value, error))
+                value, error = (float(point[f"large_system/{name}{end}"]) for end in ("", "_ci95"))
+                no_limit = int(point[f"large_system/{name}_converged"]) == CONVERGED["not_converged"]
+                cells.append("not converged" if no_limit else with_error(value, error))
             table.rows.append([f"{nu:g}", f"{alpha:g}", *cells])
     return table

@@ -180,12 +180,13 @@ def _say_resumed(checkpoint, count: int) -> None:
 
 def _say_imprecise(data) -> None:
     """Print the largest whole error beside its target, and the sampled strains, if a target was given."""
+    from jaxgran.maps.schema import relative_ci95
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
         return
-    worst = max(float((data[f"{name}_error"] / abs(data[name])).max()) for name in ERROR_OBSERVABLES)
-    strain = data.strain_by_seed
+    worst = max(float(relative_ci95(data, name)["total"].max()) for name in ERROR_OBSERVABLES)
+    strain = data["seeds/strain"]
     say(
         f"whole relative errors: {data.attrs['error']:g} asked for, {worst:.2g} at the worst point; strains of "
         f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
@@ -194,13 +195,13 @@ def _say_imprecise(data) -> None:
 
 def print_budget(data) -> None:
     """Print the parts of the whole error: those of each point, or their median and largest over a map."""
-    from jaxgran.maps.schema import relative_parts
+    from jaxgran.maps.schema import relative_ci95
 
     title = f"Whole error, 95 %, relative to a large system{'' if data.status.size == 1 else ': median (largest)'}"
     table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "together"))
     for name in _BUDGETED:
-        parts = relative_parts(data, name)
-        ordered = (parts[part] for part in ("sampling", "timestep", "size", "tolerance", "error"))
+        parts = relative_ci95(data, name)
+        ordered = (parts[part] for part in ("sampling", "timestep", "size", "tolerance", "total"))
         cells = [_percent(part) for part in ordered]
         cells[1] = "at its dt" if name == "force_ratio" else cells[1]
         table.rows.append([name.replace("_", " "), *cells])
@@ -221,9 +222,9 @@ def _percent(part) -> str:
 def _say_retried(data) -> None:
     """Print how many replicas failed and were run again with half the time step."""
     timestep = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
-    retried = int((data.timestep_by_seed < 0.75 * timestep).sum())
+    retried = int((data["seeds/sample_timestep"] < 0.75 * timestep).sum())
     if retried:
-        say(f"retried with half the time step: {retried} replicas, see timestep_by_seed.")
+        say(f"retried with half the time step: {retried} replicas, see sample_timestep in the group seeds.")
 
 
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool = False) -> None:
@@ -239,7 +240,7 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool = Fals
         say(short_in_words(data, short, "--strain "))
     if interrupted:
         missing = len(bad.get("not_run", []))
-        started = can_resume and bool((data.status_by_seed >= 0).any())
+        started = can_resume and bool((data["seeds/status"] >= 0).any())
         saved = "; what is done is saved" if started or written else ""
         resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
         stop_interrupted(f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}")

@@ -189,7 +189,7 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 
 def _summary_table(data) -> Table:
     """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
-    from jaxgran.maps.schema import shear_stress_ratio
+    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
     grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
@@ -199,8 +199,9 @@ def _summary_table(data) -> Table:
     )
     columns = ("observable", "value ± standard error", "unit", "effective samples", "kinetic theory")
     table = Table(title, columns, numbers=False)
-    point = data.isel(packing_fraction=0, restitution=0)
-    strain = float(point.strain_by_seed.sum())
+    point = flattened(data).isel(packing_fraction=0, restitution=0)
+    strain = float(point["seeds/strain"].sum())
+    correlated = point["diagnostics/correlation_strain"].to_series().to_dict()
 
     def number(name: str) -> float:
         return float(point[name]) if name in point else math.nan
@@ -210,10 +211,10 @@ def _summary_table(data) -> Table:
     for group, names in {**_GROUPS, _LAST_GROUP: others}.items():
         table.rows.append([group])
         for name in names:
-            value = with_error(number(name), number(f"{name}_stderr"))
+            value = with_error(number(path_of(name)), number(f"{path_of(name)}_stderr"))
             unit = OBSERVABLES[name][1].replace("sigma", "σ").replace("^2", "²").replace(" ", "")
-            samples = strain / number(f"{name}_correlation_strain")
-            theory = number(f"theory_{name}")
+            samples = strain / correlated.get(name, math.nan)
+            theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
             table.rows.append([name.replace("_", " "), value, "" if unit == "1" else unit, *texts])
             if name == "force_ratio":

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from scipy.optimize import brentq
 
 from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, excess_terms, require_jamming, stress_terms
-from jaxgran.maps.schema import finest, require_map
+from jaxgran.maps.schema import MapData, finest, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
@@ -32,7 +32,7 @@ _MAX_ITERATIONS = 200  # of L-BFGS
 _GRADIENT_TOLERANCE = 1e-4  # of L-BFGS, for coefficients in units of their standard errors
 
 
-def fit_closure(data: xr.Dataset, jamming_fraction: float = JAMMING) -> Closure:
+def fit_closure(data: MapData, jamming_fraction: float = JAMMING) -> Closure:
     """Fit the closure to a ratio map.
 
     The weights come from the standard errors of the points and from their scatter about the law. The scatter of each
@@ -83,7 +83,7 @@ class Points(NamedTuple):
         return self._replace(**{name: getattr(self, name)[which] for name in self._fields if name != "timestep"})
 
 
-def closure_points(data: xr.Dataset, fewest: int = FEWEST_POINTS) -> Points:
+def closure_points(data: MapData, fewest: int = FEWEST_POINTS) -> Points:
     """The points that :func:`fit_closure` fits: of status ok, positive, with known errors, and with α < 1."""
     data = finest(data)
     alpha, nu = (data[name].astype(float).values for name in ("restitution", "packing_fraction"))

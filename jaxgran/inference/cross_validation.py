@@ -17,11 +17,11 @@ from jaxgran.inference.closure_fit import (
     table,
 )
 from jaxgran.inference.stress_inversion import estimate_restitution
-from jaxgran.maps.schema import finest, require_map
+from jaxgran.maps.schema import MapData, finest, require_map
 from jaxgran.sampling.timestep import JAMMING
 
 
-def leave_one_out(data: xr.Dataset, jamming_fraction: float = JAMMING) -> xr.Dataset:
+def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Dataset:
     """Predict every point of a map by the closure fitted to all other points.
 
     ================  ===============================  ==============================================================
@@ -94,7 +94,7 @@ def _correlation(pressure: np.ndarray, shear: np.ndarray, friction: np.ndarray) 
     return np.clip((pressure**2 + shear**2 - friction**2) / (2 * product), -1.0, 1.0)
 
 
-def _as_map(data: xr.Dataset, points: Points, columns: dict[str, np.ndarray]) -> xr.Dataset:
+def _as_map(data: MapData, points: Points, columns: dict[str, np.ndarray]) -> xr.Dataset:
     """Values at the fitted points as variables of the map, NaN elsewhere."""
     dims = ("packing_fraction", "restitution")
     shape = tuple(data.sizes[name] for name in dims)

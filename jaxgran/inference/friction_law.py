@@ -16,7 +16,7 @@ import numpy as np
 import scipy  # its parts are loaded when they are used: that for fits takes longer than a figure
 import xarray as xr
 
-from jaxgran.maps.schema import finest, require_map
+from jaxgran.maps.schema import MapData, finest, require_map
 from jaxgran.model.checks import InputError, require_number
 from jaxgran.model.status import Status
 
@@ -26,7 +26,7 @@ FEWEST_POINTS = 4  # for the three parameters of a law
 FEWEST_PACKING_FRACTIONS = 3  # among the points
 NEEDED = ("inertial_number", "inertial_number_stderr", "macroscopic_friction", "macroscopic_friction_stderr")
 """Variables of a map that a friction law needs."""
-CORRELATION = "friction_error_correlation"
+CORRELATION = "diagnostics/friction_error_correlation"
 """Variable of the correlation of the errors of friction and inertial number."""
 
 _EXPONENTS = (0.05, 4.0)  # smallest and largest of a fit; an exponent at either end is not determined
@@ -88,7 +88,7 @@ class FrictionLaw:
 
 
 def friction_law(
-    data: xr.Dataset,
+    data: MapData,
     largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
     smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
 ) -> FrictionLaw:
@@ -96,7 +96,7 @@ def friction_law(
 
     The fit is by least squares with the effective variance: the variance of a point is that of y plus that of I times
     the squared slope of the law, less twice the slope times their covariance. It is found by iteration. A map without
-    `friction_error_correlation` is fitted as if the errors of μ and I were independent.
+    `diagnostics/friction_error_correlation` is fitted as if the errors of μ and I were independent.
 
     =========================  ===============================  =====================================================
     data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
@@ -144,7 +144,7 @@ def is_dense(
 
 
 def dense_points(
-    data: xr.Dataset,
+    data: MapData,
     largest_inertial_number: float = LARGEST_INERTIAL_NUMBER,
     smallest_packing_fraction: float = SMALLEST_PACKING_FRACTION,
 ) -> xr.Dataset:

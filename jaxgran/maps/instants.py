@@ -1,22 +1,23 @@
-"""The instants that a map keeps with ``snapshots``: one of every point, taken after its sample.
+"""Instants, stored by a map with ``snapshots``: grains and forces of one replica of each point, after its sample.
 
-A replica is advanced from its last state by a short strain, and every time step of it is a snapshot. This is after the
-sample, so the numbers of a map are the same with and without instants.
+The replica is advanced from its last state by a short strain, over which the forces are averaged. The sample is not
+affected, so the averages of a map are the same with and without instants.
 
-Of each point the first good replica counts. A batch cannot see other batches, so it takes an instant of the first good
-replica of each of its points. The first good one of all is then among them.
+The stored instant is that of the first good seed of a point. Batches do not communicate, so each batch takes an instant
+of the first good replica of each of its points, and the map selects from them.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from operator import itemgetter
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 
 from jaxgran.analysis.instant import Instant, averaged, instant_of
 from jaxgran.dynamics.engine import Numerics
+from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -29,18 +30,18 @@ WINDOW = 0.002
 """Strain over which the forces of an instant are averaged."""
 
 _MOST_STEPS = 1000  # of the window, where the time step is very short
-_BITS = 12  # binary digits that a file keeps of a number; the zeros after them need no space
-_POSITION_BITS = 18  # the same for positions, which are compared with a radius and may be 50 times as large
+_BITS = 12  # binary digits of a stored number; the zeros after them compress well
+_POSITION_BITS = 18  # of positions, which may be 50 times as large as a radius
 _PACKED = {"zlib": True, "shuffle": True, "complevel": 4}
 _NO_GRAIN = -1
-_GRAIN, _PAIR = ("snapshot_grain",), ("snapshot_pair",)
+_GRAIN, _PAIR = ("grain",), ("pair",)
 _MEANINGS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "x": ("position of a grain along the flow, from the centre of the sheared cell", "sigma", _GRAIN),
     "y": ("position of a grain along the gradient, from the centre of the sheared cell", "sigma", _GRAIN),
     "radius": ("radius of a grain", "sigma", _GRAIN),
     "speed": ("peculiar speed of a grain", "sigma / t", _GRAIN),
-    "pair_i": ("first grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
-    "pair_j": ("second grain of a pair that pushes, -1 behind the last pair", "1", _PAIR),
+    "pair_i": ("first grain of a pair in contact, -1 after the last pair", "1", _PAIR),
+    "pair_j": ("second grain of a pair in contact, -1 after the last pair", "1", _PAIR),
     "force": ("mean force between the grains of a pair over the window", "m sigma / t^2", _PAIR),
     "clustered": ("whether most of the force of a pair acts within clusters of three or more grains", "1", _PAIR),
     "side": ("side of the cell", "sigma", ()),
@@ -60,10 +61,14 @@ def first_instants(batch: Batch, task: Sequence[Key]) -> list[Instant | None]:
     return found
 
 
-def first_of_points(results: Mapping[Key, Replica]) -> dict[int, Instant]:
+def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, Instant]:
     """The instant of the first good seed of every point that has one."""
-    kept = {key: one.instant for key, one in results.items() if one.status < Status.infeasible}
-    return {point: one for (point, _), one in sorted(kept.items(), reverse=True, key=itemgetter(0)) if one is not None}
+    good = {
+        key: one.instant
+        for key, one in replicas.items()
+        if one is not None and one.status < Status.infeasible and one.instant is not None
+    }
+    return {point: good[point, seed] for point, seed in sorted(good, reverse=True)}
 
 
 def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
@@ -123,19 +128,17 @@ def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[Instant | None]:
     return found
 
 
-def instant_variables(
-    dims: tuple[str, ...], shape: tuple[int, ...], instants: Mapping[int, Instant]
-) -> dict[str, tuple[Any, ...]]:
-    """The variables snapshot_NAME of a map, packed.
+def instant_variables(grid: PointGrid, instants: Mapping[int, Instant]) -> dict[str, xr.Variable]:
+    """The group ``snapshots`` of a map, packed.
 
-    Points have different numbers of pairs, and may have different numbers of grains. Behind the last one, numbers of
-    grains are −1 and all other numbers NaN. A point without an instant has none.
+    Points have different numbers of pairs, and may have different numbers of grains. Unused elements are −1 for indices
+    of grains, and NaN otherwise.
 
     Args:
-      dims, shape: names and sizes of the dimensions of a point.
+      grid: the dimensions of a point.
       instants: instants by the number of the point.
     """
-    count = int(np.prod(shape))
+    count = math.prod(grid.shape)
     grains = max((len(one.radii) for one in instants.values()), default=0)
     pairs = max((len(one.force) for one in instants.values()), default=0)
     of_grains, of_pairs = (count, grains), (count, pairs)
@@ -162,10 +165,8 @@ def instant_variables(
             values[name][point] = getattr(one, name)
     variables = {}
     for name, (long_name, units, further) in _MEANINGS.items():
-        tail = values[name].shape[1:]
-        about = {"long_name": long_name, "units": units}
-        packed = (about, _PACKED) if tail else (about,)
-        variables[f"snapshot_{name}"] = ((*dims, *further), values[name].reshape(*shape, *tail), *packed)
+        variables[name] = grid.variable(values[name], {"long_name": long_name, "units": units}, *further)
+        variables[name].encoding = dict(_PACKED) if further else {}
     return variables
 
 

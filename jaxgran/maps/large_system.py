@@ -2,22 +2,25 @@
 
 Averages of a sheared flow depend on N. Dense flows hardly change beyond N = 400. Loose dissipative flows change by
 about the same amount for each factor of four, up to some thousands of grains. They follow neither 1/N nor 1/L, with L
-the side of the cell, so nothing is extrapolated. The estimate is the value at the largest N, and its error covers what
-is left beyond N.
+the side of the cell, so nothing is extrapolated. The estimate is the value at the largest N, and its error bounds the
+change beyond N.
 
-A bound on the rest is K times the difference between N and N/4. In flows with 0.2 ≤ α ≤ 0.95 and 0.2 ≤ ν ≤ 0.8, run up
-to N = 25600, K was at most 2 for the pressure and 3 for the granular temperature.
+The change beyond N is at most K times the difference between N and N/4. In flows with 0.2 ≤ α ≤ 0.95 and 0.2 ≤ ν ≤
+0.8, run up to N = 25600, K was at most 2 for the pressure and 3 for the granular temperature.
 """
 
 import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 
+from jaxgran.maps.points import PointAverages, PointGrid
+from jaxgran.maps.settings import MapSettings
 from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.sampling.observables import OBSERVABLES
 
-LIMIT_SEEN = {"no_converged": 0, "limit_seen": 1, "too_few_sizes": 2}  # values of the flag and their meanings
+CONVERGED = {"not_converged": 0, "converged": 1, "too_few_sizes": 2}  # values of the flag and their meanings
 BOUNDS = {  # K of each observable that has an estimate
     "force_ratio": 2.0,
     "pressure": 2.0,
@@ -32,16 +35,16 @@ _FACTOR = math.log(4)  # all steps are those for a factor of four in N
 class LargeSystem(NamedTuple):
     """Estimate of an average for a large system.
 
-    ==========  ====================================================================================================
-    value       that at the largest N; NaN where no limit is seen, or with fewer than two sizes
-    error       half the width of the interval that contains the limit
-    limit_seen  a value of ``LIMIT_SEEN``; three sizes are needed to see whether there is a limit
-    ==========  ====================================================================================================
+    =========  =====================================================================================================
+    value      that at the largest N; NaN where the average does not converge, or with fewer than two sizes
+    error      half-width of the 95 % interval of the limit
+    converged  a value of ``CONVERGED``; three sizes are needed to tell whether there is a limit
+    =========  =====================================================================================================
     """
 
     value: float
     error: float
-    limit_seen: int
+    converged: int
 
 
 def large_system_estimate(grains: np.ndarray, values: np.ndarray, errors: np.ndarray, bound: float) -> LargeSystem:
@@ -66,58 +69,54 @@ def large_system_estimate(grains: np.ndarray, values: np.ndarray, errors: np.nda
 
       >>> sizes, errors = np.array([100, 400, 1600]), np.full(3, 1e-3)
       >>> found = large_system_estimate(sizes, np.array([1.0, 1.2, 1.25]), errors, bound=2.0)
-      >>> found.value, round(found.error, 3), found.limit_seen
+      >>> found.value, round(found.error, 3), found.converged
       (1.25, 0.1, 1)
       >>> large_system_estimate(sizes, np.array([1.0, 1.2, 1.4]), errors, bound=2.0)
-      LargeSystem(value=nan, error=nan, limit_seen=0)
+      LargeSystem(value=nan, error=nan, converged=0)
     """
     order = np.argsort(grains)
     sizes, x, s = (np.asarray(a, float)[order] for a in (grains, values, errors))
     known = np.isfinite(x) & np.isfinite(s)
     log, x, s = np.log(sizes[known]), x[known], s[known]
     if len(x) < 2:
-        return LargeSystem(math.nan, math.nan, LIMIT_SEEN["too_few_sizes"])
+        return LargeSystem(math.nan, math.nan, CONVERGED["too_few_sizes"])
     d = _difference(log)
     error = math.sqrt((HALF_INTERVAL * s[-1]) ** 2 + bound**2 * ((d @ x) ** 2 + d**2 @ s**2))
     if len(x) == 2:
-        return LargeSystem(float(x[-1]), error, LIMIT_SEEN["too_few_sizes"])
+        return LargeSystem(float(x[-1]), error, CONVERGED["too_few_sizes"])
     if _goes_on(log, x, s, bound):
-        return LargeSystem(math.nan, math.nan, LIMIT_SEEN["no_converged"])
-    return LargeSystem(float(x[-1]), error, LIMIT_SEEN["limit_seen"])
+        return LargeSystem(math.nan, math.nan, CONVERGED["not_converged"])
+    return LargeSystem(float(x[-1]), error, CONVERGED["converged"])
 
 
-def large_system_variables(
-    dims: tuple[str, ...],
-    grains: tuple[int, ...],
-    averages: Mapping[str, tuple[np.ndarray, np.ndarray]],
-    attrs: Mapping[str, tuple[str, str]],
-) -> dict[str, Any]:
-    """The variables NAME_large_system, NAME_large_system_error and NAME_limit_seen of a map.
+def large_system_variables(settings: MapSettings, grid: PointGrid, averages: PointAverages) -> dict[str, xr.Variable]:
+    """The group ``large_system`` of a map of several numbers of grains, for the names in ``BOUNDS``.
 
-    Args:
-      dims: dimensions of a point without the first, which is grains.
-      grains: values of this dimension.
-      averages: values and standard errors of each observable, (grains, ...).
-      attrs: long name and units of each observable.
+    ================  =======================================================================
+    variable          meaning
+    ================  =======================================================================
+    NAME              estimate for a large system; a point has no dimension grains here
+    NAME_ci95         half-width of the interval that contains it
+    NAME_converged    whether the average converges at large numbers of grains
+    ================  =======================================================================
     """
-    variables: dict[str, Any] = {}
+    sizes, shape = np.array(settings.sizes), grid.shape[1:]
+    variables: dict[str, xr.Variable] = {}
     for name, bound in BOUNDS.items():
-        values, errors = averages[name]
-        shape = values.shape[1:]
-        pairs = zip(values.reshape(len(grains), -1).T, errors.reshape(len(grains), -1).T, strict=True)
-        found = [large_system_estimate(np.array(grains), *pair, bound) for pair in pairs]
-        value, error, seen = (np.array(column).reshape(shape) for column in zip(*found, strict=True))
-        long_name, units = attrs[name]
+        columns = (x[name].reshape(len(sizes), -1).T for x in (averages.values, averages.stderrs))
+        found = [large_system_estimate(sizes, x, s, bound) for x, s in zip(*columns, strict=True)]
+        value, error, converged = (np.array(part).reshape(shape) for part in zip(*found, strict=True))
+        long_name, units = OBSERVABLES[name]
         about = {"long_name": f"{long_name} of a large system", "units": units}
-        variables[f"{name}_large_system"] = (dims, value, about)
-        about = {"long_name": f"bound on the error of the {long_name} of a large system", "units": units}
-        variables[f"{name}_large_system_error"] = (dims, error, about)
+        variables[name] = xr.Variable(grid.dims[1:], value, about)
+        about = {"long_name": f"half-width of the 95 % interval of the {long_name} of a large system", "units": units}
+        variables[f"{name}_ci95"] = xr.Variable(grid.dims[1:], error, about)
         flags = {
-            "long_name": f"whether the {long_name} has a limit at large numbers of grains",
-            "flag_values": np.array(list(LIMIT_SEEN.values()), np.int8),
-            "flag_meanings": " ".join(LIMIT_SEEN),
+            "long_name": f"whether the {long_name} converges at large numbers of grains",
+            "flag_values": np.array(list(CONVERGED.values()), np.int8),
+            "flag_meanings": " ".join(CONVERGED),
         }
-        variables[f"{name}_converged"] = (dims, seen.astype(np.int8), flags)
+        variables[f"{name}_converged"] = xr.Variable(grid.dims[1:], converged.astype(np.int8), flags)
     return variables
 
 

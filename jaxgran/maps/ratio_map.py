@@ -1,4 +1,4 @@
-"""The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as an xarray.Dataset.
+"""The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as an xarray.DataTree.
 
 A list of numbers of grains or of time steps adds an axis to the grid. Every point and seed is a replica. Replicas of
 one number of grains and of similar cost form a batch. The most expensive batches run first, so that no core waits long
@@ -76,7 +76,7 @@ def ratio_map(
     report: Report | None = None,
     progress: bool = False,
     checkpoint: str | os.PathLike | None = None,
-) -> "xr.Dataset":
+) -> "xr.DataTree":
     """Force ratio, stresses and temperature over a grid of restitutions and packing fractions, with standard errors.
 
     Args:
@@ -113,9 +113,9 @@ def ratio_map(
         ``jaxgran map --output map.nc --resume`` with the same parameters. The file itself is not written.
 
     Returns:
-      The dataset described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with standard
-      errors and values by seed. Lists of numbers of grains and of time steps add the dimensions grains and timestep in
-      front. It also has the status of each point, and all parameters as attributes.
+      The DataTree described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with
+      standard errors and values by seed. Lists of numbers of grains and of time steps add the dimensions grains and
+      timestep in front. It also has the status of each point, and all parameters as attributes.
 
     Raises:
       InputError: (a ValueError) a parameter is out of range; the message says what is accepted. Or the checkpoint is
@@ -193,7 +193,7 @@ def _checkpoint(file: str | os.PathLike | None, settings: MapSettings) -> Genera
         kept.close(finished=len(kept.done) == len(settings.flows()) * settings.seeds)
 
 
-def _warn_of_bad_points(data: "xr.Dataset") -> None:
+def _warn_of_bad_points(data: "xr.DataTree") -> None:
     """Warn of what the command line prints at the end of a map."""
     from jaxgran.maps.status_report import bad_points, in_words, short_in_words
 

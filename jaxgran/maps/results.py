@@ -1,7 +1,7 @@
-"""The file of a map: it is written, read and compared.
+"""Write, read and compare the file of a map.
 
-A file ends in the SHA-256 checksum of what stands before it, which other readers of NetCDF ignore. It is compared
-first, as the HDF5 library can wait forever in a damaged file. Files of other programs, and older ones, have none.
+A file ends in a SHA-256 checksum of its content, which other readers of NetCDF ignore. It is compared first, because
+the HDF5 library may never return from a damaged file. Files written by other programs have no checksum.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.files import atomic_write
-from jaxgran.maps.schema import RATIO, what_lacks
+from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
 from jaxgran.model.checks import InputError, short_repr
 
 if TYPE_CHECKING:
@@ -25,30 +25,42 @@ _MARK = b"SHA-256:"  # between the dataset and its checksum
 _DIGEST = hashlib.sha256().digest_size  # bytes
 
 
-def write_dataset(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
+def write_dataset(data: xr.DataTree, path: Path) -> None:
+    """Write a map as NetCDF to a temporary file in the same folder, then rename it to ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)  # it may have been removed during a long run
-    known = {name: {"_FillValue": None} for name in data.coords}  # CF: a coordinate has no missing values
-    content = bytes(data.to_netcdf(engine="netcdf4", encoding=known))
+    no_fill = {node.path: {name: {"_FillValue": None} for name in node.coords} for node in data.subtree}  # as CF asks
+    content = bytes(data.to_netcdf(engine="netcdf4", encoding=no_fill, write_inherited_coords=True))
     with atomic_write(path) as temporary:
         temporary.write_bytes(content + _MARK + hashlib.sha256(content).digest())
 
 
-def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr.Dataset:
-    """Read a dataset of ``write_dataset``; InputError if the file is not one.
+def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr.DataTree:
+    """Read a map, loaded into memory.
 
-    A file is one if it has the axes of a map and the variables that are needed.
+    Args:
+      path: the file.
+      needed: variables that it must have.
+
+    Raises:
+      InputError: (a ValueError) the file does not exist, cannot be read, is not a map with these variables, or has
+        another version of the format.
     """
     if not os.path.isfile(path):
         raise InputError(f"there is no file {short_repr(str(path))}.")
     try:
-        data = xr.load_dataset(_whole(path), engine="netcdf4")
+        data = xr.load_datatree(_whole(path), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
         why = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
     problem = what_lacks(data, *needed)
     if problem:
         raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
+    version = data.attrs.get("format_version")
+    if version != FORMAT_VERSION:
+        found = "no format_version" if version is None else f"format_version {version}"
+        raise InputError(
+            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
+        )
     return data
 
 
@@ -61,10 +73,11 @@ def _whole(path: Path) -> bytes:
     return whole
 
 
-def choices_of(data: xr.Dataset) -> dict[str, Any]:
-    """The parameters of the map in a dataset, as arguments of ``MapSettings``; InputError if one is missing.
+def choices_of(data: xr.DataTree) -> dict[str, Any]:
+    """The parameters of a map, as arguments of ``MapSettings``; InputError if one is missing.
 
-    The solver of a user's own class is given by its name and numbers, as the class is not in the file.
+    Engine and solver are those that were requested, not those that ran. The solver of a user's own class is given by
+    its name and numbers, as the class is not in the file.
     """
     from jaxgran.dynamics.engine import engine_named  # here, so that figures are drawn without loading JAX
     from jaxgran.maps.settings import MapSettings
@@ -76,20 +89,14 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
                 continue
             attribute = next((name for name in (f"{field.name}_requested", field.name) if name in data.attrs), None)
             if field.name in data.coords:  # one number where one of a list was selected
-                values = data[field.name].values.tolist()
+                values = data.coords[field.name].values.tolist()
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.name not in (
-                "strain",
-                "error",
-                "grains_by_point",
-                "snapshots",
-                "first_seed",
-            ):  # not in all files
+            elif field.name not in ("strain", "error", "grains_by_point"):  # which not every map has
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
-        chosen["snapshots"] = bool(chosen.get("snapshots"))
+        chosen["snapshots"] = bool(chosen["snapshots"])
         chosen |= {"solver": _solver_of(data), "engine": engine_named(data.attrs["engine_requested"])}
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist())
@@ -97,10 +104,10 @@ def choices_of(data: xr.Dataset) -> dict[str, Any]:
             if name in chosen
         }
     except KeyError as missing:
-        raise InputError(f"this dataset does not contain the {missing.args[0]} of its map.") from None
+        raise InputError(f"these data do not contain the {missing.args[0]} of their map.") from None
 
 
-def _solver_of(data: xr.Dataset) -> Any:
+def _solver_of(data: xr.DataTree) -> Any:
     """The solver that was asked for; name and numbers where its class is not of this package."""
     from jaxgran.contact.projected_methods import SOLVERS
 
@@ -111,10 +118,10 @@ def _solver_of(data: xr.Dataset) -> Any:
         raise InputError(f"solver_parameters must be those of {name}, not {short_repr(numbers)}.") from None
 
 
-def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None, str]:
-    """The map that is in a file already, or None, and what a map of these settings would replace there, in words.
+def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None, str]:
+    """The map that is in a file already, or None, and a description of what a map of these settings would replace.
 
-    The words are "" if it is a map of the same settings.
+    The description is "" if the file holds a map of the same settings.
     """
     from jaxgran.contact.projected_methods import solver_name, solver_numbers
 
@@ -122,7 +129,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None,
         data = read_dataset(path)
         chosen = choices_of(data)
     except InputError:
-        return None, "what is no map of this version"
+        return None, "something other than a map of this version"
     for field in fields(settings):
         there, here = chosen.get(field.name, field.default), getattr(settings, field.name)
         if isinstance(there, str) and field.name == "solver":
@@ -132,15 +139,16 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.Dataset | None,
     return data, ""
 
 
-def is_finished(data: xr.Dataset) -> bool:
+def is_finished(data: xr.DataTree) -> bool:
     """Whether a map has all its replicas."""
-    flags = dict(zip(data.status.attrs["flag_meanings"].split(), data.status.attrs["flag_values"], strict=True))
-    missing = [flags[name] for name in ("not_run", "failed") if name in flags]
-    return not np.isin(data.get("status_by_seed", data.status), missing).any()
+    status = data["seeds"].status
+    flags = dict(zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True))
+    missing = [flags[name] for name in ("not_run", "failed")]
+    return not np.isin(status, missing).any()
 
 
-def differences(data: xr.Dataset) -> list[str]:
-    """Differences between the versions, device and precision of a dataset and of this process, in words."""
+def differences(data: xr.DataTree) -> list[str]:
+    """Descriptions of the differences in versions, device and precision between a map and this process."""
     from jaxgran.maps.dataset import made_with
 
     here = made_with()

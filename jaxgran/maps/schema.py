@@ -1,40 +1,116 @@
-"""What a dataset must contain to be a ratio map, checked before it is drawn or fitted; and its parts."""
+"""The groups and names in the data of a map, checked before they are drawn or fitted, and selections from them.
+
+The data of a map are a DataTree. Functions that read it also accept a Dataset, such as its root alone, or a selection
+that has been flattened.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import xarray as xr
 
 from jaxgran.model.checks import InputError
-from jaxgran.model.choices import HALF_INTERVAL
+
+FORMAT_VERSION = 2
+"""Version of the groups and names in the data of a map; a file of another one is refused."""
+
+MapData: TypeAlias = xr.DataTree | xr.Dataset
 
 RATIO = ("force_ratio", "force_ratio_stderr")
-ERROR_PARTS = {  # part of the budget: ending of the variable, and its meaning
-    "timestep": ("error_timestep", "bound on the error of the {} from the time step"),
-    "size": ("error_size", "bound on the difference of the {} from that of a large system"),
-    "tolerance": ("error_tolerance", "bound on the error of the {} from the tolerance of the contact solves"),
-    "error": ("error", "whole error of the {}, half the width of an interval of 95 %"),
-}
-_AXES = ("packing_fraction", "restitution")
+CORE = (
+    "force_ratio",
+    "contact_force",
+    "binary_force",
+    "force_second_moment",
+    "stress_ratio",
+    "pressure",
+    "shear_stress",
+    "macroscopic_friction",
+    "inertial_number",
+    "granular_temperature",
+    "local_granular_temperature",
+    "coordination_number",
+    "collision_rate",
+)
+"""Observables in the root."""
+
+STRESSES = (
+    "contact_stress",
+    "binary_stress",
+    "kinetic_stress",
+    "contact_pressure",
+    "binary_pressure",
+    "kinetic_pressure",
+    "contact_shear_stress",
+    "binary_shear_stress",
+    "kinetic_shear_stress",
+    "bagnold_pressure",
+    "bagnold_shear_stress",
+    "cluster_pressure_share",
+    "cluster_shear_share",
+)
+"""Observables in the group ``stresses``."""
+
+DIAGNOSTICS = (
+    "network_size",
+    "iterations",
+    "median_residual",
+    "worst_residual",
+    "unconverged_share",
+    "mean_overlap",
+    "max_overlap",
+    "momentum_drift",
+    "energy_balance_error",
+    "complementarity_power",
+    "longwave_energy_ratio",
+)
+"""Observables in the group ``diagnostics``."""
+
+GROUPS = {"stresses": STRESSES, "diagnostics": DIAGNOSTICS}
+
+ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
+"""Coordinate of ``NAME_ci95``."""
+
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
 """Dimensions of a map that has several numbers of grains or time steps, and which of them has the smallest errors."""
+
+_AXES = ("packing_fraction", "restitution")
 _TENSOR_AXES = {"axis_a", "axis_b"}
 
 
-def require_map(data: Any, *names: str) -> None:
-    """Raise an InputError if this is not a ratio map with the named variables."""
+def require_map(data: Any, *names: str) -> xr.Dataset:
+    """The data of a map, flattened; InputError if they are not a ratio map with the named variables."""
     problem = what_lacks(data, *names)
     if problem:
-        raise InputError(f"data must be the dataset of a ratio map, and {problem}.")
+        raise InputError(f"data must be a ratio map, and {problem}.")
+    return flattened(data)
+
+
+def flattened(data: MapData) -> xr.Dataset:
+    """The variables of all groups in one Dataset, those of the root as ``NAME``, others as ``GROUP/NAME``."""
+    if isinstance(data, xr.Dataset):
+        return data
+    flat = data.to_dataset()
+    for node in data.descendants:
+        own = node.to_dataset(inherit=False)
+        flat = flat.assign_coords({name: x for name, x in own.coords.variables.items() if name not in flat.coords})
+        flat = flat.assign({f"{node.path[1:]}/{name}": own.variables[name] for name in own.data_vars})
+    return flat
+
+
+def path_of(observable: str) -> str:
+    """Where an observable is in the data of a map: ``NAME`` in the root, or ``GROUP/NAME``."""
+    return next((f"{group}/{observable}" for group, names in GROUPS.items() if observable in names), observable)
 
 
 def what_lacks(data: Any, *names: str) -> str:
-    """Why a dataset is not a ratio map with the named variables, in words; "" if it is one."""
-    if not isinstance(data, xr.Dataset):
+    """Why data are not a ratio map with the named variables, as the end of a sentence; "" if they are one."""
+    if not isinstance(data, MapData):
         return f"this is a {type(data).__name__}"
+    data = flattened(data)
     missing = [name for name in (*_AXES, *names) if name not in data.variables]
     if missing:
         return f"it has no {', '.join(missing)}"
@@ -43,13 +119,13 @@ def what_lacks(data: Any, *names: str) -> str:
             axis = data[name]
             numeric = axis.dtype.kind in "iuf" and axis.dims == (name,) and axis.size > 0
             if not numeric or not np.isfinite(axis.values).all() or np.unique(axis.values).size < axis.size:
-                return f"its {name} is no list of different numbers"
+                return f"its {name} is not a list of different numbers"
     for name in (*names, *(("status",) if "status" in data else ())):
         variable = data[name]
         further = set(variable.dims) - {*_AXES, *FINEST}
-        on_axes = set(_AXES) <= set(variable.dims) and further in (set(), _TENSOR_AXES)
+        on_axes = set(_AXES) <= set(variable.dims) and further in (set(), _TENSOR_AXES, {"error_source"})
         if variable.dtype.kind not in "iuf" or not on_axes:
-            return f"its {name} is no number at every packing_fraction and restitution"
+            return f"its {name} is not a number at every packing_fraction and restitution"
     if "status" in data and "force_ratio" in names:  # figures of the force ratio show the status
         flags = data.status.attrs.get("flag_values", ()), str(data.status.attrs.get("flag_meanings", "")).split()
         if np.size(flags[0]) == 0 or np.size(flags[0]) != len(flags[1]):
@@ -57,11 +133,12 @@ def what_lacks(data: Any, *names: str) -> str:
     return ""
 
 
-def finest(data: xr.Dataset, *names: str) -> xr.Dataset:
-    """A map at its largest number of grains and its shortest time step, which become its attributes.
+def finest(data: MapData, *names: str) -> xr.Dataset:
+    """A map at its largest number of grains and its shortest time step, flattened; they become its attributes.
 
-    With names of these two dimensions, only they are chosen.
+    With names of these two dimensions, only they are selected.
     """
+    data = flattened(data)
     for name in names or FINEST:
         if name in data.dims:
             values = data[name].values.tolist()
@@ -71,26 +148,25 @@ def finest(data: xr.Dataset, *names: str) -> xr.Dataset:
     return data
 
 
-def parts(data: xr.Dataset) -> list[xr.Dataset]:
-    """The parts of a map, one for each number of grains and time step, which become attributes of the part."""
-    found = [data]
+def parts(data: MapData) -> list[xr.Dataset]:
+    """The parts of a map for each number of grains and time step, flattened; these become attributes of the part."""
+    found = [flattened(data)]
     for name in FINEST:
-        if name in data.dims:
-            values = data[name].values.tolist()
+        if name in found[0].dims:
+            values = found[0][name].values.tolist()
             found = [part.isel({name: k}).assign_attrs({name: x}) for part in found for k, x in enumerate(values)]
     return found
 
 
-def relative_parts(data: xr.Dataset, name: str) -> dict[str, np.ndarray]:
-    """The parts of the error of an average over the average, at every point; sampling as a half-width of 95 %."""
-    value = np.abs(data[name].values)
+def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:
+    """Half-width of the 95 % interval of an average over the average, at every point, by the source of the error."""
+    data = flattened(data)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sampling = HALF_INTERVAL * data[f"{name}_stderr"].values / value
-        others = {part: data[f"{name}_{ending}"].values / value for part, (ending, _) in ERROR_PARTS.items()}
-    return {"sampling": sampling, **others}
+        share = data[f"{name}_ci95"] / np.abs(data[name])
+    return {source: share.sel(error_source=source).values for source in ERROR_SOURCES}
 
 
-def shear_stress_ratio(data: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
+def shear_stress_ratio(data: MapData) -> tuple[xr.DataArray, xr.DataArray]:
     """Contact over binary shear stress, and its standard error: component xy of the ratio of the stresses."""
-    value, stderr = (data[name].isel(axis_a=0, axis_b=1) for name in ("stress_ratio", "stress_ratio_stderr"))
+    value, stderr = (flattened(data)[name].isel(axis_a=0, axis_b=1) for name in ("stress_ratio", "stress_ratio_stderr"))
     return value, stderr

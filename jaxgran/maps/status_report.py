@@ -1,19 +1,15 @@
 """What went wrong at the points of a map, in words: for the command line, and for the warnings of ``ratio_map``."""
 
 import math
-from typing import TYPE_CHECKING
 
-from jaxgran.maps.schema import parts
+from jaxgran.maps.schema import MapData, parts
 from jaxgran.model.status import MEANINGS
 from jaxgran.sampling.correlation_strain import FEWEST_CORRELATION_STRAINS
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 _MOST_NAMED = 6  # points of a map in one sentence
 
 
-def bad_points(data: "xr.Dataset") -> dict[str, list[str]]:
+def bad_points(data: MapData) -> dict[str, list[str]]:
     """The points whose status is not ok, in words, by the name of the status."""
     names = dict(
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
@@ -37,11 +33,11 @@ def in_words(bad: dict[str, list[str]]) -> str:
     return f"{words}. What that means: {'; '.join(meanings)}."
 
 
-def short_in_words(data: "xr.Dataset", points: list[str], option: str) -> str:
+def short_in_words(data: MapData, points: list[str], option: str) -> str:
     """Which samples are shorter than a few memories, and the strain that would do, by ``option`` and the number."""
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
     short = data.status == data.status.attrs["flag_values"][code]
-    enough = FEWEST_CORRELATION_STRAINS * float(data.memory.where(short).max())
+    enough = FEWEST_CORRELATION_STRAINS * float(data.correlation_strain.where(short).max())
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
         f"short sample{which}: it lasts less than {FEWEST_CORRELATION_STRAINS:g} correlation strains of the flow, so "

@@ -1,9 +1,8 @@
-"""A map as a page to look into: the plane, curves through a point, its numbers, and its grains."""
+"""A map as an interactive page: the plane, curves through a point, its numbers, and its grains."""
 
 from pathlib import Path
 
-import xarray as xr
-
+from jaxgran.maps.schema import MapData
 from jaxgran.page.document import Page, data_of, document
 from jaxgran.page.map_data import map_data
 
@@ -11,7 +10,7 @@ _OF_THE_MAP = ("title", "axes", "about", "again")  # data of a page that the par
 _SCRIPTS = ("page.js", "grains.js", "charts.js", "table.js", "map.js")
 
 
-def explore(data: xr.Dataset, output: str | Path | None = None) -> Page:
+def explore(data: MapData, output: str | Path | None = None) -> Page:
     """A page to look into a map with a browser. It is one file, and needs neither a network nor a running program.
 
     A notebook shows the page if this call is the last line of a cell.

@@ -1,12 +1,13 @@
-"""What a page of a map holds: every average at every point, with its errors, theory and status, and the instants."""
+"""The data of the page of a map: every average at every point, with its errors, theory and status, and the instants."""
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any, get_args
 
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.schema import FINEST, require_map
+from jaxgran.maps.schema import FINEST, MapData, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import Activation, EngineName, SolverName
 from jaxgran.model.status import MEANINGS
@@ -27,13 +28,14 @@ _AXES = {
 }
 _PLANE = ("packing_fraction", "restitution")
 _TENSOR_AXES = ("axis_a", "axis_b")
-_COMPANIONS = ("_stderr", "_error", "_correlation_strain", "_error_timestep", "_error_size", "_error_tolerance")
+_COMPANIONS = ("_stderr", "_ci95")
+_GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
 _LEFT_OUT = ("status", "point_grains")
 _NAMED = {"activation": get_args(Activation), "solver": get_args(SolverName), "engine": get_args(EngineName)}
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
 
 
-def map_data(data: xr.Dataset) -> dict[str, Any]:
+def map_data(data: MapData) -> dict[str, Any]:
     """The numbers of a map in types of JSON, by point: number of grains, time step, packing fraction, restitution.
 
     =============  =====================================================================================
@@ -47,19 +49,19 @@ def map_data(data: xr.Dataset) -> dict[str, Any]:
     grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
     again          what the command needs that measures a point again, if the map was made by this program
-    about, notes   sentences: what the numbers belong to, and what is left out
+    about, notes   sentences: parameters of the map, and what is left out
     =============  =====================================================================================
 
     Raises:
       InputError: (a ValueError) the data are no map, or have nothing to show.
     """
-    require_map(data)
+    data = require_map(data)
     data, notes = _thinned(data.sortby([name for name in _AXES if name in data.dims]))
     dims = [name for name in _AXES if name in data.dims]
     names = [str(name) for name in data.data_vars if _is_shown(data, str(name))]
-    observables = [one for name in names for one in _observables(data, name, dims)]
+    observables = [one for name, label in _labels(names).items() for one in _observables(data, name, label, dims)]
     if not observables:
-        raise InputError("data must be the dataset of a ratio map, and it has no number at its points.")
+        raise InputError("data must be a ratio map, and it has no number at its points.")
     instants, more = _instants(data, dims)
     return {
         "title": _text(data.attrs.get("title", "Map of sheared grains")),
@@ -102,37 +104,43 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
     variable = data[name]
     dims = set(variable.dims) - set(FINEST)
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
-    belongs |= name.startswith("theory_") and name.removeprefix("theory_") in data
-    ours = name in _LEFT_OUT or name.startswith("snapshot_") or "flag_values" in variable.attrs
-    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *_TENSOR_AXES}) and not (belongs or ours)
+    belongs |= name.startswith("theory/") and name.removeprefix("theory/") in data
+    apart = name in _LEFT_OUT or name.startswith("snapshots/") or "flag_values" in variable.attrs
+    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *_TENSOR_AXES}) and not (belongs or apart)
 
 
-def _observables(data: xr.Dataset, name: str, dims: list[str]) -> Iterator[dict[str, Any]]:
+def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> Iterator[dict[str, Any]]:
     """The entry of a variable, or those of its components."""
     about = data[name].attrs
-    parts = {
-        "value": name,
-        "error": f"{name}_stderr",
-        "whole": f"{name}_error",
-        "theory": f"theory_{name}",
-        "samples": f"{name}_correlation_strain",
-    }
+    parts = {"value": name, "error": f"{name}_stderr", "whole": f"{name}_ci95", "theory": f"theory/{name}"}
+    samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():
         columns = {
             part: _column(data[there].isel(chosen), data, dims) for part, there in parts.items() if there in data
         }
-        if "samples" in columns and "strain_by_seed" in data:
-            strain = _column(data.strain_by_seed.sum("seed"), data, dims)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                columns["samples"] = strain / columns["samples"]
-        else:
-            columns.pop("samples", None)
+        if samples is not None:
+            columns["samples"] = _column(samples, data, dims)
         yield {
-            "name": _text(name + component),
-            "meaning": _text(about.get("long_name", name.replace("_", " "))) + component.replace("_", ", "),
+            "name": _text(label + component),
+            "meaning": _text(about.get("long_name", label.replace("_", " "))) + component.replace("_", ", "),
             "unit": _unit(about.get("reduced_unit", about.get("units", ""))),
             **{part: _numbers(values) for part, values in columns.items()},
         }
+
+
+def _effective_samples(data: xr.Dataset, observable: str) -> xr.DataArray | None:
+    """The number of independent samples of an observable at each point, or None where it is not known."""
+    strain, correlated = data.get("seeds/strain"), data.get("diagnostics/correlation_strain")
+    if strain is None or correlated is None or observable not in data.get("observable", ()):
+        return None
+    return strain.sum("seed") / correlated.sel(observable=observable)
+
+
+def _labels(names: list[str]) -> dict[str, str]:
+    """Short names of variables: without their group, or with it at the end where another one has the same name."""
+    split = {name: (name.split("/", 1) if name.startswith(_GROUPS) else ["", name]) for name in names}
+    counts = Counter(end for _, end in split.values())
+    return {name: f"{end}_{group}" if group and counts[end] > 1 else end for name, (group, end) in split.items()}
 
 
 def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
@@ -144,7 +152,9 @@ def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
 
 
 def _column(variable: xr.DataArray, data: xr.Dataset, dims: list[str]) -> np.ndarray:
-    """The values of a variable by point; one without numbers of grains, such as an estimate, is the same at all."""
+    """The values of a variable by point, or the total of an interval; one without numbers of grains is repeated."""
+    if "error_source" in variable.dims:
+        variable = variable.sel(error_source="total")
     missing = {name: data[name] for name in dims if name not in variable.dims}
     return variable.expand_dims(missing).transpose(*dims).values.astype(float).ravel()
 
@@ -162,11 +172,11 @@ def _statuses(data: xr.Dataset, dims: list[str]) -> list[str]:
 def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
     """Grains and forces of every point, and a sentence if some are left out; None if the map has none."""
     names = ("x", "y", "radius", "speed", "pair_i", "pair_j", "force", "clustered", "side", "tilt", "window")
-    if not all(f"snapshot_{name}" in data for name in names):
+    if not all(f"snapshots/{name}" in data for name in names):
         return None, []
     columns = {}
     for name in names:
-        variable = data[f"snapshot_{name}"].transpose(*dims, ...).values
+        variable = data[f"snapshots/{name}"].transpose(*dims, ...).values
         columns[name] = variable.reshape(-1, *variable.shape[len(dims) :])
     found, large = [], 0
     for point in zip(*columns.values(), strict=True):
@@ -193,11 +203,11 @@ def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | 
 
 
 def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
-    """Seeds, sampled strain of a seed at every point, and options; None where the file does not tell.
+    """Seeds, sampled strain of a seed at every point, and options; None if the file lacks them.
 
-    A reader will paste the command into a shell. So it has nothing but numbers, and names that this program knows.
+    The reader pastes the command into a shell, so it contains only numbers and known names.
     """
-    if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "strain_by_seed" not in data:
+    if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "seeds/strain" not in data:
         return None
     options = {}
     for name, accepted in _NAMED.items():
@@ -211,12 +221,12 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     except (TypeError, ValueError):
         return None
     words = [f"--{name} {value}" for name, value in options.items() if value != "auto"]
-    strain = _column(data.strain_by_seed.mean("seed"), data, dims)
+    strain = _column(data["seeds/strain"].mean("seed"), data, dims)
     return {"seeds": seeds, "options": " ".join(words), "strain": _numbers(strain)}
 
 
 def _about(data: xr.Dataset) -> str:
-    """The sentence that says what the numbers belong to."""
+    """A sentence with the parameters that the axes do not show."""
     words = {"activation": "{} activation", "seeds": "{} seed" if data.attrs.get("seeds") == 1 else "{} seeds"}
     return _text(", ".join(form.format(data.attrs[name]) for name, form in words.items() if name in data.attrs))
 

@@ -1,4 +1,4 @@
-"""Contours in the plane of 1 − α and ν: levels, labels that do not overlap, and the excess on top.
+"""Contours in the plane of 1 − α and ν, and those of the excess on top.
 
 A quantity is interpolated between the grid points of a map. A cell is hatched if one of its corners has no value.
 """
@@ -6,8 +6,8 @@ A quantity is interpolated between the grid points of a map. A cell is hatched i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -17,9 +17,7 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import withStroke
-from matplotlib.text import Text
 
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
 from jaxgran.plotting.encoding import EXCESS_LEVELS
@@ -28,24 +26,10 @@ from jaxgran.plotting.interpolation import interpolated, refined_axes
 _EXCESS_COLOUR = "#00803c"
 _EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
-_LABEL_SPACE = 1.44  # points between a label and its contour
-_LABEL_DISTANCE = 28.0  # points between the middles of two labels, slightly more than the length of a label
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
 
 _Key = TypeVar("_Key", str, float)
-
-
-class Line(NamedTuple):
-    """The contour of one value, which is drawn together with those of others and counted among them."""
-
-    drawn: QuadContourSet
-    number: int
-    value: float
-
-    @property
-    def path(self) -> MplPath:
-        return self.drawn.get_paths()[self.number]
 
 
 # ----------------------------------------------------------------------------------------------- plane
@@ -66,16 +50,46 @@ EXCESS_VALUES = {level: float(contour_variable(np.array(level))) for level in EX
 
 
 def draw_levels(
-    axes: Axes, x: np.ndarray, y: np.ndarray, field: np.ma.MaskedArray, levels: Mapping[_Key, float], **styles: Any
-) -> dict[_Key, Line]:
-    """Draw the contours of a field at increasing values, in one style or one for each; return those that there are."""
+    axes: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    field: np.ma.MaskedArray,
+    levels: Mapping[_Key, float],
+    labelled: bool = True,
+    room: float = 0.0,
+    **styles: Any,
+) -> list[_Key]:
+    """Draw the contours of a field at increasing values, with their keys as labels; return the keys of those drawn.
+
+    A contour that is nowhere farther from the others than `room`, a share of the plane, has no label.
+    """
     low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
-    crossed = [low < value < high for value in levels.values()]
-    if not any(crossed):
-        return {}
+    crossed = [key for key, value in levels.items() if low < value < high]
+    if not crossed:
+        return []
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
-    lines = {key: Line(drawn, number, value) for number, (key, value) in enumerate(levels.items()) if crossed[number]}
-    return {key: line for key, line in lines.items() if len(line.path)}
+    if labelled:
+        texts = {value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()}
+        places = _label_places(drawn, x, y, room)
+        for label in axes.clabel(
+            drawn, fmt=texts, fontsize=SMALL_SIZE + 0.5, inline_spacing=2, manual=places, zorder=6
+        ):
+            label.set_path_effects([withStroke(linewidth=2, foreground="white")])
+    return crossed
+
+
+def _label_places(drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, room: float) -> list[tuple[float, float]]:
+    """Return the point of each contour that is farthest from the others and the frame, if that is more than `room`."""
+    corner, size = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
+    curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / size for path in drawn.get_paths()]
+    places = []
+    for k, curve in enumerate(curves):
+        others = np.concatenate([np.full((1, 2), np.inf), *curves[:k], *curves[k + 1 :]])
+        apart = np.linalg.norm(curve[:, None] - others, axis=-1).min(axis=1)
+        clearance = np.minimum(apart, np.minimum(curve, 1 - curve).min(axis=1) / 2)
+        if len(curve) and clearance.max() > room:
+            places.append(tuple(corner + size * curve[clearance.argmax()]))
+    return places
 
 
 def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:
@@ -113,94 +127,15 @@ def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, ent
     )
 
 
-# ---------------------------------------------------------------------------------------------- labels
-
-
-def label_contours(
-    axes: Axes,
-    lines: Mapping[str, Line],
-    obstacles: Iterable[Line] = (),
-    room: float = 0.0,
-) -> None:
-    """Write a label on each contour, where it is farthest from other lines, labels, ends of lines and the frame.
-
-    The layout must be fixed, so that distances on the page are known. A contour with less clearance than `room` points
-    at its best place gets no label.
-    """
-    to_page, pixels = axes.transData, axes.figure.dpi / 72.0  # pixels of a typographic point
-    paths = [to_page.transform_path(line.path) for line in lines.values()]
-    blocked = [_thinned(to_page.transform_path(line.path)) for line in obstacles]
-    labelled: list[np.ndarray] = []
-    for k, (text, line) in enumerate(lines.items()):
-        others = [_thinned(path) for path in paths[:k] + paths[k + 1 :]] + [path for path in blocked if len(path)]
-        frame = np.array(axes.bbox.extents)
-        place, clearance = _label_place(paths[k], others, labelled, _LABEL_DISTANCE * pixels, frame)
-        if clearance < room * pixels:
-            continue
-        labelled.append(place)
-        x, y = to_page.inverted().transform(place)
-        label = line.drawn.clabel(
-            [line.value],
-            fontsize=SMALL_SIZE + 0.5,
-            fmt={line.value: text},
-            inline_spacing=_LABEL_SPACE * pixels,
-            manual=[(float(x), float(y))],
-            zorder=6,
-        )[-1]
-        label.set_path_effects([withStroke(linewidth=2, foreground="white")])
-        _move_inside(label, axes)
-
-
-def _move_inside(label: Text, axes: Axes) -> None:
-    """Move a label that reaches over the frame into it."""
-    box, frame = (np.reshape(one.extents, (2, 2)) for one in (label.get_window_extent(), axes.bbox))
-    over = np.maximum(0.0, frame[0] - box[0]) - np.maximum(0.0, box[1] - frame[1])
-    if over.any():
-        place = axes.transData.transform(label.get_position()) + over
-        x, y = axes.transData.inverted().transform(place)
-        label.set_position((float(x), float(y)))
-
-
-def _thinned(path: MplPath) -> np.ndarray:
-    """Return at most 400 vertices of a path, at equal intervals."""
-    return np.asarray(path.vertices)[:: 1 + len(path) // 400]
-
-
-def _label_place(
-    path: MplPath, others: Sequence[np.ndarray], labelled: Sequence[np.ndarray], distance: float, frame: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """Return the vertex of a path with the largest clearance, and that clearance, both in pixels.
-
-    A label lies along its curve, so the ends of the curve and the frame must be twice as far away as other curves.
-    Places closer than `distance` to another label are used only if there is no other place.
-    """
-    places = _thinned(path)
-    starts = np.flatnonzero(path.codes == MplPath.MOVETO)
-    ends = np.asarray(path.vertices)[np.concatenate([starts, starts - 1])]
-    to_frame = np.minimum(places - frame[:2], frame[2:] - places).min(axis=1)
-    clearances = [to_frame / 2, _distance(places, ends) / 2, *(_distance(places, other) for other in others)]
-    clearance = np.minimum.reduce(clearances)
-    for label in labelled:
-        clearance[np.linalg.norm(places - label, axis=1) < distance] *= 1e-3
-    best = np.argmax(clearance)
-    return places[best], float(clearance[best])
-
-
-def _distance(places: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the distance from each place to the nearest of the others."""
-    x, y = (np.subtract.outer(places[:, axis], others[:, axis]) for axis in (0, 1))
-    return np.sqrt((x * x + y * y).min(axis=1))
-
-
 # ---------------------------------------------------------------------------------------------- excess
 
 
-def draw_excess(axes: Axes, data: xr.Dataset) -> dict[float, Line]:
+def draw_excess(axes: Axes, data: xr.Dataset) -> list[float]:
     """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
     x, y = refined_axes(data)
     widths = [_excess_width(level) for level in EXCESS_LEVELS]
     style = {"colors": _EXCESS_COLOUR, "linewidths": widths, **_EXCESS_STYLE}
-    return draw_levels(axes, x, y, excess_field(data), EXCESS_VALUES, **style)
+    return draw_levels(axes, x, y, excess_field(data), EXCESS_VALUES, labelled=False, **style)
 
 
 def excess_style(level: float) -> dict[str, Any]:

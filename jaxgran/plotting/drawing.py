@@ -1,4 +1,4 @@
-"""What all figures share: the order of a map, the marks of its points, captions and files.
+"""What all figures share: point markers, legends, captions and files.
 
 Figures use no global plotting state, so they need no display.
 """
@@ -17,11 +17,12 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Bbox
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from jaxgran.files import atomic_write
 from jaxgran.maps.schema import FINEST
@@ -32,15 +33,18 @@ FILE_DPI = 200  # dots per inch of a picture, unless another number is given
 LABEL_SIZE = 9.0  # points, font of the labels of axes
 TICK_SIZE = 8.0  # points, font of the numbers at the ticks
 SMALL_SIZE = 7.0  # points, font of legends and captions
-PANEL_TITLE: dict[str, Any] = {"fontsize": LABEL_SIZE, "y": 1.0}  # at a given height, which need not be looked for
+PANEL_TITLE: dict[str, Any] = {"fontsize": LABEL_SIZE, "y": 1.0}  # a fixed height: Matplotlib would search for one
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
-_CAPTION = "caption"  # names the text under the axes
+_CAPTION = "caption"  # id of the text under the axes
+_MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
+_NARROW = 4  # largest over smallest value at and below which numbers have equal steps
+_LEAST_PLAIN = 1e-3  # smallest number that is written without a power of ten
 _SAVED: dict[str, dict[str, Any]] = {
-    "png": {"pil_kwargs": {"compress_level": 3}},  # 3 % larger than by default, in three quarters of the time
+    "png": {"pil_kwargs": {"compress_level": 3}},  # 3 % larger than the default, 25 % faster
     "pdf": {"metadata": {"CreationDate": None}},
     "svg": {"metadata": {"Date": None}},
 }
@@ -211,13 +215,17 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def fix_layout(figure: Figure) -> None:
-    """Place all parts of a finished figure, once, so that distances on the page are known."""
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        engine.execute(figure)
-        with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-            figure.set_layout_engine(None)  # with "none" Matplotlib would still draw twice, the first time for nothing
+def label_log_axis(axis: Axis) -> None:
+    """Put numbers at 1, 2 and 5 of each decade of a logarithmic axis, at powers of ten, or at equal steps.
+
+    Powers of ten are those of several decades, equal steps those of a small part of one.
+    """
+    low, high = axis.get_view_interval()
+    every = LogFormatterSciNotation(minor_thresholds=(np.inf, np.inf))
+    in_a_decade = (1, 2, 5) if high < _MANY_DECADES * low else (1,)
+    axis.set_major_locator(LogLocator(subs=in_a_decade, numticks=9) if high > _NARROW * low else MaxNLocator(4))
+    axis.set_major_formatter(every if low < _LEAST_PLAIN else StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def scientific(value: float) -> str:
@@ -250,8 +258,6 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
     """Set the tick style and write the caption under the axes; write "no measured values" where there are none."""
     for axes in figure.axes:
         axes.tick_params(which="both", direction="in", top=True, right=True, labelsize=TICK_SIZE)
-        for spine in axes.spines.values():
-            spine.set_in_layout(False)  # the frame ends where the axes end, and to measure it takes long
         if not measured.any():
             box = {"facecolor": "white", "edgecolor": "none"}
             where = {"transform": axes.transAxes, "ha": "center"}
@@ -297,21 +303,11 @@ def writable_stem(stem: Path | str) -> Path:
 def write(figure: Figure, path: Path, dpi: int = FILE_DPI, caption: bool = True) -> Path:
     """Write a figure in the format of its ending; a file that is there is replaced at the end.
 
-    The same figure gives the same file: no date and no random name is in it. Without its caption a figure is lower.
+    The same figure gives the same file: no date and no random name is in it.
     """
-    figure.set_dpi(dpi)
-    fix_layout(figure)  # which Matplotlib would do by drawing the whole figure twice
     kind = path.suffix.removeprefix(".")
-    area = None if caption else _cut_caption(figure)
+    for text in figure.findobj(lambda artist: artist.get_gid() == _CAPTION):
+        text.set_visible(caption)
     with atomic_write(path) as temporary, rc_context({"svg.hashsalt": "jaxgran", "pdf.fonttype": 42}):
-        figure.savefig(temporary, format=kind, dpi=dpi, bbox_inches=area, **_SAVED.get(kind, {}))
+        figure.savefig(temporary, format=kind, dpi=dpi, **_SAVED.get(kind, {}))
     return path
-
-
-def _cut_caption(figure: Figure) -> Bbox:
-    """Hide the caption, and return what is above it, in inches."""
-    width, height = figure.get_size_inches()
-    (caption,) = figure.findobj(lambda artist: artist.get_gid() == _CAPTION)
-    top = caption.get_window_extent().y1 / figure.dpi
-    caption.set_visible(False)
-    return Bbox.from_extents(0.0, top, width, height)

@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
-from jaxgran.plotting.contours import add_plane_legend, draw_excess, excess_keys, label_contours
+from jaxgran.maps.schema import RATIO, MapData, finest, require_map, what_lacks
+from jaxgran.plotting.contours import add_plane_legend, draw_excess, excess_keys
 from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
     LABEL_SIZE,
@@ -17,7 +17,6 @@ from jaxgran.plotting.drawing import (
     PANEL_TITLE,
     empty_figure,
     finish,
-    fix_layout,
     missing_note,
     ordered,
     require_plane,
@@ -35,15 +34,14 @@ PANELS = {
 """Factors of the map and the titles of their panels."""
 
 _NOTE = (
-    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d).\n"
-    "Enskog: independent isotropic Gaussian velocities at the measured temperature.\n"
-    "Black contours: measured over assumed, as a quotient less one (dashed where negative) or a factor"
+    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d). "
+    "Black contours: factor, or less one in % (dashed where negative)"
 )
 
 
 def _needed(stress: str) -> list[str]:
     """Return the names of the variables that :func:`enskog_factors` draws."""
-    return [f"enskog_factor_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
+    return [f"theory/enskog_factor_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
 
 
 def has_factors(data: xr.Dataset) -> bool:
@@ -51,7 +49,7 @@ def has_factors(data: xr.Dataset) -> bool:
     return not what_lacks(data, *RATIO, *_needed("pressure"))
 
 
-def enskog_factors(data: xr.Dataset, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
+def enskog_factors(data: MapData, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
     """Return the four factors by which a measured contact stress differs from Enskog's, in the plane of 1 − α and ν.
 
     Each factor is a stress with one more assumption replaced by what was measured, over the stress before:
@@ -60,29 +58,27 @@ def enskog_factors(data: xr.Dataset, stress: Literal["pressure", "shear_stress"]
     force ratio.
 
     ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `enskog_factor_...` of the stress, with `_stderr`,
+    data     (packing_fraction, restitution) `theory/enskog_factor_...` of the stress, with `_stderr`,
                                              `force_ratio` and `status`
     stress   text                            "pressure" or "shear_stress"
     returns  Figure
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *_needed(stress))
+    data = require_map(data, *RATIO, *_needed(stress))
     require_plane(data)
     data = finest(ordered(data, *_needed(stress)))
     figure = empty_figure(width=7.4, height=6.8)
     grid = figure.subplots(2, 2, sharex=True, sharey=True)
-    measured = np.isfinite(data[f"enskog_factor_{stress}_pairs"].values)
-    panels, fields, noisy, over = [], [], False, {}
+    measured = np.isfinite(data[f"theory/enskog_factor_{stress}_pairs"].values)
+    fields, noisy, over = [], False, []
     for axes, (factor, title) in zip(grid.flat, PANELS.items(), strict=True):
-        value, error = (data[f"enskog_factor_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
+        value, error = (data[f"theory/enskog_factor_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(value > 0, np.log(value), np.nan)
-            lines, hidden = draw_errors(axes, data, logarithm, error / value)
+            noisy |= draw_errors(axes, data, logarithm, error / value)
         fields.append(logarithm)
         over = draw_excess(axes, data)
-        panels.append((axes, lines, over.values()))
-        noisy |= hidden
         axes.set_title(title, **PANEL_TITLE)
     for axes in grid[1]:
         axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
@@ -92,7 +88,4 @@ def enskog_factors(data: xr.Dataset, stress: Literal["pressure", "shear_stress"]
     note = _NOTE.format(stress.replace("_", " "))
     found = left_out_note(data, fields, "each factor")
     finish(figure, data, measured, [note, found, status_note(data), missing_note(measured, " (hatched)")])
-    fix_layout(figure)
-    for axes, lines, others in panels:
-        label_contours(axes, lines, others, room=4.0)
     return figure

@@ -7,8 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxgran.maps.schema import ERROR_PARTS, RATIO, finest, relative_parts, require_map
-from jaxgran.model.checks import InputError
+from jaxgran.maps.schema import RATIO, MapData, finest, relative_ci95, require_map, what_lacks
 from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     NU_LABEL,
@@ -25,8 +24,7 @@ _PANELS = {
     "pressure": r"pressure $p$",
     "granular_temperature": r"granular temperature $T$",
 }
-_BUDGET = [*_PANELS, *(f"{name}_{ending}" for name in _PANELS for ending, _ in ERROR_PARTS.values())]
-"""Averages that are drawn, and the parts of their errors."""
+_NEEDED = (*_PANELS, *(f"{name}_ci95" for name in _PANELS))
 
 _PARTS = {  # part: its name and mark
     "sampling": ("sampling", "o"),
@@ -40,31 +38,29 @@ _LEAST, _LARGEST = 12.0, 150.0  # area of a mark, in pt², at an error of 1 % an
 
 def has_errors(data: xr.Dataset) -> bool:
     """Whether a map has the error budget of what is drawn."""
-    return all(f"{name}_error" in data for name in _PANELS)
+    return not what_lacks(data, *RATIO, *_NEEDED)
 
 
-def dominating_errors(data: xr.Dataset) -> Figure:
+def dominating_errors(data: MapData) -> Figure:
     """Return the whole error of each point of a map, and which of its parts is the largest.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) `force_ratio`, `pressure` and `granular_temperature`
-                                             with `_stderr` and `_error_...`; of several sizes or
+                                             with `_stderr` and `_ci95`; of several sizes or
                                              time steps, the largest and the shortest
     returns  Figure                          a mark for each point: its shape is the largest part,
                                              its area grows with the whole error, in per cent
     raises   ValueError                      the data are not a map, or have no error budget
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO)
-    if not has_errors(data):
-        raise InputError("this map has no error budget: it was made by an older version.")
-    data = finest(ordered(data, *_BUDGET))
+    data = require_map(data, *RATIO, *_NEEDED)
+    data = finest(ordered(data, *_NEEDED))
     alpha, nu = np.meshgrid(data.restitution.values, data.packing_fraction.values)
     figure = empty_figure(width=3.4 * len(_PANELS) + 0.6, height=4.6)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)
     for axes, (name, title) in zip(panels, _PANELS.items(), strict=True):
-        parts = relative_parts(data, name)
-        whole = parts["error"]
+        parts = relative_ci95(data, name)
+        whole = parts["total"]
         known = np.isfinite(whole)
         stacked = np.stack([np.nan_to_num(parts[part]) for part in _PARTS])
         largest = np.argmax(stacked, axis=0)

@@ -21,7 +21,7 @@ from jaxgran.inference.friction_law import (
     friction_law,
     is_dense,
 )
-from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
+from jaxgran.maps.schema import RATIO, MapData, finest, require_map, what_lacks
 from jaxgran.model.display import with_error
 from jaxgran.plotting.drawing import (
     LABEL_SIZE,
@@ -33,12 +33,12 @@ from jaxgran.plotting.drawing import (
     draw_points,
     empty_figure,
     finish,
+    label_log_axis,
     missing_note,
     ordered,
     status_note,
     suspect,
 )
-from jaxgran.plotting.log_axis import number_log_axis
 
 _FRICTION_NOTE = (
     r"$\mu=\mu_0+aI^b$ and $\nu=\nu_c-kI^c$, fitted to the filled symbols: status ok, "
@@ -51,7 +51,7 @@ def has_friction_law(data: xr.Dataset) -> bool:
     return not what_lacks(data, *NEEDED) and enough(dense_points(data))
 
 
-def friction_figure(data: xr.Dataset) -> Figure:
+def friction_figure(data: MapData) -> Figure:
     """Return friction and packing fraction against the inertial number, with the laws of dense flow.
 
     ======== =============================== =====================================================
@@ -61,7 +61,7 @@ def friction_figure(data: xr.Dataset) -> Figure:
     raises   ValueError                      too few dense points
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *NEEDED)
+    data = require_map(data, *RATIO, *NEEDED)
     law = friction_law(data)
     data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
     measured = np.isfinite(data.macroscopic_friction.values)
@@ -73,7 +73,7 @@ def friction_figure(data: xr.Dataset) -> Figure:
         for alpha, style in styles.items():
             _draw_flows(axes, data.sel(restitution=alpha), name, style)
         axes.set_xlabel(r"inertial number $I$", fontsize=LABEL_SIZE)
-        number_log_axis(axes.xaxis, *axes.get_xlim())
+        label_log_axis(axes.xaxis)
     left.set_ylabel(r"macroscopic friction $\mu$", fontsize=LABEL_SIZE)
     right.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     _add_laws(left, law, styles, lambda one: one.friction, r"$\mu_0$, $a$, $b$")

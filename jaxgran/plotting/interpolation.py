@@ -53,9 +53,9 @@ def left_out_note(data: xr.Dataset, fields: Iterable[np.ndarray], of: str, count
     known = np.abs(np.concatenate(errors))
     known = known[np.isfinite(known)]
     if len(known) < _FEWEST:
-        return "Linear between the points, too few to tell with what error"
+        return "Linear interpolation between points, too few to estimate its error"
     median, large = (f"{float(f'{100 * value:.2g}'):g} %" for value in np.quantile(known, (0.5, 0.9)))
-    return f"Linear between points: left out, half are found to {median} of {of}, 9 of 10 to {large}"
+    return f"Leave-one-out interpolation error of {of}: median {median}, 90th percentile {large}"
 
 
 def _axes(data: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:

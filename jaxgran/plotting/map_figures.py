@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
-import xarray as xr
-from matplotlib.figure import Figure
-
-from jaxgran.maps.schema import RATIO, require_map
+from jaxgran.maps.schema import RATIO, MapData, require_map
 from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
@@ -20,13 +15,10 @@ from jaxgran.plotting.friction import friction_figure, has_friction_law
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
-from jaxgran.plotting.two_processes import do_all
-
-_DEAREST = (theory_errors, enskog_factors, cluster_shares, friction_figure)
 
 
 def save_figures(
-    data: xr.Dataset, stem: Path | str, format: FileFormat = "png", dpi: int = FILE_DPI, caption: bool = True
+    data: MapData, stem: Path | str, format: FileFormat = "png", dpi: int = FILE_DPI, caption: bool = True
 ) -> list[Path]:
     """Write every figure for which a map has the data, and return the paths written.
 
@@ -57,7 +49,7 @@ def save_figures(
                            written there
     ======== ============= =====================================================================
     """
-    require_map(data, *RATIO)
+    data = require_map(data, *RATIO)
     require_file(format, dpi)
     stem = writable_stem(stem)
     figures = {
@@ -77,8 +69,8 @@ def save_figures(
     for path in drawn:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    first = sorted(drawn, key=lambda path: drawn[path] not in _DEAREST)  # so that two processes end together
-    do_all([partial(_draw, drawn[path], data, path, dpi, caption) for path in first])
+    for path, draw in drawn.items():
+        write(draw(data), path, dpi, caption)
     return list(drawn)
 
 
@@ -87,7 +79,3 @@ def require_file(format: Any, dpi: Any) -> None:
     if format not in get_args(FileFormat):
         raise InputError(f"format must be png, pdf or svg, not {short_repr(format)}.")
     require_whole("dpi", dpi, 50, 1200, "as no print shows more")
-
-
-def _draw(draw: Callable[[xr.Dataset], Figure], data: xr.Dataset, path: Path, dpi: int, caption: bool) -> None:
-    write(draw(data), path, dpi, caption)

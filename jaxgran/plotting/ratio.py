@@ -1,8 +1,7 @@
 """The figures of a ratio map: curves of its ratios, contours of the excess over one, and the effect of dt.
 
-All are drawn from the dataset of :func:`jaxgran.ratio_map`. Curves and contours follow Figures 1 and 2 of Lois,
-Lemaître and Carlson, *Momentum transport in granular flows*. They show the largest number of grains and the shortest
-time step of a map that has several. The third figure shows the effect of the time step. The force ratio is ⟨F⟩/⟨F_bc⟩
+Curves and contours follow Figures 1 and 2 of Lois, Lemaître and Carlson, *Momentum transport in granular flows*. They
+show the largest number of grains and the shortest time step of a map that has several. The force ratio is ⟨F⟩/⟨F_bc⟩,
 and the excess is ⟨F⟩/⟨F_bc⟩ − 1. The shear-stress ratio is that of the contact stress to the binary stress, component
 xy. :func:`save_figures` also writes the figures of :mod:`jaxgran.plotting.size`, :mod:`jaxgran.plotting.theory` and
 :mod:`jaxgran.plotting.friction`.
@@ -21,9 +20,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
-from jaxgran.maps.schema import RATIO, finest, require_map, shear_stress_ratio, what_lacks
+from jaxgran.maps.schema import RATIO, MapData, finest, require_map, shear_stress_ratio, what_lacks
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
@@ -33,7 +32,6 @@ from jaxgran.plotting.contours import (
     draw_levels,
     draw_plane,
     excess_field,
-    label_contours,
 )
 from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
@@ -48,17 +46,15 @@ from jaxgran.plotting.drawing import (
     draw_points,
     empty_figure,
     finish,
-    fix_layout,
+    label_log_axis,
     missing_note,
     ordered,
     padded,
     require_plane,
-    scientific,
     status_note,
     suspect,
 )
 from jaxgran.plotting.interpolation import interpolated, interpolation_error, left_out_note, refined_axes
-from jaxgran.plotting.log_axis import number_log_axis
 
 MOST_TOGETHER = 8  # curves in one panel of the figures against the time step and the number of grains
 _LOG_SPAN = 2.5  # largest over smallest force ratio at and above which the axis is logarithmic
@@ -68,7 +64,7 @@ _BETWEEN: dict[str, Any] = {"facecolor": "#2b8cbe", "alpha": 0.25, "linewidth": 
 _LEAST_CONTOURED = 0.02  # excess above which the error of interpolation is quoted, below the lowest level
 
 
-def ratio_curves(data: xr.Dataset) -> Figure:
+def ratio_curves(data: MapData) -> Figure:
     """Return force ratio and shear-stress ratio against the packing fraction, one curve per restitution (Figure 1).
 
     ======== =============================== =====================================================
@@ -83,7 +79,7 @@ def ratio_curves(data: xr.Dataset) -> Figure:
                                              status is not `ok` is an open symbol in a ring
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO)
+    data = require_map(data, *RATIO)
     data = _with_shear_stress_ratio(finest(ordered(data, "stress_ratio")))
     labels = {"force_ratio": RATIO_LABEL}
     if "shear_stress_ratio" in data:
@@ -110,7 +106,7 @@ def ratio_curves(data: xr.Dataset) -> Figure:
     return figure
 
 
-def ratio_contours(data: xr.Dataset) -> Figure:
+def ratio_contours(data: MapData) -> Figure:
     """Return the contours of the excess force ratio in the plane of 1 − α and ν (Figure 2).
 
     The contoured variable is asinh(excess/0.01). It is logarithmic for an excess well above 0.01, and linear
@@ -126,7 +122,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO)
+    data = require_map(data, *RATIO)
     require_plane(data)
     data = finest(ordered(data))
     x, y = refined_axes(data)
@@ -137,7 +133,7 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     axes = figure.add_subplot()
     _shade(axes, x, y, field)
     lines = draw_levels(axes, x, y, field, EXCESS_VALUES, colors="black", linewidths=1.1, zorder=3)
-    values = [line.value for line in lines.values()]
+    values = [EXCESS_VALUES[level] for level in lines]
     widths = interpolation_error(data, contour_variable(excess))
     between = _draw_interpolation(axes, x, y, field, widths, values)
     banded = _draw_bands(axes, x, y, excess, stderr, values)
@@ -151,12 +147,10 @@ def ratio_contours(data: xr.Dataset) -> Figure:
     found = left_out_note(data, [contour_variable(excess)], "the excess", excess > _LEAST_CONTOURED)
     notes = [_contour_note(absent), found, status_note(data), missing_note(measured, " (hatched)")]
     finish(figure, data, measured, notes)
-    fix_layout(figure)
-    label_contours(axes, {f"{level:.2f}": line for level, line in lines.items()})
     return figure
 
 
-def ratio_against_timestep(data: xr.Dataset) -> Figure:
+def ratio_against_timestep(data: MapData) -> Figure:
     """Return the force ratio against the time step, a curve for each restitution and packing fraction.
 
     Up to eight curves share one panel. With more, each packing fraction has a panel with its own force-ratio axis.
@@ -170,7 +164,7 @@ def ratio_against_timestep(data: xr.Dataset) -> Figure:
     raises   ValueError                                fewer than two time steps
     ======== ========================================= =============================================
     """
-    require_map(data, *RATIO)
+    data = require_map(data, *RATIO)
     if data.sizes.get("timestep", 1) < 2:
         raise InputError(
             f"this figure needs at least two time steps, and this map has {data.sizes.get('timestep', 1)}."
@@ -230,7 +224,7 @@ def _set_ratio_scale(axes: Axes, ratio: np.ndarray) -> None:
     if span < _LOG_SPAN:
         return
     axes.set_yscale("log")
-    number_log_axis(axes.yaxis, *axes.get_ylim())
+    label_log_axis(axes.yaxis)
 
 
 # ----------------------------------------------------------------------------------------- time steps
@@ -254,16 +248,12 @@ def point_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.D
 
 
 def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
-    """Make the time-step axis logarithmic; if it contains fewer than two powers of ten, its ends are labelled."""
+    """Make the time-step axis logarithmic."""
     axes.set_xscale("log")
     low, high = timesteps.min(), timesteps.max()
     margin = (high / low) ** 0.06
     axes.set_xlim(low / margin, high * margin)
-    powers = math.floor(math.log10(high) + 1e-9) - math.ceil(math.log10(low) - 1e-9)
-    if powers < 1:
-        axes.xaxis.set_major_locator(FixedLocator([low, high]))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"${scientific(value)}$"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    label_log_axis(axes.xaxis)
 
 
 # ------------------------------------------------------------------------------------------- contours

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from jaxgran.maps.schema import RATIO, finest, require_map
+from jaxgran.maps.schema import RATIO, MapData, finest, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.drawing import (
     LABEL_SIZE,
@@ -37,7 +37,7 @@ _QUANTITIES = {
 }
 
 
-def averages_against_grains(data: xr.Dataset) -> Figure:
+def averages_against_grains(data: MapData) -> Figure:
     """Return pressure, shear stress, granular temperature and force ratio against the number of grains.
 
     Each average is divided by its value at the largest number of grains N. Every restitution and packing fraction has a
@@ -54,7 +54,7 @@ def averages_against_grains(data: xr.Dataset) -> Figure:
     raises   ValueError                              fewer than two numbers of grains
     ======== ======================================= =====================================================
     """
-    require_map(data, *RATIO)
+    data = require_map(data, *RATIO)
     sizes = data.sizes.get("grains", 1)
     if sizes < 2:
         raise InputError(f"this figure needs at least two numbers of grains, and this map has {sizes}.")

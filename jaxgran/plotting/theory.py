@@ -1,4 +1,4 @@
-"""Figures that explain the force ratio: the errors of kinetic theory and their causes, and the share of clusters.
+"""The errors of kinetic theory and their two causes, and the share of the stress in clusters, over the plane.
 
 The figures show the largest number of grains and the shortest time step of a map that has several. The excess is
 ⟨F⟩/⟨F_bc⟩ − 1, that of the force ratio over one. In the plane of 1 − α and ν its contours are drawn on top of each
@@ -15,17 +15,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxgran.maps.schema import RATIO, finest, require_map, what_lacks
+from jaxgran.maps.schema import RATIO, MapData, finest, require_map, what_lacks
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
-    Line,
     add_plane_legend,
     draw_excess,
     draw_levels,
     draw_plane,
     excess_keys,
     excess_style,
-    label_contours,
 )
 from jaxgran.plotting.drawing import (
     ALPHA_LABEL,
@@ -39,8 +37,8 @@ from jaxgran.plotting.drawing import (
     curve_styles,
     empty_figure,
     finish,
-    fix_layout,
     is_plane,
+    label_log_axis,
     mark_bad,
     missing_note,
     ordered,
@@ -49,7 +47,6 @@ from jaxgran.plotting.drawing import (
     suspect,
 )
 from jaxgran.plotting.interpolation import interpolated, left_out_note, refined_axes
-from jaxgran.plotting.log_axis import number_log_axis
 
 ERROR_LEVELS = {
     "÷10": np.log(0.1),
@@ -72,18 +69,15 @@ SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
 """Contour values of the share of clusters."""
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
-_STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in ("", "theory_", "kinetic_", "binary_")]
+_PARTS = ("", "theory/", "stresses/kinetic_", "stresses/binary_")
+_STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in _PARTS]
 _STRESSES_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
-SHARES = [f"cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
+SHARES = [f"stresses/cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
 _LEAST_SHARE = 0.02  # share of clusters above which the error of interpolation is quoted, below the lowest level
 _EXCESS_LABEL = r"excess $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle-1$"
 _CLUSTER_NOTE = "Share of the contact stress in clusters of three or more grains"
-_THEORY_NOTE = (
-    "Black contours: error, as a quotient less one (dashed where negative) or a factor; (a) is (b) times (c).\n"
-    "Theory: Enskog balance of the second moments of anisotropic Gaussian velocities, per size class.\n"
-    "Binary: measured kinetic stress plus that of the contacts if all collisions were binary"
-)
+_THEORY_NOTE = "Black contours: quotient, or less one in % (dashed where negative); (a) = (b) × (c)"
 
 
 def has_theory(data: xr.Dataset) -> bool:
@@ -113,7 +107,7 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     Binary is the measured kinetic stress plus the contact stress if all collisions were binary. The total is the sum of
     the other two. All are NaN where a quotient is not positive or not known.
     """
-    names = quantity, f"theory_{quantity}", f"kinetic_{quantity}", f"binary_{quantity}"
+    names = [f"{part}{quantity}" for part in _PARTS]
     measured, theory, kinetic, collisional = (data[name].values for name in names)
     stderr, _, kinetic_error, collisional_error = (
         data[f"{name}_stderr"].values if f"{name}_stderr" in data else np.zeros(()) for name in names
@@ -131,13 +125,14 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     return {name: (np.where(np.isfinite(value), value, np.nan), error) for name, (value, error) in parts.items()}
 
 
-def theory_errors(data: xr.Dataset) -> Figure:
+def theory_errors(data: MapData) -> Figure:
     """Return the error of kinetic theory in the plane of 1 − α and ν, and its two parts.
 
     The rows are pressure and shear stress. The columns are the total error, the part of the binary assumption and that
     of the closure, as in :func:`error_parts`. Black contours have the error as their label; they are dashed where the
     theory is too low. In dotted areas the error is smaller than its standard error. Green contours show the excess of
-    the force ratio.
+    the force ratio. The theory is the Enskog balance of the second moments of anisotropic Gaussian velocities, for each
+    size class.
 
     ======== =============================== =====================================================
     data     (packing_fraction, restitution) what :func:`error_parts` needs, `force_ratio` and
@@ -146,13 +141,13 @@ def theory_errors(data: xr.Dataset) -> Figure:
     raises   ValueError                      fewer than two restitutions or two packing fractions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *_STRESSES_NEEDED)
+    data = require_map(data, *RATIO, *_STRESSES_NEEDED)
     require_plane(data)
     data = finest(ordered(data, *_STRESSES, "stress_ratio"))
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
     figure = empty_figure(width=7.6, height=5.9)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
-    panels, fields, noisy, over = [], [], False, {}
+    fields, noisy, over = [], False, []
     measured = np.ones(data.force_ratio.shape, bool)
     for axes, title in zip(grid[0], titles, strict=True):
         axes.set_title(title, **PANEL_TITLE)
@@ -162,18 +157,13 @@ def theory_errors(data: xr.Dataset) -> Figure:
         parts = error_parts(data, quantity)
         measured &= np.isfinite(parts["total"][0])
         for axes, (value, error) in zip(row, parts.values(), strict=True):
-            lines, hidden = draw_errors(axes, data, value, error)
+            noisy |= draw_errors(axes, data, value, error)
             fields.append(value)
             over = draw_excess(axes, data)
-            panels.append((axes, lines, over.values()))
-            noisy |= hidden
         row[0].set_ylabel(f"{_QUANTITIES[quantity]}\n{NU_LABEL}", fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
     found = left_out_note(data, fields, "each quotient")
     finish(figure, data, measured, [_THEORY_NOTE, found, status_note(data), missing_note(measured, " (hatched)")])
-    fix_layout(figure)
-    for axes, lines, over in panels:
-        label_contours(axes, lines, over, room=4.0)
     return figure
 
 
@@ -182,10 +172,10 @@ def noise_keys() -> list[Patch]:
     return [Patch(facecolor="white", edgecolor="0.5", hatch="....", linewidth=0, label="within ± std. error")]
 
 
-def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray) -> tuple[dict[str, Line], bool]:
+def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarray) -> bool:
     """Draw contours and faint shades of an error, the logarithm of a quotient.
 
-    Return the lines by their labels, and whether the error is anywhere smaller than its standard error.
+    Return whether the error is anywhere smaller than its standard error.
     """
     x, y = refined_axes(data)
     field = interpolated(value)
@@ -200,15 +190,15 @@ def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarr
         dots.set_linewidth(0.0)
     dashes = ["-" if level > 0.0 else "--" for level in ERROR_LEVELS.values()]
     style = {"colors": "black", "linewidths": 0.9, "linestyles": dashes, "zorder": 3}
-    lines = draw_levels(axes, x, y, field, ERROR_LEVELS, **style)
+    draw_levels(axes, x, y, field, ERROR_LEVELS, room=0.025, **style)
     draw_plane(axes, data, field, np.isfinite(value))
-    return lines, hidden
+    return hidden
 
 
 # -------------------------------------------------------------------------------------------- clusters
 
 
-def cluster_shares(data: xr.Dataset) -> Figure:
+def cluster_shares(data: MapData) -> Figure:
     """Return the share of the contact stress that clusters of three or more grains carry, against the excess.
 
     Left: shares of pressure and shear stress against the excess of the force ratio, with a curve per restitution and a
@@ -216,15 +206,16 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     of the excess.
 
     ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `cluster_pressure_share`, `cluster_shear_share`,
+    data     (packing_fraction, restitution) `cluster_pressure_share` and `cluster_shear_share` in
+                                             `stresses`,
                                              `force_ratio`, with `_stderr`, and `status`
     returns  Figure                          error bars are one standard error, in both directions
     ======== =============================== =====================================================
     """
-    require_map(data, *RATIO, *SHARES)
-    data = finest(ordered(data, "cluster_pressure_share", "cluster_shear_share"))
-    shares = {"pressure": "cluster_pressure_share", "shear stress": "cluster_shear_share"}
-    measured = np.isfinite(data.cluster_pressure_share.values)
+    data = require_map(data, *RATIO, *SHARES)
+    data = finest(ordered(data, "stresses/cluster_pressure_share", "stresses/cluster_shear_share"))
+    shares = {"pressure": "stresses/cluster_pressure_share", "shear stress": "stresses/cluster_shear_share"}
+    measured = np.isfinite(data["stresses/cluster_pressure_share"].values)
     plane = is_plane(data)
     figure = empty_figure(*((8.8, 4.6) if plane else (4.8, 4.6)))
     axes = figure.subplot_mosaic("pm;sm" if plane else "p;s", width_ratios=(1.0, 1.15) if plane else None)
@@ -235,20 +226,16 @@ def cluster_shares(data: xr.Dataset) -> Figure:
     axes["p"].tick_params(labelbottom=False)
     axes["s"].set_xlabel(_EXCESS_LABEL, fontsize=LABEL_SIZE)
     left_out = int((measured & ~_set_excess_scale(axes["p"], data)).sum())
-    lines, over = {}, {}
     if plane:
-        lines, over = _draw_share_plane(axes["m"], data, measured)
+        over = _draw_share_plane(axes["m"], data, measured)
         add_plane_legend(figure, data, measured, excess_keys(over))
     else:
         add_ring_legend(figure, data, "outside upper right")
     _add_share_legend(figure, data)
     beyond = f"{left_out} of {measured.size} points have an excess too small for its axis" if left_out else ""
-    share = data.cluster_pressure_share.values
+    share = data["stresses/cluster_pressure_share"].values
     found = left_out_note(data, [share], "the pressure", share > _LEAST_SHARE) if plane else ""
     finish(figure, data, measured, [_CLUSTER_NOTE, beyond, found, status_note(data), missing_note(measured)])
-    fix_layout(figure)
-    if plane:
-        label_contours(axes["m"], lines, over.values())
     return figure
 
 
@@ -282,24 +269,24 @@ def _set_excess_scale(axes: Axes, data: xr.Dataset) -> np.ndarray:
     if shown.any():
         low, high = excess[shown].min() / 1.6, (excess + stderr)[shown].max() * 1.3
         axes.set_xlim(low, high)
-        number_log_axis(axes.xaxis, low, high)
+        label_log_axis(axes.xaxis)
     return shown
 
 
-def _draw_share_plane(axes: Axes, data: xr.Dataset, measured: np.ndarray) -> tuple[dict[str, Line], dict[float, Line]]:
-    """Draw the share of the pressure in the plane; return its contours by their labels, and those of the excess."""
+def _draw_share_plane(axes: Axes, data: xr.Dataset, measured: np.ndarray) -> list[float]:
+    """Draw the share of the pressure in the plane; return the contours of the excess that it has."""
     x, y = refined_axes(data)
-    field = interpolated(data.cluster_pressure_share.values)
+    field = interpolated(data["stresses/cluster_pressure_share"].values)
     greys = [str(value) for value in np.linspace(1.0, 0.8, len(SHARE_LEVELS) + 1)]
     axes.contourf(x, y, field, [-1e9, *SHARE_LEVELS, 1e9], colors=greys, zorder=1)
     levels = {f"{level:.2f}": level for level in SHARE_LEVELS}
-    lines = draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.0, zorder=3)
+    draw_levels(axes, x, y, field, levels, colors="black", linewidths=1.0, zorder=3)
     over = draw_excess(axes, data)
     draw_plane(axes, data, field, measured)
     axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
     axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     axes.set_title("share of pressure", **PANEL_TITLE)
-    return lines, over
+    return over
 
 
 def _add_share_legend(figure: Figure, data: xr.Dataset) -> None:

@@ -1,0 +1,56 @@
+"""The half-widths of the 95 % intervals of a map, with the sources of error along a dimension."""
+
+import numpy as np
+import xarray as xr
+
+from jaxgran.maps.points import PointAverages, PointGrid
+from jaxgran.maps.schema import ERROR_SOURCES
+from jaxgran.maps.settings import MapSettings, stack_of_any_size
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.sampling.budget import BUDGET, error_budget
+from jaxgran.sampling.observables import OBSERVABLES
+
+
+def confidence_variables(settings: MapSettings, grid: PointGrid, averages: PointAverages) -> dict[str, xr.Variable]:
+    """The variables NAME_ci95 of a map, for the names in ``BUDGET``, with the dimension ``error_source``.
+
+    ===========  ====================================================================================
+    source       half-width
+    ===========  ====================================================================================
+    total        of all sources together, √(sampling² + timestep² + size² + tolerance²)
+    sampling     1.96 standard errors
+    timestep     bound on the error from the time step
+    size         bound on the difference from a large system
+    tolerance    bound on the error from the tolerance of the contact solves
+    ===========  ====================================================================================
+    """
+    flows = stack_of_any_size(settings.flows())
+    budget = error_budget(
+        averages.values,
+        averages.stderrs,
+        flows.restitution,
+        flows.packing_fraction,
+        point_grains(settings),
+        flows.timestep,
+        settings.solver.tolerance,
+    )
+    variables = {}
+    for name in BUDGET:
+        long_name, units = OBSERVABLES[name]
+        one = budget[name]
+        by_source = {
+            "total": one.error,
+            "sampling": HALF_INTERVAL * one.stderr,
+            "timestep": one.timestep,
+            "size": one.size,
+            "tolerance": one.tolerance,
+        }
+        values = np.stack([by_source[source] for source in ERROR_SOURCES], axis=-1)
+        about = {"long_name": f"half-width of the 95 % interval of {long_name}", "units": units}
+        variables[f"{name}_ci95"] = grid.variable(values, about, "error_source")
+    return variables
+
+
+def point_grains(settings: MapSettings) -> np.ndarray:
+    """The number of grains of every point."""
+    return np.array([flow.grains for flow in settings.flows()])

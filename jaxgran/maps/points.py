@@ -1,0 +1,116 @@
+"""The points of a map: their dimensions, and the averages of the replicas of each."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.status import Status
+from jaxgran.sampling.correlation_strain import flow_correlation_strain
+from jaxgran.sampling.drift import is_drifting
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
+
+TENSOR_AXES = ("axis_a", "axis_b")
+
+
+class PointGrid(NamedTuple):
+    """The dimensions of a point, outermost first, and their sizes."""
+
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+
+    @classmethod
+    def of(cls, settings: MapSettings) -> "PointGrid":
+        """The grid of a map."""
+        return cls(tuple(settings.axes), tuple(map(len, settings.axes.values())))
+
+    def variable(self, values: np.ndarray, attrs: Mapping[str, Any], *further: str) -> xr.Variable:
+        """A variable of values (points, ...) in the order of ``settings.flows()``; ``further`` are its last dims."""
+        return xr.Variable((*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs))
+
+    def averages(
+        self, names: Iterable[str], values: Mapping[str, np.ndarray], stderrs: Mapping[str, np.ndarray]
+    ) -> dict[str, xr.Variable]:
+        """The variables NAME and NAME_stderr of some observables."""
+        variables = {}
+        for name in names:
+            long_name, units = OBSERVABLES[name]
+            tensor_dims = TENSOR_AXES if name in TENSORS else ()
+            error = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
+            about = {"long_name": long_name, "units": units}
+            variables[name] = self.variable(values[name], about, *tensor_dims)
+            about = {"long_name": f"{error} of {long_name}", "units": units}
+            variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *tensor_dims)
+        return variables
+
+
+class PointAverages(NamedTuple):
+    """Averages over the finite seeds of each point, in the order of ``settings.flows()``; NaN where there are none.
+
+    ============================  ==============  =================================================================
+    values, stderrs               (points, ...)   each observable and its standard error, by name
+    correlation_strain            (points,)       strain over which the flow is correlated
+    observable_correlation        (points,)       strain of one independent sample, for averages of scalars, by name
+    friction_error_correlation    (points,)       of the errors of macroscopic_friction and inertial_number
+    drifting                      (points,)       whether the averages still change
+    samples                       by point        finite samples
+    ============================  ==============  =================================================================
+    """
+
+    values: dict[str, np.ndarray]
+    stderrs: dict[str, np.ndarray]
+    correlation_strain: np.ndarray
+    observable_correlation: dict[str, np.ndarray]
+    friction_error_correlation: np.ndarray
+    drifting: np.ndarray
+    samples: dict[int, Sequence[Sample]]
+
+
+def tensor_shape(name: str) -> tuple[int, ...]:
+    """Shape of an observable at one point: (2, 2) for a tensor, () for a scalar."""
+    return (2, 2) if name in TENSORS else ()
+
+
+def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> PointAverages:
+    """The averages of every point over its finite replicas."""
+    flows = settings.flows()
+    count = len(flows)
+    scalars = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
+    found = PointAverages(
+        values={name: np.full((count, *tensor_shape(name)), np.nan) for name in OBSERVABLES},
+        stderrs={name: np.full((count, *tensor_shape(name)), np.nan) for name in OBSERVABLES},
+        correlation_strain=np.full(count, np.nan),
+        observable_correlation={name: np.full(count, np.nan) for name in scalars},
+        friction_error_correlation=np.full(count, np.nan),
+        drifting=np.zeros(count, bool),
+        samples=_finite_samples(settings, replicas),
+    )
+    for point, samples in found.samples.items():
+        flow, (values, stderrs) = flows[point], estimates(samples)
+        for name in OBSERVABLES:
+            found.values[name][point], found.stderrs[name][point] = values[name], stderrs[name]
+        mass = flow.grains * (1 + float(flow.polydispersity) ** 2 / 3)
+        area, shear_rate = samples[0].area, samples[0].shear_rate
+        strain = found.correlation_strain[point] = flow_correlation_strain(values, flow.grains, mass, area, shear_rate)
+        found.drifting[point] = is_drifting(samples, float(strain))
+        correlation = error_correlation_of(samples, "macroscopic_friction", "inertial_number")
+        found.friction_error_correlation[point] = correlation
+        independent = correlation_strains(samples)
+        for name in scalars:
+            found.observable_correlation[name][point] = independent[name]
+    return found
+
+
+def _finite_samples(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> dict[int, Sequence[Sample]]:
+    """The samples of the finite replicas of each point that has any, in the order of the seeds."""
+    finite: dict[int, Sequence[Sample]] = {}
+    for point in range(len(settings.flows())):
+        seeds = [replicas.get((point, seed)) for seed in range(settings.seeds)]
+        samples = [one.sample for one in seeds if one is not None and one.status < Status.nonfinite]
+        if samples:
+            finite[point] = samples
+    return finite
