@@ -411,13 +411,13 @@ def test_broken_or_foreign_file_is_one_sentence_and_status_2(name: str, tmp_path
     ("options", "why"),
     {
         "--frame-time 0": "--frame-time must be a positive number, not 0",
-        "--frame-strain 0.1 --frame-time 1": "--frame-strain goes without --frame-time",
+        "--frame-strain 0.1 --frame-time 1": "--frame-strain and --frame-time exclude each other",
         "--frame-strain 0.1 --shear-rate 0": "--shear-rate must be positive beside a strain",
         "--peculiar": "--peculiar goes with a shear rate",
-        "--every 0": "--every must be a whole number of at least 1, not 0",
+        "--stride 0": "--stride must be a whole number of at least 1, not 0",
         "--diameter -1": "--diameter must be a positive number",
         "--position-noise -1": "--position-noise must be a number of at least 0",
-        "--pressure 3": "--pressure goes with a map, and 'discs.csv' is not one",
+        "--pressure 3": "--pressure requires a map, and 'discs.csv' is none",
         "--frame-time 1": "must be in one unit",
     }.items(),
 )

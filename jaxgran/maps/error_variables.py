@@ -29,7 +29,13 @@ def error_variables(
     flows = stack_of_any_size(settings.flows())
     grains = np.array([flow.grains for flow in settings.flows()])
     budget = error_budget(
-        values, errors, flows.restitution, flows.packing_fraction, grains, flows.timestep, settings.tolerance
+        values,
+        errors,
+        flows.restitution,
+        flows.packing_fraction,
+        grains,
+        flows.timestep,
+        settings.tolerance,  # type: ignore[arg-type]
     )
     variables = {}
     for name in BUDGET:
