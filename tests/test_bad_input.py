@@ -228,6 +228,7 @@ def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> No
     function = {**NUMBERS, **OBJECTS}[argument]
     for value in NEVER:
         suits = (value is SEEN and argument == "fields_at seen") or (value is KEYS and argument == "prepare key")
+        suits |= argument == "ratio_map attributes" and isinstance(value, dict)
         if not suits:
             assert verdict(function, value)
 
@@ -515,7 +516,7 @@ ALIKE = {"tolerance": 1e-4, "solver": "barzilai-borwein", "equilibrate": "until 
     [
         *[("grains", value) for value in ("many", 3, 64.5, [64, 64])],
         *[("seeds", value) for value in (0, "two", 10**9)],
-        *[("timestep", value) for value in ("short", [1e-3, 1e-4], 0.0, 1e-300)],
+        *[("timestep", value) for value in ("short", 0.0, 1e-300)],
         *[("strain", value) for value in ("long", 1e30, [1.0, 2.0])],
         *[
             (name, value)

@@ -14,7 +14,7 @@ This module loads neither JAX nor xarray, so that the command line can print its
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
@@ -183,7 +183,7 @@ class RunParameters(MapParameters):
         default=None,
         metadata=row("Wraps the function that advances a sampled batch, such as that of a recorder.", commands=()),
     )
-    attributes: Mapping[str, Any] | None = field(
+    attributes: dict[str, Any] | None = field(
         default=None, metadata=row("More attributes of the dataset.", commands=())
     )
 

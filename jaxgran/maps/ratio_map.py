@@ -3,7 +3,6 @@
 import os
 import sys
 import warnings
-from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from threading import Thread
@@ -130,8 +129,8 @@ def _checked(run: RunParameters) -> Path | None:
         raise refused("record", run.record, "must be a function")
     if run.record is not None and (run.resume or run.workers > 1 or run.scheduler is not None):
         raise InputError("what is recorded cannot be resumed, and needs one process.", field="record")
-    if run.attributes is not None and not isinstance(run.attributes, Mapping):
-        raise refused("attributes", run.attributes, "must be a mapping")
+    if run.attributes is not None and not isinstance(run.attributes, dict):
+        raise refused("attributes", run.attributes, "must be a dictionary")
     if run.output is None:
         if run.resume:
             raise InputError("`resume` requires `output`.", field="resume")
