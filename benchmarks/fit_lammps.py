@@ -57,9 +57,9 @@ class Way(NamedTuple):
 NOISE = {"position_noise": 1e-3, "velocity_noise": 5e-3}  # σ and σ/t: what a contact of some duration is off by
 WAYS = {  # by the options of the command
     "": Way(1, {}),
-    "--every 3": Way(3, {}),
-    "--every 3 --position-noise 0.001 --velocity-noise 0.005": Way(3, NOISE),
-    "--every 3 --position-noise 0.001, positions alone": Way(3, {"position_noise": 1e-3}, True),
+    "--stride 3": Way(3, {}),
+    "--stride 3 --position-noise 0.001 --velocity-noise 0.005": Way(3, NOISE),
+    "--stride 3 --position-noise 0.001, positions alone": Way(3, {"position_noise": 1e-3}, True),
 }
 
 

@@ -10,16 +10,16 @@ from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
 
-from jaxgran.maps import journal
-from jaxgran.maps import ratio_map as sweep
+from jaxgran.maps import batches, journal, replicas
 
 PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
 journal.SECONDS = 0.1  # so that its batches have journals
+batches.batch_size = lambda *_: 2
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
 modules["dask"] = None  # as for a user without a cluster: xarray would load it, which takes half a second
-advance_batch = sweep.advance_batch
+advance_batch = replicas.advance_batch
 FAULT = os.environ.get("FAULT", "")
 
 
@@ -28,20 +28,20 @@ def advance_slowly(*arguments):
     return advance_batch(*arguments)
 
 
-sweep.advance_batch = advance_slowly
+replicas.advance_batch = advance_slowly
 
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
 elif FAULT == "deadly batch":
-    measured = sweep._measured
+    measured = replicas._measured
 
     def deadly(settings, task, drive, refinement=1):
         if (0, 0) in task:
             os.kill(os.getpid(), signal.SIGKILL)
         return measured(settings, task, drive, refinement)
 
-    sweep._measured = deadly
+    replicas._measured = deadly
 
 if __name__ == "__main__":
     from jaxgran.cli.app import main

@@ -21,7 +21,7 @@ NEEDS_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="lo
 DRIVER = Path(__file__).with_name("fault_driver.py")
 FLOWS = ["--restitution", "0.3,0.7", "--packing-fraction", "0.6", "--grains", "32", "--seeds", "2"]
 STRAINS = ["--timestep", "1e-3", "--equilibrate", "3", "--strain", "10"]
-MAP = ["map", *FLOWS, *STRAINS, "--batch", "2"]
+MAP = ["map", *FLOWS, *STRAINS]
 PATIENCE = 120.0
 
 
@@ -38,6 +38,7 @@ class Lab:
         """Run a map in this process, where nothing happens to it."""
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
+            patch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
             return jaxgran(self.folder, *MAP, "--workers", "1", "--output", output, *words)
 
     def start(self, output: str, *words: str, fault: str = "", workers: int = 1) -> subprocess.Popen:

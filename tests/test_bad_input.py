@@ -1,5 +1,6 @@
 """Bad input of any kind ends with one sentence that says what is accepted: nothing runs, and no file is left behind."""
 
+import inspect
 import math
 import os
 import time
@@ -26,6 +27,9 @@ from synthetic import one_sentence, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
+from jaxgran.cli import map as cli_map
+from jaxgran.cli import run as cli_run
+from jaxgran.cli.mistakes import option_name
 from jaxgran.dynamics import snapshots
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import settings as map_settings
@@ -108,11 +112,10 @@ def make_map(name: str, value: Any) -> xr.Dataset:
     return jg.ratio_map(**{**MAP, name: value})
 
 
+PARAMETERS = list(inspect.signature(jg.ratio_map).parameters)
 NUMBERS: dict[str, Callable[[Any], Any]] = {
     **{f"ShearFlow {name}": partial(make_flow, name) for name in jg.ShearFlow.__dataclass_fields__},
-    **{f"ratio_map {name}": partial(make_map, name) for name in ratio_map_module.ratio_map.__kwdefaults__},
-    "ratio_map restitution": partial(make_map, "restitution"),
-    "ratio_map packing_fraction": partial(make_map, "packing_fraction"),
+    **{f"ratio_map {name}": partial(make_map, name) for name in PARAMETERS},
     "polydisperse count": lambda x: jg.polydisperse(x, 0.2, "no key"),
     "polydisperse polydispersity": lambda x: jg.polydisperse(4, x, "no key"),
     "prepare equilibrate": lambda x: jg.prepare(flow(), KEY, x),
@@ -225,8 +228,9 @@ def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> No
     function = {**NUMBERS, **OBJECTS}[argument]
     for value in NEVER:
         suits = (value is SEEN and argument == "fields_at seen") or (value is KEYS and argument == "prepare key")
+        suits |= argument == "ratio_map attributes" and isinstance(value, dict)
         if not suits:
-            assert verdict(function, value) or (argument == "ratio_map batch" and value == 10**5000)
+            assert verdict(function, value)
 
 
 @pytest.mark.parametrize("argument", NUMBERS)
@@ -249,7 +253,7 @@ def test_any_flow_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]
 
 
 @few(max_examples=50)
-@given(st.dictionaries(st.sampled_from([*MAP, *ratio_map_module.ratio_map.__kwdefaults__]), anything, min_size=2))
+@given(st.dictionaries(st.sampled_from(PARAMETERS), anything, min_size=2))
 def test_any_map_is_accepted_or_refused_in_one_sentence(changes: dict[str, Any]) -> None:
     verdict(lambda _: jg.ratio_map(**{**MAP, **changes}), None)
 
@@ -265,7 +269,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "too many seeds": (partial(make_map, "seeds", 10**9), "at most 1000000, the most replicas of a map"),
     "too many replicas": (partial(make_map, "seeds", 600_000), "at most 1000000 replicas, points times seeds"),
     "too many restitutions": (partial(make_map, "restitution", range(10**9)), "a list of at most 1000000 numbers"),
-    "too long a strain": (partial(make_map, "strain", 1e30), r"at most 2147483647 time steps, that is 2.14748e\+06"),
+    "too long a strain": (partial(make_map, "strain", 1e30), "at most 2147483647 time steps"),
     "too long an equilibration": (partial(make_map, "equilibrate", 1e30), r"at least 0 and at most 1e\+06"),
     "too short a time step": (partial(make_map, "timestep", 1e-300), "at least 1e-08 / shear rate"),
     "too short a time step in a list": (partial(make_map, "timestep", [1e-3, 1e-12]), "at least 1e-08 / shear rate"),
@@ -294,7 +298,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "no clusters": (lambda: jg.cluster_shares(ratio_dataset()), "it has no stresses/cluster_pressure_share"),
     "no friction": (lambda: jg.friction_figure(ratio_dataset()), "it has no inertial_number"),
     "too few dense points": (lambda: jg.friction_law(dense_map()), "at least 4 points of status ok"),
-    "a report that is none": (partial(make_map, "report", 3), "report must be a function of one number"),
+    "progress that is none": (partial(make_map, "progress", 3), "progress must be True, False or a function"),
 }
 
 
@@ -345,21 +349,8 @@ def ends(*_) -> Iterator:
 
 
 RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6")
-MAP_OPTIONS = ["restitution", "packing-fraction", "grains", "seeds", "timestep", "equilibrate", "strain", "error"]
-MAP_OPTIONS += [
-    "tolerance",
-    "target-error",
-    "solver",
-    "activation",
-    "engine",
-    "batch",
-    "workers",
-    "scheduler",
-    "preset",
-]
-MAP_OPTIONS += ["output", "like", "snapshots", "first-seed"]
-RUN_OPTIONS = ["restitution", "packing-fraction", "grains", "strain", "error", "timestep", "engine", "output"]
-RUN_OPTIONS += ["seeds", "seed", "tolerance", "solver", "activation", "trajectory", "trajectory=x.gsd --every"]
+MAP_OPTIONS = [option_name(name) for name, one in cli_map.MAP_OPTIONS.items() if one.kind is not bool]
+RUN_OPTIONS = [option_name(name) for name, one in cli_run.RUN_OPTIONS.items() if one.kind is not bool]
 ENORMOUS = ["1" * 5000, "9" * 12, "1e30", "1e-300", "1e999", "-" + "9" * 400, "0:1:10000000", "0:1:" + "9" * 5000]
 ENORMOUS += ["a" * 5000, "a" * 5000 + ".nc", "n" * 250 + ".nc", "\udcff.nc", "../..", "/", ".nc", "..nc", "~/x", "x.NC"]
 ENORMOUS += ["n" * 250 + ".gsd", "\udcff.gsd", "x.gsd"]
@@ -377,15 +368,14 @@ texts = st.one_of(
 @few(max_examples=12)
 @given(texts)
 def test_any_text_in_an_option_of_map_is_accepted_or_refused_in_one_sentence(option: str, text: str) -> None:
-    accepts_or_refuses("map", f"--{option}={text}")
+    accepts_or_refuses("map", f"{option}={text}")
 
 
 @pytest.mark.parametrize("option", RUN_OPTIONS)
 @few(max_examples=12)
 @given(texts)
 def test_any_text_in_an_option_of_run_is_accepted_or_refused_in_one_sentence(option: str, text: str) -> None:
-    *others, option = option.split(" --")
-    accepts_or_refuses(*RUN, *(f"--{other}" for other in others), f"--{option}={text}")
+    accepts_or_refuses(*RUN, f"{option}={text}")
 
 
 @few(max_examples=40)
@@ -408,30 +398,8 @@ def test_any_words_after_a_command_are_refused_in_one_sentence(command: str, wor
 def test_enormous_text_is_accepted_or_refused_at_once_in_one_sentence(option: str) -> None:
     start = time.process_time()
     for text in ENORMOUS:
-        accepts_or_refuses("map", f"--{option}={text}")
+        accepts_or_refuses("map", f"{option}={text}")
     assert time.process_time() - start < SECONDS * len(ENORMOUS)
-
-
-TOO_MUCH = {
-    "map --grains 1000000000000": "grains must be at most 10000000",
-    "map --seeds 1000000000": "seeds must be at most 1000000",
-    "map --restitution 0:1:10000000": "start:stop:count with a count of 2 to 1000000",
-    "map --restitution 0:1:1000000": "at most 1000000 replicas, points times seeds",
-    "map --strain 1e30": "strain must be at most 2147483647 time steps",
-    "map --equilibrate 1e30": "equilibrate must be a number of at least 0 and at most",
-    "map --timestep 1e-300": "timestep must be at least 1e-08 / shear rate",
-    "map --batch 99999999999999": "batch must be auto or a whole number of at least 1, below a billion",
-    "map --workers 1000000000": "workers must be at most 1024",
-    "run --restitution 0.5 --packing-fraction 0.6 --grains 1000000000000": "grains must be at most 10000000",
-    "run --restitution 0.5 --packing-fraction 0.6 --strain 1e30": "at most 2147483647 time steps",
-}
-
-
-@pytest.mark.parametrize(("command", "accepted"), TOO_MUCH.items(), ids=TOO_MUCH)
-def test_more_than_can_be_held_or_counted_is_refused(command: str, accepted: str) -> None:
-    outcome = accepts_or_refuses(*command.split())
-    assert outcome.status == 2
-    assert accepted in outcome.err
 
 
 # Files
@@ -480,7 +448,7 @@ def test_a_dataset_that_is_no_map_is_refused_by_every_figure(kind: str, tmp_path
 @pytest.mark.parametrize("kind", NO_MAPS)
 def test_a_file_that_is_no_map_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
     NO_MAPS[kind].to_netcdf(tmp_path / "no.nc", engine="netcdf4")
-    for words in (["plot", "no.nc"], ["map", "--like", "no.nc"]):
+    for words in (["plot", "no.nc"], ["map", "--from-map", "no.nc"]):
         outcome = jaxgran(tmp_path, *words)
         assert_one_sentence(outcome)
         assert "'no.nc' is not a ratio map: " in outcome.err
@@ -524,7 +492,7 @@ GARBAGE: dict[str, Callable[[Path], Any]] = {
 @pytest.mark.parametrize("kind", GARBAGE)
 def test_a_file_that_is_no_netcdf_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
     GARBAGE[kind](tmp_path / "garbage.nc")
-    for words in (["plot", "garbage.nc"], ["map", "--like", "garbage.nc"]):
+    for words in (["plot", "garbage.nc"], ["map", "--from-map", "garbage.nc"]):
         assert_one_sentence(jaxgran(tmp_path, *words))
     assert files(tmp_path) == {"garbage.nc"}
 
@@ -553,7 +521,7 @@ ALIKE = {
     [
         *[("grains", value) for value in ("many", 3, 64.5, [64, 64])],
         *[("seeds", value) for value in (0, "two", 10**9)],
-        *[("timestep", value) for value in ("short", [1e-3, 1e-4], 0.0, 1e-300)],
+        *[("timestep", value) for value in ("short", 0.0, 1e-300)],
         *[("strain", value) for value in ("long", 1e30, [1.0, 2.0])],
         *[
             (name, value)
@@ -569,7 +537,7 @@ def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any,
     data = ratio_dataset(alphas=2, nus=2)
     attrs = {"restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE}
     data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
-    outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
+    outcome = jaxgran(tmp_path, "map", "--from-map", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
     assert name.partition("_")[0] in outcome.err
     assert files(tmp_path) == {"old.nc"}
@@ -581,7 +549,7 @@ def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, t
     attrs = {**data.attrs, **ALIKE}
     del attrs[missing]
     data.drop_attrs(deep=False).assign_attrs(attrs).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
-    outcome = jaxgran(tmp_path, "map", "--like", "old.nc", "--output", "new.nc")
+    outcome = jaxgran(tmp_path, "map", "--from-map", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
     assert missing in outcome.err
     assert files(tmp_path) == {"old.nc"}
@@ -667,7 +635,7 @@ def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_pa
         for words in (["plot", "map.nc"], ["map", "--output", "new.nc"], [*RUN, "--output", "new.nc"]):
             assert_one_sentence(jaxgran(tmp_path, *words))
         (tmp_path / "map.nc").chmod(0)
-        for words in (["plot", "map.nc"], ["map", "--like", "map.nc"]):
+        for words in (["plot", "map.nc"], ["map", "--from-map", "map.nc"]):
             assert_one_sentence(jaxgran(tmp_path, *words))
     finally:
         tmp_path.chmod(0o700)

@@ -77,7 +77,7 @@ def test_replicas_of_every_number_of_grains_come_back(output: Path) -> None:
 
 def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     cut_off(output)
-    with pytest.raises(InputError, match="continue it with --resume") as refused:
+    with pytest.raises(InputError, match="to continue it") as refused:
         Checkpoint(output, SETTINGS, resume=False)
     assert one_sentence(str(refused.value))
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
@@ -96,7 +96,7 @@ def test_another_map_is_refused_and_the_difference_named(output: Path, change: d
 def test_another_version_is_refused_and_named(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cut_off(output)
     monkeypatch.setattr(checkpoint, "version", lambda name: "0.0.1")
-    with pytest.raises(InputError, match=r"version of jaxgran .* and not '0.0.1'"):
+    with pytest.raises(InputError, match=r"version of jaxgran .*, not '0.0.1'"):
         Checkpoint(output, SETTINGS, resume=True)
 
 
@@ -222,7 +222,7 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
 
 def test_a_file_in_place_of_the_folder_is_one_sentence(output: Path) -> None:
     output.with_name("map.nc.unfinished").write_text("mine")
-    with pytest.raises(InputError, match="there is a file of this name") as refused:
+    with pytest.raises(InputError, match="a file has this name") as refused:
         Checkpoint(output, SETTINGS, resume=False)
     assert one_sentence(str(refused.value))
 

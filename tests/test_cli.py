@@ -30,7 +30,7 @@ from command_line import (
     made_up_replicas,
     write_few_variables,
 )
-from drawn import write_without_drawing
+from drawn import leave_out_layout, write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up_maps import known_closure, made_up_map
@@ -38,18 +38,16 @@ from matplotlib.figure import Figure
 from PIL import Image
 from synthetic import one_sentence, random_replica
 
-from jaxgran.cli import app
+from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
-from jaxgran.cli.arguments import number_list
 from jaxgran.cli.tables import print_table
-from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
-from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
@@ -65,7 +63,7 @@ SMALL_MAP = (
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
 SAME += ("solver", "engine", "solver_requested", "engine_requested")
 PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters", "errors")}
-FRAMES = ["--trajectory", "flow.gsd", "--every", "0.1"]
+FRAMES = ["--trajectory", "flow.gsd", "--frame-strain", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
 STRESSES = ["--packing-fraction", "0.7", "--pressure", "3", "--shear-stress", "1"]
@@ -80,35 +78,39 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 # Lists
 
 
+def restitutions(text: str) -> tuple[float, ...]:
+    return arguments.value("restitution", map_module.MAP_OPTIONS["restitution"], text)
+
+
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=8))
 def test_list_of_numbers_is_those_numbers(numbers: list[float]) -> None:
-    assert number_list(",".join(map(repr, numbers)), "restitution") == tuple(numbers)
+    assert restitutions(",".join(map(repr, numbers))) == tuple(numbers)
 
 
 @given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
 def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, count: int) -> None:
-    numbers = number_list(f"{start / 100}:{stop / 100}:{count}", "restitution")
+    numbers = restitutions(f"{start / 100}:{stop / 100}:{count}")
     assert len(numbers) == count
     assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
 
 
 def test_range_has_no_noise_in_its_last_digits() -> None:
-    assert number_list("0.1:0.9:9", "restitution") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    assert restitutions("0.1:0.9:9") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 @pytest.mark.parametrize("text", ["", ",", "0.1,", "a", "0.1;0.5", "0.1:0.9", "0.1:0.9:1", "0.1:0.9:x", "0:1:2:3"])
 def test_what_is_no_list_is_refused(text: str) -> None:
     with pytest.raises(
-        InputError, match=r"restitution must be a number, a list like 0\.1,0\.5,0\.9 or start:stop:count"
+        InputError, match=r"restitution must be a number or a list like 0\.1,0\.5,0\.9 or start:stop:count"
     ):
-        number_list(text, "restitution")
+        restitutions(text)
 
 
 @given(st.text("0123456789.,:e-+ nainf", max_size=8))
 def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
     try:
-        numbers = number_list(text, "restitution")
+        numbers = restitutions(text)
     except InputError as mistake:
         assert one_sentence(str(mistake))
     else:
@@ -118,112 +120,60 @@ def test_any_text_is_a_list_of_numbers_or_a_mistake(text: str) -> None:
 
 # Mistakes
 
-MISTAKES = {
-    "run --restitution 0.5 --packing-fraction 0.6 --strain 0": "strain must be a positive number",
-    "run --restitution 0.5 --packing-fraction 0.6 --colour 3": "there is no option --colour",
-    "map --restitution -0.1,0.5": "restitution must be between 0 and 1",
-    "map --restitution 0.5,1.1": "restitution must be between 0 and 1",
-    "map --restitution nan": "restitution must be between 0 and 1",
-    "map --restitution ''": "restitution must be a number, a list",
-    "map --restitution 0.5,0.1,0.9": "restitution must be sorted",
-    "map --restitution 0.5,0.5": "without repetition",
-    "map --packing-fraction 0,0.5": "--packing-fraction must be above 0 and at most 0.83",
-    "map --packing-fraction 0.5,0.84": "--packing-fraction must be above 0 and at most 0.83",
+FLOW = "run --restitution 0.5 --packing-fraction 0.6"
+MISTAKES = {  # one for each kind of option, check and file
+    "map --restitution -0.1,0.5": "--restitution must be between 0 and 1",
+    "map --restitution ''": "--restitution must be a number or a list",
     "map --packing-fraction 0.7,0.5,0.6": "--packing-fraction must be sorted",
-    "map --grains 15": "grains must be a whole number of at least 16",
-    "map --grains 20.5": "--grains must be a whole number",
-    "map --seeds 0": "seeds must be a whole number of at least 1",
-    "map --timestep 0": "timestep must be a positive number",
-    "map --timestep -1e-3": "timestep must be a positive number",
-    "map --timestep fine": "timestep must be a number, a list",
-    "map --timestep 1e-3,1e-3": "without repetition",
-    "map --timestep 1e-3,1e-5,1e-4": "timestep must be sorted",
-    "map --timestep 1e-3,0": "timestep must be a positive number",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 1e-3,0.01": "timestep must be at most",
-    "map --timestep 0.2": "timestep must be at most 0.1 / shear_rate",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.01": "auto chooses one",
-    "map --strain 0": "strain must be a positive number",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "strain must be at least 160 time steps",
-    "map --equilibrate -1": "equilibrate must be a number of at least 0",
-    "map --tolerance 1": "tolerance must be between",
-    "map --tolerance 1e-3,1e-4": "tolerance must be between",
-    "map --tolerance loose": "tolerance must be a number",
-    "map --error 0": "error must be between 1e-3 and 0.5",
-    "map --error small": "--error",
+    "map --grains 20.5": "--grains must be auto, a whole number or a list like 256,1000,4000, not '20.5'",
+    "map -n 15": "--grains must be a whole number of at least 16, not 15",
+    "map --grains auto": "--grains auto requires --error",
+    "map --seeds 0": "--seeds must be a whole number of at least 1",
+    "map --timestep fine": "--timestep must be auto, a number or a list",
+    "map --timestep 1e-3,1e-3": "--timestep must be sorted and without repetition",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.01": "--timestep must be at most",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "--strain must be at least 160 time steps",
+    "map --tolerance 1e-3,1e-4": "--tolerance must be auto, a number, not '1e-3,1e-4'",
+    "map --error small": "--error must be a number, not 'small'",
     "map --error 0.02 --strain 5": "--strain and --error exclude each other",
-    "run --restitution 0.5 --packing-fraction 0.6 --strain 5 --error 0.02": "--strain and --error exclude each other",
-    "map --timestep auto --target-error 1": "--target-error must be between 1e-4 and 0.1",
-    "run --restitution 0.5 --packing-fraction 0.6 --timestep 1e-3,1e-4": "timestep must be one number or auto",
-    "map --solver gauss": "'nesterov', 'barzilai-borwein', 'jacobi'",
-    "map --engine fortran": "--engine must be one of 'auto', 'numba', 'jax', 'pallas', not 'fortran'",
-    "map --engine pallas": "--engine must be auto or jax on a CPU, not pallas",
-    "map --engine numba --solver jacobi": "--engine must be auto or jax with the solver jacobi",
-    "run --restitution 0.5 --packing-fraction 0.6 --engine pallas": "--engine must be auto or jax on a CPU",
-    "map --activation always": "'midpoint', 'touching'",
-    "map --preset slow": "'quick', 'paper', 'dense'",
-    "map --batch 0": "batch must be auto or a whole number of at least 1",
-    "map --batch many": "batch must be auto or a whole number of at least 1",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --workers 0": "workers must be a whole number of at least 1",
-    "map --output map.txt": "ends in .nc",
-    "map --output none/map.nc": "a folder that exists",
-    "map --output folder.nc": "is a folder",
+    "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
+    "map --engine fortran": "--engine must be auto, numba, jax or pallas, not 'fortran'",
+    "map --engine pallas": "engine must be auto or jax on a CPU, not pallas",
+    "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
+    "map --restitution 0.5,0.9 --packing-fraction 0.6 --workers 0": "--workers must be a whole number of at least 1",
+    "map --output map.txt": "--output must be a file name that ends in .nc",
+    "map -o folder.nc": "is a folder",
     "map --output picture.nc": "picture_timestep.png' is a folder",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
-    "map --like none.nc": "there is no file",
-    "map --like text.nc": "not a NetCDF file",
-    "map --wrong": "--wrong",
-    "run --restitution 2 --packing-fraction 0.5": "restitution must be between 0 and 1",
-    "run --restitution 0.5 --packing-fraction 0.9": "--packing-fraction must be above 0 and at most 0.83",
-    "run --restitution 0.5 --packing-fraction 0.5 --grains 3": "grains must be a whole number of at least 16",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.xyz": "trajectory must be a file name that ends in",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 0": "every must be at least 5e-05, for",
-    "run --restitution 0.5 --packing-fraction 0.5 --trajectory flow.gsd --every 6": "at most the sampled strain, 5",
-    "run --restitution 0.5 --packing-fraction 0.5 --every 1": "add --trajectory FILE.gsd",
-    "run --restitution 0.5 --packing-fraction 0.5 --every 2": "or --page FILE.html to have any",
-    "run --restitution 0.5 --packing-fraction 0.5 --page flow.gif": "--page must be a file name that ends in .html",
-    "explore none.nc": "there is no file",
-    "explore text.nc": "not a NetCDF file",
-    "explore text.nc --output page.nc": "--output must be a file name that ends in .html",
-    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.avi": "--movie must be a file name that ends in .gif or",
-    "run --restitution 0.5 --packing-fraction 0.5 --movie none/flow.gif": "--movie must be in a folder that exists",
-    "run --restitution 0.5 --packing-fraction 0.5 --movie flow.gif --every 0.001": "at least 0.01, for 500",
-    "run --restitution 0.5 --packing-fraction 0.5 --output flow.csv": "ends in .nc",
-    "run --restitution 0.5": "--packing-fraction",
-    "plot none.nc": "there is no file",
-    "plot folder.nc": "there is no file",
-    "plot text.nc": "not a NetCDF file",
+    "map --from-map text.nc": "not a NetCDF file",
+    f"{FLOW} --timestep 1e-3,1e-4": "--timestep must be auto, a number, not '1e-3,1e-4'",
+    f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
+    f"{FLOW} --trajectory flow.gsd --frame-strain 0": "--frame-strain must be at least 5e-05, for",
+    f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory, --movie or --page",
+    f"{FLOW} --page flow.gif": "page must be a file name that ends in .html",
+    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory, --movie and --page show one seed: leave out --seeds",
+    f"{FLOW} --resume": "--resume requires --output",
+    "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
+    "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
+    "explore text.nc --output page.nc": "output must be a file name that ends in .html",
     "plot": "FILE must be given: see jaxgran plot --help",
-    "fit": "FILE must be given: see jaxgran fit --help",
-    "fit none.gsd": "there is no file 'none.gsd'",
-    "fit none.nc": "there is no file 'none.nc'",
-    "fit text.nc": "not a NetCDF file",
+    "plot none.nc": "there is no file",
+    "plot text.nc --dpi many": "--dpi must be a whole number, not 'many'",
     "fit text.gsd": "'text.gsd' cannot be read",
-    "fit text.gsd --pressure 3": "--pressure goes with a map, and 'text.gsd' is not one",
-    "fit text.nc --frame-time 1": "--frame-time goes with tracks of discs, and 'text.nc' is a map",
-    "fit text.nc --pressure 3": "--packing-fraction must be given too",
-    "fit text.nc --packing-fraction 0.7 --pressure 3": "--shear-stress must be given too",
+    "fit text.gsd --pressure 3": "--pressure requires a map, and 'text.gsd' is none",
+    "fit text.nc --frame-time 1": "--frame-time requires tracks of discs, and 'text.nc' is a map",
+    "fit text.nc --pressure 3": "--packing-fraction must be given, too",
     "fit text.nc --relative-error -1": "--relative-error must be between 0 and 1, not -1.0",
+    "fit text.gsd --frame-strain 1 --frame-time 1": "--frame-strain and --frame-time exclude each other",
     # as they slip in
     "draw": "there is no command 'draw': see jaxgran --help",
     "mpa": "there is no command 'mpa', perhaps map is meant",
-    "run": "--restitution must be given: see jaxgran run --help",
     "run --alpha 0.5": "there is no option --alpha, perhaps --restitution is meant",
-    "run --restitution 0.5 --nu 0.7": "there is no option --nu, perhaps --packing-fraction is meant",
-    "map --dt 1e-4": "there is no option --dt, perhaps --timestep is meant",
     "map --outptu map.nc": "there is no option --outptu, perhaps --output is meant",
     "map -x 3": "there is no option -x: see jaxgran map --help",
-    "map map.nc": "'map.nc' stands alone",
-    "map --restitution 0.1 0.5 0.9": "'0.5 0.9' stands alone, and values follow their options; a list has commas",
-    "map --grains 1e3": "--grains must be a whole number or a list like 256,1000,4000, not '1e3'",
-    "map --grains=many": "--grains must be a whole number or a list like 256,1000,4000, not 'many'",
-    "map --grains 64,": "--grains must be a whole number or a list like 256,1000,4000, not '64,'",
-    "map --grains 64,1000,256": "--grains must be sorted",
-    "map --grains 15,64": "--grains must be a whole number of at least 16, not 15",
-    "run --restitution 0.5 --packing-fraction 0.7 --grains=many": "--grains must be a whole number, not 'many'",
-    "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
-    "map --seeds": "'--seeds' requires an argument",
-    "map --preset fast": "--preset must be one of 'quick', 'paper', 'dense', not 'fast'",
+    "map --restitution 0.1 0.5 0.9": "'0.5 0.9' belongs to no option",
+    "map --seeds": "--seeds requires a value",
+    "map --quiet=3": "--quiet takes no value",
 }
 
 
@@ -246,6 +196,21 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(command: str, accep
     assert files(folder) == before
 
 
+@pytest.mark.parametrize("name", app.COMMANDS)
+def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder: Path) -> None:
+    """Whatever an option is for, what it cannot be is refused in its name."""
+    command = typer.main.get_command(app.app).commands[name]
+    for parameter in command.params:
+        option = parameter.opts[0]
+        if option.startswith("--") and parameter.name not in ("help", "scheduler"):
+            wrong = f"{option}=" if getattr(parameter, "is_flag", False) else f"{option}=no\nsuch"
+            needed = {"run": FLOW.split()[1:], "map": [], "info": []}.get(name, ["text.nc"])
+            outcome = jaxgran(folder, name, *needed, wrong)
+            assert outcome.status == 2 and "Traceback" not in outcome.err, outcome
+            of_files = ("output", "trajectory", "movie", "page", "from_map")  # read after what is required
+            assert option in outcome.err or parameter.name in of_files, outcome.err
+
+
 def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def denied(**_):
         raise PermissionError(13, "Permission denied")
@@ -261,6 +226,17 @@ def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> No
     assert_one_sentence(outcome)
     assert "timestep must be at most" in outcome.err
     assert not files(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_mistake_is_one_sentence_with_and_without_cached_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for _ in range(2):
+        assert_one_sentence(in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09"))
+        assert any((tmp_path / "cache" / "jaxgran").iterdir())
+    assert files(tmp_path) == {"cache"}
 
 
 # What the commands do
@@ -281,13 +257,13 @@ def test_map_writes_a_dataset_and_its_figures(small_map, small_data) -> None:
     np.testing.assert_array_equal(data.restitution, [0.5, 0.9])
     np.testing.assert_array_equal(data.packing_fraction, [0.5, 0.6])
     assert np.all(data.force_ratio >= 0.99)
-    assert np.all(data["seeds/equilibration_strain"] == 0.5)
+    assert np.all(data.equilibration_strain_by_seed == 0.5)
     assert data.attrs["command"] == f"jaxgran {SMALL_MAP}"
     assert data.attrs["replica_steps_per_second"] > 0
 
 
 @pytest.fixture(scope="module")
-def small_data(small_map) -> xr.DataTree:
+def small_data(small_map) -> xr.Dataset:
     return read_dataset(small_map[0] / "small.nc")
 
 
@@ -310,14 +286,13 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
 def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     small_data, no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, data = tmp_path / "other.nc", small_data.copy()
+    other, data = tmp_path / "other.nc", small_data[["force_ratio", "force_ratio_stderr", "pressure", "status"]]
     write_few_variables(monkeypatch, "pressure")
-    data.attrs["version_jax"] = "0.1.0"
-    write_dataset(data, other)
-    outcome = jaxgran(tmp_path, "map", "--like", "other.nc", "--workers", "1", "--output", "again.nc")
+    write_dataset(data.assign_attrs(version_jax="0.1.0"), other)
+    outcome = jaxgran(tmp_path, "map", "--from-map", "other.nc", "--workers", "1", "--output", "again.nc")
     again = read_dataset(tmp_path / "again.nc")
-    assert again.force_ratio.equals(data.force_ratio) and again.pressure.equals(data.pressure)
-    assert f"version jax 0.1.0 there, {again.attrs['version_jax']} here" in outcome.err.splitlines()[0]
+    assert again[list(data)].equals(data)
+    assert f"version jax 0.1.0 there, {data.attrs['version_jax']} here" in outcome.err.splitlines()[0]
     assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
 
 
@@ -338,6 +313,7 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     folder, _ = small_map
     for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, ratio_curves)
+    leave_out_layout(monkeypatch)
     words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
     assert jaxgran(folder, *words).status == 0
     assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
@@ -379,24 +355,26 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     groups = [line.strip() for line in outcome.out.splitlines()]
     places = [groups.index(name) for name in ("Forces", "Stresses", "Motion and structure", "Quality of the run")]
     assert places == sorted(places)
-    assert "frames cut the flow elsewhere" in outcome.err
+    assert "recording frames split the run" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
-    data = flattened(data).isel(restitution=0, packing_fraction=0)
-    averages, budget = outcome.out.split("Whole error")
+    data = data.isel(restitution=0, packing_fraction=0)
+    averages, budget = outcome.out.split("Relative error, 95 %")
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
         (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
-        assert with_error(*(float(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))) in row
+        assert with_error(float(data[name]), float(data[f"{name}_stderr"])) in row
     (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("shear-stress ratio  "))
     value, error = (float(data[name][0, 1]) for name in ("stress_ratio", "stress_ratio_stderr"))
     assert with_error(value, error) in row
     (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
-    sources = ("sampling", "timestep", "size", "tolerance", "total")
-    shown = [f"{100 * float(data.pressure_ci95.sel(error_source=one) / data.pressure):.2g}" for one in sources]
+    parts = [
+        1.96 * data.pressure_stderr,
+        *(data[f"pressure_error_{part}"] for part in ("timestep", "size", "tolerance")),
+    ]
+    shown = [f"{100 * float(part / data.pressure):.2g}" for part in (*parts, data.pressure_error)]
     assert [word for word in row.split()[1:] if word != "%"] == shown
     (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
-    correlated = data["diagnostics/correlation_strain"].sel(observable="pressure")
-    samples = data["seeds/strain"].sum().item() / correlated.item()
-    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data['theory/pressure']):.3g}"]
+    samples = data.strain_by_seed.sum().item() / data.pressure_correlation_strain.item()
+    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
 
 
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
@@ -406,8 +384,8 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     assert data.attrs["error"] == 0.1
     for name in ("force_ratio", "pressure", "shear_stress"):
         assert np.all(data[f"{name}_stderr"] <= sampling_error(0.1) * data[name])
-    assert data["seeds/strain"].item() >= LEAST_SAMPLE
-    assert "whole relative errors: 0.1 asked for" in outcome.err
+    assert data.strain_by_seed.item() >= LEAST_SAMPLE
+    assert "relative errors: 0.1 requested" in outcome.err
 
 
 def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
@@ -428,7 +406,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("command", "platform"),
-    [("info", "cuda"), ("map", "cuda")],
+    [("info", "cuda"), ("map", "cuda"), pytest.param("fit text.gsd", "banana", marks=pytest.mark.slow)],
 )
 def test_a_platform_that_is_not_there_is_one_sentence(command: str, platform: str, folder: Path, monkeypatch) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", platform)
@@ -505,8 +483,9 @@ def test_fit_that_fails_has_a_status_of_its_own(small_run, tmp_path: Path, monke
     assert outcome == (3, "", "jaxgran: the restitution did not settle.\n")
 
 
+@pytest.mark.slow
 def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--every", "0.02")
+    jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--frame-strain", "0.02")
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.err) == (0, "")
     rows = rows_of(outcome.out)
@@ -515,7 +494,7 @@ def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.out) == (3, "")
-    assert "did not settle" in outcome.err
+    assert outcome.err.startswith("jaxgran: the restitution did not settle: it was last 0.")
     assert one_sentence(outcome.err.rstrip("\n"))
 
 
@@ -524,11 +503,21 @@ def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("known") / "known.nc"
     data = made_up_map()
     flags = {"flag_values": [0], "flag_meanings": "ok"}
-    data = data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags))
-    write_dataset(xr.DataTree(data), path)
+    write_dataset(data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags)), path)
     return path
 
 
+@pytest.mark.slow
+def test_fit_tells_how_well_a_law_describes_a_map(known_map: Path, tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "fit", str(known_map))
+    assert (outcome.status, outcome.err) == (0, "")
+    for name in ("pressure", "shear stress", "force ratio"):
+        (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
+        assert row.count("%") == 3
+        assert 0 < float(row[len(name.split())]) < 20
+
+
+@pytest.mark.slow
 def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
     point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
     stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")
@@ -560,8 +549,8 @@ def test_fit_of_a_map_prints_how_well_a_law_describes_it(known_map: Path, known_
     ("determined", "chi_squared", "words"),
     [
         (True, 1.0, ""),
-        (False, 1.0, ", hardly determined: the stresses depend little on it there"),
-        (True, 10.0, ", the nearest in the map: none there has these stresses"),
+        (False, 1.0, ", poorly determined: the stresses depend little on it there"),
+        (True, 10.0, ", the nearest in the map: no restitution has these stresses"),
     ],
 )
 def test_fit_of_a_map_finds_a_restitution_from_stresses_and_says_how_well(
@@ -617,6 +606,7 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
         path.touch()
         return path
 
+    leave_out_layout(monkeypatch)
     write_few_variables(monkeypatch)
     monkeypatch.setattr(ratio_map_module, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
@@ -725,14 +715,20 @@ def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeyp
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     """Grains by point hold for the points of the file only, and either a strain or an error holds."""
     chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1, "seeds": 1}
-    assert map_module.kept_choices(chosen, {}) == chosen
-    assert map_module.kept_choices(chosen, {"restitution": (0.2, 0.5)}) == {
+    assert map_module.combined(chosen, {}) == chosen
+    assert map_module.combined(chosen, {"restitution": (0.2, 0.5)}) == {
         **{name: value for name, value in chosen.items() if name != "grains_by_point"},
+        "restitution": (0.2, 0.5),
         "grains": "auto",
     }
-    assert "grains_by_point" not in map_module.kept_choices(chosen, {"grains": 256})
-    assert map_module.kept_choices(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"}
-    assert map_module.kept_choices({"strain": 4.0, "seeds": 4, "grains": 400}, {"error": 0.1}) == {"grains": 400}
+    assert "grains_by_point" not in map_module.combined(chosen, {"grains": 256})
+    assert map_module.combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"}
+    assert map_module.combined({"strain": 4.0, "seeds": 4}, {"error": 0.1, "grains": 400}) == {
+        **dict.fromkeys(("timestep", "tolerance"), "auto"),
+        "error": 0.1,
+        "grains": 400,
+        "seeds": 1,
+    }
 
 
 def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -746,10 +742,21 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(ratio_map_module, "replicas", notes)
     flow = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--strain", "20", "--quiet")
-    words = ("--seeds", "2", "--seed", "7", "--tolerance", "1e-6", "--solver", "jacobi", "--activation", "touching")
+    words = (
+        "--seeds",
+        "2",
+        "--first-seed",
+        "7",
+        "--tolerance",
+        "1e-6",
+        "--solver",
+        "jacobi",
+        "--activation",
+        "touching",
+    )
     assert jaxgran(tmp_path, *flow, *words).status == 0
     (one,) = asked
-    assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
+    assert (one.seeds, one.first_seed, one.tolerance, one.solver, one.activation) == (2, 7, 1e-6, "jacobi", "touching")
     outcome = jaxgran(tmp_path, *flow, "--seeds", "2", "--movie", "flow.gif")
     assert_one_sentence(outcome)
     assert "leave out --seeds" in outcome.err
@@ -776,9 +783,9 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
     assert "Traceback" not in outcome.err and "restitution 0," not in outcome.err
     for k, status in points.items():
         alpha = 0.9 * k / (len(points) - 1)
-        named = f"{status.name.replace('_', ' ')}: (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
-        assert named == (status not in (Status.ok, Status.short_sample)), status
-    assert "short sample at (restitution" in outcome.err and "Add --strain" in outcome.err
+        named = f"{status.name.replace('_', ' ')} at (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
+        assert named == (status != Status.ok), status
+    assert "short sample at (restitution" in outcome.err and "set --strain" in outcome.err
     rows = [line for line in outcome.out.splitlines() if line.strip().startswith("0.6")]
     assert [row.count("*") for row in rows] == [len(points) - 1] * 2  # force ratio and shear-stress ratio
 
@@ -786,7 +793,7 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
 def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> None:
     """A map has made-up replicas, of which the last has a bad status, and its figures are not drawn."""
     write_without_drawing(monkeypatch)
-    write_few_variables(monkeypatch, "large_system/pressure")
+    write_few_variables(monkeypatch, "pressure_large_system", "pressure_large_system_error")
     statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
     monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(statuses))
 
@@ -797,7 +804,7 @@ def test_several_time_steps_have_a_table_each_a_figure_and_bad_points_that_name_
     last_point_overlaps_deeply(monkeypatch, points=4)
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--timestep", "1e-3,1e-4")
     assert outcome.status == 3
-    assert "deep overlap: (restitution 0.9, packing fraction 0.6, time step 0.0001)." in outcome.err
+    assert "deep overlap at (restitution 0.9, packing fraction 0.6, time step 0.0001)." in outcome.err
     assert "4/4 points" in outcome.err
     assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", "_curves.png", "_timestep.png", "_clusters.png")}
     assert "wrote jaxgran_map_timestep.png" in outcome.err
@@ -821,7 +828,7 @@ def test_several_numbers_of_grains_have_a_table_each_estimates_and_a_figure(
     words = [*POINTS, "--seeds", "1", "--grains", "64,128", "--timestep", "1e-3,1e-4"]
     outcome = jaxgran(tmp_path, "map", *words)
     assert outcome.status == 3
-    assert "deep overlap: (restitution 0.9, packing fraction 0.6, 128 grains, time step 0.0001)." in outcome.err
+    assert "deep overlap at (restitution 0.9, packing fraction 0.6, 128 grains, time step 0.0001)." in outcome.err
     pictures = ("_curves.png", "_timestep.png", "_size.png", "_clusters.png")
     assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", *pictures)}
     data = read_dataset(tmp_path / "jaxgran_map.nc")
@@ -831,8 +838,8 @@ def test_several_numbers_of_grains_have_a_table_each_estimates_and_a_figure(
     titles = [f"Force ratio at {n} grains, dt = {dt:g} / shear rate" for n in (64, 128) for dt in (1e-3, 1e-4)]
     titles += [f"Large systems at dt = {dt:g} / shear rate" for dt in (1e-3, 1e-4)]
     assert [out.index(title) for title in titles] == sorted(out.index(title) for title in titles)
-    errors = data["large_system/pressure_ci95"].values.flat
-    for value, error in zip(data["large_system/pressure"].values.flat, errors, strict=True):
+    errors = data.pressure_large_system_error.values.flat
+    for value, error in zip(data.pressure_large_system.values.flat, errors, strict=True):
         assert with_error(value, error) in out
     assert (choices_of(data)["grains"], choices_of(data)["timestep"]) == ((64, 128), (1e-3, 1e-4))
 
@@ -860,7 +867,7 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     np.testing.assert_array_equal(data.status, [[NOT_RUN, Status.ok]])
     assert np.isnan(data.force_ratio[0, 0]) and np.isfinite(data.force_ratio[0, 1])
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
-    assert "1 points missing; what is done is saved" in outcome.err
+    assert "1 points missing; finished points are saved" in outcome.err
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 

@@ -83,7 +83,7 @@ def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab:
     done = lab.finish(lab.start("full.nc", fault="disc full"))
     assert done.returncode == 1
     *_, last = done.stderr.strip().splitlines()
-    assert last.startswith("jaxgran: stopped by the file system, File too large; what is done is in ")
+    assert last.startswith("jaxgran: stopped by the file system, File too large; finished batches are in ")
     assert last.endswith("add --resume.")
     lab.assert_whole_when_continued("full.nc")
 
@@ -106,7 +106,7 @@ def test_a_batch_that_kills_its_workers_is_given_up_and_the_rest_is_done(lab: La
     done = lab.finish(lab.start("deadly.nc", fault="deadly batch", workers=2))
     assert done.returncode == 3
     assert "killed its worker 3 times: (restitution 0.3, packing fraction 0.6) not measured." in done.stderr
-    assert "failed: (restitution 0.3, packing fraction 0.6)." in done.stderr
+    assert "failed at (restitution 0.3, packing fraction 0.6)." in done.stderr
     data = read_dataset(lab.folder / "deadly.nc")
     for name in ("force_ratio", "pressure", "status"):
         assert data[name].values[0, 1] == lab.whole[name].values[0, 1]

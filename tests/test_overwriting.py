@@ -57,8 +57,8 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     before = files(tmp_path)
     outcome = jaxgran(tmp_path, *MAP, "--strain", "9", "--grains", "64")
     assert_one_sentence(outcome)
-    assert "--output must be another file, or --overwrite be given" in outcome.err
-    assert "'jaxgran_map.nc' has a map with grains 256 and not 64." in outcome.err
+    assert "--output 'jaxgran_map.nc' already exists and has a map with grains 256" in outcome.err
+    assert "'jaxgran_map.nc' already exists and has a map with grains 256 and not 64" in outcome.err
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert read_dataset(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
@@ -81,7 +81,7 @@ def test_a_finished_map_is_taken_from_its_file_by_resume(finished: bytes, tmp_pa
     (tmp_path / "jaxgran_map_curves.png").unlink()
     outcome = jaxgran(tmp_path, *MAP, "--resume")
     assert outcome.status == 0
-    assert "jaxgran_map.nc is finished: it is shown and drawn from the file." in outcome.err
+    assert "jaxgran_map.nc is finished and is read from its file." in outcome.err
     assert "wrote jaxgran_map_curves.png" in outcome.err and "wrote jaxgran_map.nc" not in outcome.err
     assert "Force ratio" in outcome.out
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
@@ -94,7 +94,7 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp
     for words in ([], ["--grains", "64", "--overwrite"]):
         outcome = jaxgran(tmp_path, *MAP, *words)
         assert outcome.status == 130
-        assert "1 points missing; what is done is saved" in outcome.err and "wrote" not in outcome.err
+        assert "1 points missing; finished points are saved" in outcome.err and "wrote" not in outcome.err
         assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
         unfinished = tmp_path / "jaxgran_map.nc.unfinished"
         assert list(unfinished.glob("done-*.nc"))
@@ -144,7 +144,7 @@ def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_
         page.write_bytes(content)
         outcome = jaxgran(tmp_path, "explore", "other.nc", "--output", page.name)
         assert_one_sentence(outcome)
-        assert "--output must be another file, or --overwrite be given: 'jaxgran_map.html'" in outcome.err
+        assert "--output 'jaxgran_map.html' already exists and belongs to another map; pass --overwrite" in outcome.err
         assert page.read_bytes() == content
     assert jaxgran(tmp_path, "explore", "other.nc", "--output", page.name, "--overwrite").status == 0
     assert page.read_bytes() not in (first, b"")
@@ -159,7 +159,7 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     file.write_bytes(b"frames")
     outcome = jaxgran(tmp_path, *RUN, f"--{option}", file.name)
     assert_one_sentence(outcome)
-    assert f"--{option} must be a new file, or --overwrite be given" in outcome.err
+    assert f"--{option} {file.name!r} already exists; pass --overwrite" in outcome.err
     assert files(tmp_path) == {file.name}
 
 

@@ -184,7 +184,7 @@ def test_page_forbids_itself_every_request() -> None:
 def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> None:
     data = page_map()
     again = map_data(data)["again"]
-    assert again["options"] == "--activation midpoint --solver barzilai-borwein --tolerance 0.0001"
+    assert again["options"] == "--solver barzilai-borwein --activation midpoint --tolerance 0.0001"
     assert_same_numbers(again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values)
     assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
 

@@ -1,6 +1,7 @@
 """Every replica runs once, and its numbers depend on nothing but its seed and its place in the grid."""
 
-from dataclasses import replace
+import inspect
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,11 +14,17 @@ from hypothesis import strategies as st
 from synthetic import random_replica
 
 from jaxgran.maps import ratio_map as ratio_map_module
+from jaxgran.maps import replicas as replicas_module
+from jaxgran.maps.batches import batches, predicted_cost
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.ratio_map import predicted_cost, ratio_map, replicas
+from jaxgran.maps.interruption import Interrupted
+from jaxgran.maps.parameters import RunParameters
+from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import choices_of
+from jaxgran.maps.replicas import replicas
+from jaxgran.maps.results import choices_of, read_dataset
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
@@ -76,8 +83,8 @@ def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_nu
     points, seeds: int, batch, workers: int
 ) -> None:
     flows = [ShearFlow(*point) for point in points]
-    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, engine=None)
-    tasks = ratio_map_module._tasks(settings, batch, workers)
+    settings: Any = SimpleNamespace(flows=lambda: flows, seeds=seeds, engine="auto")
+    tasks = batches(settings, batch, workers)
     keys = [key for task in tasks for key in task]
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
     assert all(len({flows[point].grains for point, _ in task}) == 1 for task in tasks)
@@ -108,8 +115,8 @@ def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> 
 
 def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
     mixed = [
-        *ratio_map_module._run_task(settings, [(1, 1), (0, 0)]),
-        *ratio_map_module._run_task(settings, [(1, 0), (0, 1)]),
+        *replicas_module._run_task(settings, [(1, 1), (0, 0)]),
+        *replicas_module._run_task(settings, [(1, 0), (0, 1)]),
     ]
     assert_same_bits(dict(mixed), results)
 
@@ -123,7 +130,9 @@ def test_every_step_of_every_replica_is_reported(results, reported) -> None:
     assert_every_step_is_reported(reported)
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
+    """A map with a worker is in the tests of faults too."""
     told: list[float] = []
     assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
     assert_every_step_is_reported(told)
@@ -142,26 +151,26 @@ def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_st
         statuses = {(0, 1): Status.capacity if refinement == 1 else second}
         return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
 
-    monkeypatch.setattr(ratio_map_module, "_measured", measured)
-    done = dict(ratio_map_module._run_task(settings, task))
+    monkeypatch.setattr(replicas_module, "_measured", measured)
+    done = dict(replicas_module._run_task(settings, task))
     assert calls == [(task, 1), ([(0, 1)], 2)]
     assert list(done) == task
     assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0]
 
 
 def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
-    (key, refined), *_ = ratio_map_module._measured(settings, [(0, 0)], ratio_map_module.advance_batch, refinement=2)
+    (key, refined), *_ = replicas_module._measured(settings, [(0, 0)], replicas_module.advance_batch, refinement=2)
     assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
     assert refined.sample.pressure != results[key].sample.pressure
     data = map_dataset(settings, {**results, key: refined}, {})
-    np.testing.assert_allclose(data["seeds/sample_timestep"].values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
+    np.testing.assert_allclose(data.timestep_by_seed.values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
 
 
 def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest, sizes = ratio_map_module._measured, 1, []
+    measured, largest, sizes = replicas_module._measured, 1, []
 
     def bounded(settings, task, drive, refinement: int = 1):
         sizes.append(len(task))
@@ -169,24 +178,24 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
         return measured(settings, task, drive, refinement)
 
-    monkeypatch.setattr(ratio_map_module, "_measured", bounded)
+    monkeypatch.setattr(replicas_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    halved = ratio_map_module._run_task(settings, tasks, tmp_path / "journal.nc")
+    halved = replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
     assert sizes == [4, 2, 1, 1, 2, 1, 1]
     assert [key for key, _ in halved] == tasks
     assert_same_bits(dict(halved), results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        ratio_map_module._run_task(settings, tasks)
+        replicas_module._run_task(settings, tasks)
 
 
 def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken_device(*_):
         raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
 
-    monkeypatch.setattr(ratio_map_module, "prepare_batch", broken_device)
+    monkeypatch.setattr(replicas_module, "prepare_batch", broken_device)
     with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
-        ratio_map_module._run_task(settings, [(0, 0), (0, 1)])
+        replicas_module._run_task(settings, [(0, 0), (0, 1)])
 
 
 def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
@@ -200,30 +209,48 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.Monkey
         yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
 
     monkeypatch.setattr(ratio_map_module, "replicas", found)
-    words = r"^points of the map have a bad status. deep overlap: \(restitution 0.5, packing fraction 0.6\). What"
-    with pytest.warns(match=words):
+    sentence = r"^1 of 2 points failed: deep overlap at \(restitution 0.5, packing fraction 0.6\)"
+    with pytest.warns(BadPoints, match=sentence):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
     assert "2/2 points" in capsys.readouterr().err
 
 
-def test_a_map_that_is_cut_off_in_python_is_continued(settings, results, tmp_path) -> None:
-    folder, calls = tmp_path / "map.nc.unfinished", []
+def test_a_map_that_is_cut_off_is_continued_and_written_once(settings, results, tmp_path, monkeypatch) -> None:
+    folder, output = tmp_path / "map.nc.unfinished", tmp_path / "map.nc"
+    monkeypatch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
 
     def cut_off(_: float) -> None:
-        calls.append(len(list(folder.glob("done-*"))))
-        if calls[-1]:
+        if list(folder.glob("done-*")):
             raise RuntimeError("cut off")
 
     with pytest.raises(RuntimeError, match="cut off"):
-        ratio_map(**SETTINGS, batch=2, report=cut_off, checkpoint=tmp_path / "map.nc")
-    with pytest.raises(InputError, match=r"has solver .*0\.0001.* and not .*0\.001"):
-        ratio_map(**SETTINGS, batch=2, tolerance=1e-3, checkpoint=str(tmp_path / "map.nc"))
-    data = ratio_map(**SETTINGS, batch=2, checkpoint=tmp_path / "map.nc")
+        ratio_map(**SETTINGS, progress=cut_off, output=output)
+    with pytest.raises(InputError, match="has an unfinished map: pass `resume=True`"):
+        ratio_map(**SETTINGS, output=output)
+    with pytest.raises(InputError, match=r"has tolerance 0\.0001, not 0\.001"):
+        ratio_map(**SETTINGS, tolerance=1e-3, output=str(output), resume=True)
+    data = ratio_map(**SETTINGS, output=output, resume=True)
     assert data.attrs["resumed_replicas"] == 2 and not folder.exists()
     expected = map_dataset(settings, results, {})
-    np.testing.assert_array_equal(data["seeds/force_ratio"], expected["seeds/force_ratio"])
-    with pytest.raises(InputError, match=r"^checkpoint must be a file name, not 3\.$"):
-        ratio_map(**SETTINGS, checkpoint=3)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
+    monkeypatch.setattr(ratio_map_module, "replicas", None)  # nothing is run
+    again = ratio_map(**SETTINGS, output=output, resume=True)
+    np.testing.assert_array_equal(again.force_ratio_by_seed, expected.force_ratio_by_seed)
+    with pytest.raises(InputError, match="already exists and has a map with tolerance"):
+        ratio_map(**SETTINGS, tolerance=1e-3, output=output)
+
+
+def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def some(settings, *_):
+        yield (1, 0), random_replica(np.random.default_rng(0), settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ratio_map_module, "replicas", some)
+    with pytest.raises(Interrupted) as caught:
+        ratio_map(**SETTINGS, output=tmp_path / "map.nc", attributes={"project": "mine"})
+    assert np.isfinite(caught.value.data.force_ratio[0, 1]) and np.isnan(caught.value.data.force_ratio[0, 0])
+    assert caught.value.data.attrs["project"] == "mine"
+    np.testing.assert_array_equal(read_dataset(tmp_path / "map.nc").status, caught.value.data.status)
 
 
 def test_replicas_of_a_point_differ(results) -> None:
@@ -232,23 +259,24 @@ def test_replicas_of_a_point_differ(results) -> None:
 
 
 def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
-    data = ratio_map(**SETTINGS, batch=2)
+    data = ratio_map(**SETTINGS)
     expected = map_dataset(settings, results, {})
-    np.testing.assert_array_equal(data["seeds/force_ratio"], expected["seeds/force_ratio"])
+    np.testing.assert_array_equal(data.force_ratio_by_seed, expected.force_ratio_by_seed)
     np.testing.assert_array_equal(data.pressure_stderr, expected.pressure_stderr)
-    assert set(data.attrs) - set(expected.attrs) == {"automatic_choice", *MEASURED}
+    assert set(data.attrs) - set(expected.attrs) == {"automatic_choice", "resumed_replicas", *MEASURED}
     assert data.attrs["wall_time_seconds"] > 0
     steps = 4 * round((SETTINGS["strain"] + SETTINGS["equilibrate"]) / 1e-3)
     assert data.attrs["wall_time_seconds"] * data.attrs["replica_steps_per_second"] == pytest.approx(steps)
 
 
+@pytest.mark.slow
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
     both = dict(replicas(some, batch=8))
     assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
     xr.testing.assert_equal(data.isel(timestep=0, drop=True), alone)
-    assert not np.any(data["seeds/force_ratio"][0] == data["seeds/force_ratio"][1])
+    assert not np.any(data.force_ratio_by_seed[0] == data.force_ratio_by_seed[1])
 
 
 def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
@@ -259,20 +287,20 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
     assert data.grains.values.tolist() == data.attrs["grains"] == [32, 64] and data.grains.dtype.kind == "i"
     assert {"long_name", "units"} <= set(data.grains.attrs)
     alone = map_dataset(replace(settings, seeds=1), {key: x for key, x in results.items() if key[1] == 0}, {})
-    first = data.isel(grains=0).to_dataset()
-    xr.testing.assert_equal(first, alone.to_dataset())
+    variables = [name for name in alone.data_vars if name in data]
+    xr.testing.assert_equal(data[variables].isel(grains=0), alone[variables])
     assert not np.any(data.pressure[0] == data.pressure[1])
-    np.testing.assert_array_equal(data["large_system/pressure"], data.pressure[1])
-    assert np.all(data["large_system/pressure_ci95"] > data.pressure_stderr[1])
+    np.testing.assert_array_equal(data.pressure_large_system, data.pressure[1])
+    assert np.all(data.pressure_large_system_error > data.pressure_stderr[1])
     assert set(choices_of(data)["grains"]) == {32, 64} and choices_of(data.sel(grains=64))["grains"] == 64
 
 
 @pytest.mark.parametrize("grains", [[64, 128], (64, 128), np.array([64, 128])], ids=["list", "tuple", "array"])
 def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: iter(()))
+    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: (_ for _ in ()))
     data = ratio_map(**{**SETTINGS, "grains": grains, "timestep": [1e-3, 5e-4]})
     assert data.force_ratio.dims == ("grains", "timestep", "packing_fraction", "restitution")
-    assert data["large_system/pressure"].dims == ("timestep", "packing_fraction", "restitution")
+    assert data.pressure_large_system.dims == ("timestep", "packing_fraction", "restitution")
     assert data.attrs["grains"] == data.grains.values.tolist() == [64, 128]
     assert ratio_map(**SETTINGS).grains.dims == ()
 
@@ -281,7 +309,7 @@ def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pyte
     "timestep", [[1e-3, 5e-4], (1e-3, 5e-4), np.array([1e-3, 5e-4])], ids=["list", "tuple", "array"]
 )
 def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: iter(()))
+    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: (_ for _ in ()))
     data = ratio_map(**{**SETTINGS, "timestep": timestep, "strain": 4.0})
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
     assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-3, 5e-4]
@@ -290,15 +318,28 @@ def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.Mo
         assert data.timestep.dims == () and data.timestep == data.attrs["timestep"] == 1e-3
 
 
-@pytest.mark.parametrize("mistake", [{"batch": 0}, {"batch": 1.5}, {"batch": "all"}, {"workers": 0}, {"workers": 2.0}])
-def test_batches_and_workers_that_cannot_be_are_one_sentence(mistake: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(mistake))} must be"):
+WRONG = [{"workers": 0}, {"workers": 2.0}, {"output": 3}, {"output": "map.txt"}, {"resume": True}, {"progress": 3}]
+WRONG += [{"scheduler": 3}, {"attributes": 3}, {"overwrite": 1}, {"record": 3}]
+
+
+@pytest.mark.parametrize("mistake", WRONG, ids=str)
+def test_how_a_map_is_run_is_checked(mistake: dict[str, Any]) -> None:
+    with pytest.raises(InputError) as caught:
         ratio_map(**SETTINGS, **mistake)
+    assert caught.value.field == next(iter(mistake)) and caught.value.field in str(caught.value)
+
+
+def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:
+    assert list(inspect.signature(ratio_map).parameters) == [row.name for row in fields(RunParameters)]
+    for row in fields(RunParameters):
+        assert f"{row.name}: {row.metadata['option'].help}" in str(ratio_map.__doc__)
+    with pytest.raises(TypeError, match="restitutions"):
+        ratio_map(restitutions=[0.5], packing_fraction=[0.6])  # type: ignore[call-arg]
 
 
 def test_small_flows_have_nearly_the_stresses_of_event_driven_discs() -> None:
     # N = 1000 discs at ν = 0.6, α = 0.7 and 0.9. So few grains have stresses that are 3 to 6 % smaller.
-    data = ratio_map([0.7, 0.9], [0.6], grains=64, seeds=2, timestep=1e-3, strain=40.0, batch=2)
+    data = ratio_map([0.7, 0.9], [0.6], grains=64, seeds=2, timestep=1e-3, strain=40.0)
     assert np.all(data.status.values == Status.ok)
     for name, expected in (("pressure", [2.530, 9.814]), ("shear_stress", [1.083, 2.715])):
         measured, error = data[name].values[0], data[f"{name}_stderr"].values[0]

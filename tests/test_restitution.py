@@ -118,7 +118,7 @@ def test_contacts_that_outlast_a_frame_are_refused(known: bool) -> None:
     """They would be taken for collisions of a small restitution."""
     seen = tracks()
     lasting = lasting_contacts(seen, 4)
-    with pytest.raises(InputError, match=r"contacts that are shorter .* or --every [3-9]"):
+    with pytest.raises(InputError, match=r"contacts that are shorter .* or --stride [3-9]"):
         fit_restitution(lasting if known else without_velocities(lasting))
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
-from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.dynamics.engine import Numba, Pallas
-from jaxgran.maps.settings import MapSettings, automatic
+from jaxgran.maps.parameters import MapParameters
+from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_GRAINS
 from jaxgran.sampling.budget import size_error
@@ -53,7 +52,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"timestep": -1e-3}, "a positive number"),
     ({"timestep": float("nan")}, "a positive number"),
     ({"timestep": 0.2}, "at most 0.1"),
-    ({"timestep": 5e-3}, "at most .* at restitution 0.9 and packing fraction 0.6, or grains would overlap"),
+    ({"timestep": 5e-3}, "at most .* at restitution 0.9 and packing fraction 0.6"),
     ({"timestep": ()}, "at least one number"),
     ({"timestep": (1e-4, 1e-3, 1e-5)}, "sorted"),
     ({"timestep": (1e-3, 1e-3)}, "without repetition"),
@@ -69,12 +68,14 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"error": 1.0}, "between 1e-3 and 0.5"),
     ({"error": float("nan")}, "between 1e-3 and 0.5"),
     ({"equilibrate": -1.0}, "at least 0"),
-    ({"solver": "gauss"}, "a ProjectedMethod, such as"),
+    ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
+    ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
+    ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
     ({"activation": "always"}, "midpoint or touching"),
     ({"snapshots": 1}, "True or False"),
-    ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\), jg.Pallas\(\) or None"),
-    ({"engine": Pallas()}, "on a CPU, not pallas: it is made for NVIDIA GPUs"),
-    ({"engine": Numba(), "solver": Jacobi()}, "with the solver jacobi, not numba"),
+    ({"engine": "fortran"}, "auto, numba, jax or pallas"),
+    ({"engine": "pallas"}, "auto or jax on a CPU, not pallas: it is made for NVIDIA GPUs"),
+    ({"engine": "numba", "solver": "jacobi"}, "auto or jax with the solver jacobi, not numba"),
 ]
 
 
@@ -85,6 +86,7 @@ def test_a_mistake_is_one_sentence_with_the_accepted_range(mistake: dict[str, An
     assert isinstance(caught.value, InputError)
     assert one_sentence(str(caught.value))
     assert next(iter(mistake)) in str(caught.value)
+    assert caught.value.field in ("", next(iter(mistake)))
 
 
 def test_lists_may_fall_as_well_as_rise() -> None:
@@ -93,11 +95,11 @@ def test_lists_may_fall_as_well_as_rise() -> None:
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
     settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6)})
-    settings = replace(settings, activation="touching")
+    settings = replace(settings, activation="touching", engine="jax")
     points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
-        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
+        assert (flow.grains, flow.timestep, flow.activation, flow.engine) == (64, 1e-3, "touching", "jax")
 
 
 def test_numbers_of_numpy_are_accepted() -> None:
@@ -122,46 +124,42 @@ def test_number_of_grains_is_an_axis_where_it_is_a_list_and_then_the_slowest() -
     assert some.flows()[:2] == one.flows()
 
 
+def chosen(**parameters: Any) -> tuple[MapSettings, str]:
+    return chosen_settings(MapParameters(**parameters))
+
+
 def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
-    choices = {**GOOD, "timestep": "auto"}
-    several = {**choices, "grains": (64, 1024)}
-    assert automatic(several, 0.02) == (
-        {**automatic(choices, 0.02)[0], "grains": (64, 1024)},
-        automatic(choices, 0.02)[1],
-    )
+    one, several = (chosen(**{**GOOD, "timestep": "auto", "grains": grains}) for grains in (64, (64, 1024)))
+    assert several == (replace(one[0], grains=(64, 1024)), one[1])
 
 
-def test_automatic_choices_are_accepted_and_finer_for_a_smaller_error() -> None:
-    choices = {**GOOD, "restitution": (0.1, 0.9), "timestep": "auto", "tolerance": "auto"}
-    found = []
-    for target_error in (0.05, 0.02, 0.005):
-        numbers, words = automatic(choices, target_error)
-        settings = MapSettings(**numbers)
-        assert "restitution 0.9 and packing fraction 0.6" in words and f"error of {target_error:g}" in words
-        found.append((settings.timestep, settings.solver.tolerance))
-    timesteps, tolerances = zip(*found, strict=True)
+def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
+    given = {**GOOD, "restitution": (0.1, 0.9), "strain": None, "timestep": "auto", "tolerance": "auto"}
+    found = [chosen(**given, error=error) for error in (0.1, 0.01, 0.001)]
+    timesteps, tolerances = zip(*((settings.timestep, settings.tolerance) for settings, _ in found), strict=True)
     assert list(timesteps) == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
     assert list(tolerances) == sorted(set(tolerances), reverse=True)
+    assert all("restitution 0.9 and packing fraction 0.6" in sentence for _, sentence in found)
 
 
 def test_given_numbers_stay_as_they_are() -> None:
-    assert automatic(GOOD, 0.02) == (GOOD, "")
-    numbers, words = automatic({**GOOD, "tolerance": "auto"}, 0.02)
-    assert numbers["timestep"] == GOOD["timestep"] and "timestep" not in words
+    assert chosen(**GOOD) == (MapSettings(**GOOD), "")
+    settings, sentence = chosen(**{**GOOD, "tolerance": "auto"})
+    assert settings.timestep == GOOD["timestep"] and "timestep" not in sentence
 
 
-def test_a_given_tolerance_is_that_of_the_solver() -> None:
-    numbers, _ = automatic({**GOOD, "solver": Jacobi(relaxation=1.5), "tolerance": 1e-3}, 0.02)
-    assert MapSettings(**numbers).solver == Jacobi(tolerance=1e-3, relaxation=1.5)
-    for value in (0.0, 1.0, "small"):
-        with pytest.raises(InputError, match="tolerance must be between"):
-            automatic({**GOOD, "tolerance": value}, 0.02)
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_any_list_of_numbers_is_a_tuple_in_the_settings(kind: Any) -> None:
+    settings, _ = chosen(**{**GOOD, "restitution": kind([0.5, 0.9]), "grains": kind([64, 128])})
+    assert settings.restitution == (0.5, 0.9) and settings.grains == (64, 128)
 
 
-@pytest.mark.parametrize("target_error", [0.0, 1.0, float("nan"), "small"])
-def test_target_error_out_of_range_is_one_sentence(target_error) -> None:
-    with pytest.raises(InputError, match="target_error must be between 1e-4 and"):
-        automatic(GOOD, target_error)
+def test_numbers_of_grains_may_be_given_by_point() -> None:
+    settings, _ = chosen(**{**GOOD, "grains_by_point": [64, 128]})
+    assert [flow.grains for flow in settings.flows()] == [64, 128] and settings.grains == 128
+    for wrong in ([64], 64, [64, 8], [64, 128.5]):
+        with pytest.raises(InputError, match="grains"):
+            chosen(**{**GOOD, "grains_by_point": wrong})
 
 
 def test_time_steps_may_fall_as_well_as_rise() -> None:
@@ -170,24 +168,23 @@ def test_time_steps_may_fall_as_well_as_rise() -> None:
 
 
 def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
-    given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2}
-    numbers, said = automatic({**given, **dict.fromkeys(("grains", "timestep", "tolerance"), "auto")}, 0.02)
-    settings = MapSettings(**numbers)
+    given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2, "seeds": 1}
+    settings, sentence = chosen(**given, grains="auto", timestep="auto", tolerance="auto")
     for flow in settings.flows():
         assert size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains) <= 0.6 * 0.2
-    assert len({flow.grains for flow in settings.flows()}) > 1 and settings.seeds == 1
-    assert f"{settings.grains} grains, 1 seed" in said and "for an error of 0.2" in said
+    assert len({flow.grains for flow in settings.flows()}) > 1
+    assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.2" in sentence
 
 
-def test_automatic_grains_need_an_error() -> None:
-    with pytest.raises(InputError, match="grains may be auto only with a given error"):
-        automatic({"restitution": (0.5,), "packing_fraction": (0.6,), "grains": "auto"}, 0.02)
+def test_automatic_grains_require_an_error() -> None:
+    with pytest.raises(InputError, match="`grains='auto'` requires `error`"):
+        chosen(restitution=(0.5,), packing_fraction=(0.6,), grains="auto")
 
 
-def test_an_error_that_needs_too_many_grains_is_one_sentence_with_the_smallest_one() -> None:
-    given = {"restitution": (0.2,), "packing_fraction": (0.6,), "error": 1e-3, "grains": "auto"}
+def test_an_error_that_needs_too_many_grains_names_the_smallest_one() -> None:
+    given = {"restitution": (0.2,), "packing_fraction": (0.6,), "grains": "auto"}
     with pytest.raises(InputError, match="error must be at least") as caught:
-        automatic(given, 0.02)
+        chosen(**given, error=1e-3)
     assert one_sentence(str(caught.value))
     least = float(str(caught.value).split("at least ")[1].split()[0])
-    assert automatic({**given, "error": least}, 0.02)[0]["grains"] <= MAX_GRAINS
+    assert chosen(**given, error=least)[0].grains <= MAX_GRAINS

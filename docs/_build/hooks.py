@@ -3,11 +3,12 @@
 Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site, and the file of tracked discs
 from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
 ``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
-the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{BENCHMARKS}`` for the table of
+the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPTIONS COMMAND}`` for its options, and ``{BENCHMARKS}`` for the table of
 ``benchmarks/registry.py``.
 """
 
 import ast
+import importlib
 import re
 import runpy
 from pathlib import Path
@@ -19,6 +20,9 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
+from jaxgran.cli.arguments import placeholder
+from jaxgran.cli.mistakes import option_name, with_options
+from jaxgran.maps.parameters import options as parameters
 from jaxgran.maps.results import read_dataset
 from jaxgran.page.explore import explore
 
@@ -49,6 +53,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put in the tables of what is measured and of the benchmarks."""
     charts = "../" * page.file.src_uri.count("/") + "charts/"
+    markdown = re.sub(r"\{OPTIONS (\w+)\}", lambda mark: options(mark[1]), markdown)
     for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
@@ -71,6 +76,18 @@ def observables() -> str:
     for name, about in zip(constants["OBSERVABLES"].keys, constants["OBSERVABLES"].values, strict=True):
         meaning, unit = (stress_unit if isinstance(x, ast.Name) else ast.literal_eval(x) for x in about.elts)
         rows.append(f"| `{ast.literal_eval(name)}` | {'–' if unit == '1' else unit} | {meaning} |")
+    return "\n".join(rows)
+
+
+def options(command: str) -> str:
+    """A table of the options of a command."""
+    rows = ["| option | meaning | default |", "| --- | --- | --- |"]
+    for name, one in getattr(importlib.import_module(f"jaxgran.cli.{command}"), f"{command.upper()}_OPTIONS").items():
+        names = [f"-{one.short}", option_name(name)] if one.short else [option_name(name)]
+        value = "" if one.kind is bool else f" {placeholder(one)}"
+        meaning = with_options(one.help, parameters(command)) + (f" In {one.unit}." if one.unit else "")
+        cells = (f"`{', '.join(names)}{value}`", meaning, one.default or "–")
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(rows)
 
 

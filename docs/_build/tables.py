@@ -9,6 +9,8 @@ from typing import Any
 
 import griffe
 
+from jaxgran.maps.parameters import table as parameters
+
 _BORDER = re.compile(r"^ *=+( +=+)+ *$")
 _ROLE = re.compile(r":(?:func|class|mod|meth|data):`~?([^`]+)`")
 
@@ -18,7 +20,7 @@ class Tables(griffe.Extension):
 
     def on_instance(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         if obj.docstring is not None:
-            obj.docstring.value = in_markdown(obj.docstring.value)
+            obj.docstring.value = in_markdown(obj.docstring.value.replace("{PARAMETERS}", parameters()))
 
 
 def in_markdown(docstring: str) -> str:

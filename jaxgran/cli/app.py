@@ -1,6 +1,7 @@
 """Command line: ``jaxgran map``, ``plot``, ``explore``, ``run``, ``fit``, ``info``. Exit statuses: ``terminal``."""
 
 import gc
+import inspect
 import os
 import sys
 from typing import Annotated, NoReturn
@@ -16,21 +17,21 @@ from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
 from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
-from jaxgran.cli.mistakes import UsageError, by_option, in_words
+from jaxgran.cli.mistakes import Command, Group, UsageError, sentence_of, usage_sentence, with_options
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
 from jaxgran.cli.tables import use_plain_letters
 from jaxgran.cli.terminal import (
     INTERRUPTED,
     NO_FILE,
-    is_interruption,
     sigterm_interrupts,
     stop,
     stop_interrupted,
 )
+from jaxgran.maps.interruption import is_interruption
 from jaxgran.model.checks import InputError
 
 EXAMPLES = {
-    "Where binary collisions are all there is, and where they are not": "jaxgran map",
+    "Where binary collisions dominate, and where they do not": "jaxgran map",
     "One flow, with a movie of it": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
     "The options of a command": "jaxgran run --help",
 }
@@ -69,6 +70,7 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
 }
 
 app = typer.Typer(
+    cls=Group,
     help="Flows of rigid, frictionless discs in simple shear by contact dynamics.",
     epilog=examples(EXAMPLES),
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -76,7 +78,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 for name, (command, short_help, long_help, command_examples) in COMMANDS.items():
-    app.command(name, help=long_help, short_help=short_help, epilog=examples(command_examples))(command)
+    app.command(name, cls=Command, help=long_help, short_help=short_help, epilog=examples(command_examples))(command)
 
 
 def _print_version(wanted: bool) -> None:
@@ -97,7 +99,7 @@ def command_line(
 def main() -> None:
     """Entry point: a mistake in the input ends with one sentence and exit status 2."""
     use_plain_letters()
-    gc.set_threshold(50_000, 20, 100)  # what is loaded is no garbage, and a command is short
+    gc.set_threshold(50_000, 20, 100)  # raise the garbage collector's thresholds: the process is short-lived
     with sigterm_interrupts():
         _run()
 
@@ -107,13 +109,14 @@ def _run() -> NoReturn:
     try:
         status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
     except InputError as mistake:
-        stop(by_option(str(mistake), _options()))
+        stop(sentence_of(mistake, _parameters()))
     except UsageError as mistake:
-        stop(in_words(mistake, sys.argv[1:]))
+        stop(usage_sentence(mistake))
     except typer.Abort:
         status = INTERRUPTED
     except OSError as error:
-        stop(f"stopped by the file system, {error.strerror or error}.", NO_FILE)
+        notes = "".join(f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", []))
+        stop(f"stopped by the file system, {error.strerror or error}{notes}.", NO_FILE)
     except Exception as error:
         if not is_interruption(error):
             raise
@@ -123,7 +126,7 @@ def _run() -> NoReturn:
     raise SystemExit(status)
 
 
-def _options() -> frozenset[str]:
-    """The options of all commands."""
-    commands = getattr(typer.main.get_command(app), "commands", {}).values()
-    return frozenset(option for command in commands for parameter in command.params for option in parameter.opts)
+def _parameters() -> frozenset[str]:
+    """The parameters that are options of the command that was given."""
+    command = next((word for word in sys.argv[1:] if word in COMMANDS), "")
+    return frozenset(inspect.signature(COMMANDS[command][0]).parameters) if command else frozenset()

@@ -1,84 +1,155 @@
-"""Values of options: lists of numbers, "auto", options that exclude each other; and the examples of a help text."""
+"""Options of a command from its table: their place in the help, and their values from text.
 
-from collections.abc import Mapping
-from typing import Annotated, Literal
+Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake is an ``InputError``.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from jaxgran.model.checks import InputError, short_repr
+from jaxgran.cli.mistakes import option_name, with_options
+from jaxgran.maps.parameters import Command, Option, default, is_new_dimension, options
+from jaxgran.maps.presets import PRESETS
+from jaxgran.model.checks import refused, require
 from jaxgran.model.choices import MAX_REPLICAS
 
 _MOST_DIGITS = 20  # of a whole number
-
-RelativeError = Annotated[
-    float | None,
-    typer.Option(
-        "--error",
-        help="Whole relative error of force ratio and stresses to reach, 95 %: chooses grains, time step, tolerance "
-        "and strain that are not given.",
-    ),
-]
+_LIST = f"or a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to {MAX_REPLICAS}"
+_WHOLE_LIST = "or a list like 256,1000,4000"
+FILE = Option("Dataset of a map.", Path)
+QUIET = Option("No progress on standard error.", bool, short="q")
+OVERWRITE = Option("Replace the output, whatever it holds.", bool)
 
 
-def number_list(text: str, name: str) -> tuple[float, ...]:
-    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included."""
+def of_map(command: Command) -> dict[str, Option]:
+    """The parameters of a map that a command offers, with the defaults of the command."""
+    return {name: _as_offered(name, one, command) for name, one in options(command).items()}
+
+
+def _as_offered(name: str, one: Option, command: Command) -> Option:
+    values = {"several": False} if command == "run" else {}
+    words = one.help + (" A list adds a dimension." if command == "map" and is_new_dimension(name) else "")
+    text = one.default
+    if command == "map" and name in PRESETS["quick"]:
+        text = "of the preset"
+    elif text is None and one.kind is not bool and default(name) is not None:
+        text = f"{default(name):g}" if isinstance(default(name), float) else str(default(name))
+    return Option(**{**vars(one), "help": words, "default": text, **values})
+
+
+def command(
+    table: Mapping[str, Option],
+    run: Callable[..., None],
+    required: tuple[str, ...] = (),
+    argument: Option | None = None,
+) -> Callable[..., None]:
+    """A command function for Typer that calls ``run`` with the values of the options that were given.
+
+    Args:
+      table: the options by name.
+      run: called with the argument, if there is one, and with the values by name.
+      required: options that must be given.
+      argument: a file without an option's name.
+    """
+
+    def parsed(**texts: Any) -> None:
+        file = () if argument is None else (texts.pop("file"),)
+        given = {name: text for name, text in texts.items() if text is not None}
+        run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
+
+    parameters = [] if argument is None else [_parameter("file", Path, typer.Argument(help=argument.help), ...)]
+    for name, one in table.items():
+        kind = one.kind if one.kind in (bool, Path) else str
+        first = ... if name in required else None
+        parameters.append(_parameter(name, kind if first is ... else kind | None, _declared(name, one), first))
+    parsed.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return parsed
+
+
+def _parameter(name: str, kind: Any, declared: Any, first: Any) -> inspect.Parameter:
+    first = inspect.Parameter.empty if first is ... else first
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=first, annotation=Annotated[kind, declared])
+
+
+def _declared(name: str, one: Option) -> Any:
+    """The option as Typer knows it."""
+    off = f"/--no-{name}" if one.off else ""
+    names = [option_name(name) + off, *([f"-{one.short}"] if one.short else [])]
+    words = with_options(one.help, (*options("map"), *options("run")))
+    words += f" [unit: {one.unit}]" if one.unit else ""
+    words += f" [default: {one.default}]" if one.default else ""
+    choices = one.kind if isinstance(one.kind, tuple) else ("auto",) if one.auto else ()
+    completion = (lambda: list(choices)) if choices else None
+    metavar = None if one.kind is bool else placeholder(one)
+    return typer.Option(*names, help=words, metavar=metavar, show_default=False, autocompletion=completion)
+
+
+def placeholder(one: Option) -> str:
+    """What stands for the value of an option in a help text."""
+    if isinstance(one.kind, tuple):
+        return "|".join(one.kind)
+    kind = one.example or {float: "NUMBER", int: "INTEGER", Path: "FILE"}.get(one.kind, "TEXT")
+    return ("LIST" if one.several else kind) + ("|auto" if one.auto else "")
+
+
+def value(name: str, one: Option, text: Any) -> Any:
+    """The value of an option from its text.
+
+    Raises:
+      InputError: (a ValueError) it is not accepted; ``field`` is the name.
+    """
+    if not isinstance(text, str) or one.kind is str:
+        return text
+    if isinstance(one.kind, tuple):
+        if text not in one.kind:
+            raise refused(name, text, f"must be {', '.join(one.kind[:-1])} or {one.kind[-1]}")
+        return text
+    if one.auto and text == "auto":
+        return text
+    several = (_WHOLE_LIST if one.kind is int else _LIST) if one.several else ""
+    accepted = "a whole number" if one.kind is int else "a number"
+    accepted = ", ".join(x for x in ("auto" if one.auto else "", f"{accepted} {several}".strip()) if x)
     try:
-        if ":" in text:
-            start, stop, count = text.split(":")
-            steps = int(count) - 1
-            if not 1 <= steps < MAX_REPLICAS:
-                raise ValueError(count)
-            return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
-        return tuple(float(x) for x in text.split(","))
+        numbers = list(_whole(text) if one.kind is int else _numbers(text))
+        if len(numbers) > 1 and not one.several:
+            raise ValueError(text)
     except ValueError:
-        raise InputError(
-            f"{name} must be a number, a list like 0.1,0.5,0.9 or start:stop:count with a count of 2 to "
-            f"{MAX_REPLICAS}, not {short_repr(text)}."
-        ) from None
+        raise refused(name, text, f"must be {accepted}") from None
+    if one.range is not None:
+        for number in numbers:
+            require(name, number, *one.range)
+    is_axis = one.several and not is_new_dimension(name)
+    return tuple(numbers) if len(numbers) > 1 or is_axis else numbers[0]
 
 
-def numbers_or_auto(text: str | None, name: str) -> float | tuple[float, ...] | str | None:
-    """One number, several numbers, or "auto"; None if the option is not given."""
-    if text is None or text == "auto":
-        return text
-    numbers = number_list(text, name)
-    return numbers[0] if len(numbers) == 1 else numbers
-
-
-def whole_numbers(text: str | None, name: str) -> int | tuple[int, ...] | str | None:
-    """One whole number, or several from ``256,1000,4000``, or "auto"; None if the option is not given."""
-    if text is None or text == "auto":
-        return text
+def _whole(text: str) -> tuple[int, ...]:
     parts = text.split(",")
-    if not all(part.isdecimal() and len(part) <= _MOST_DIGITS for part in parts):
-        raise InputError(f"{name} must be a whole number or a list like 256,1000,4000, not {short_repr(text)}.")
-    numbers = tuple(int(part) for part in parts)
-    return numbers[0] if len(numbers) == 1 else numbers
+    if not all(part.removeprefix("-").isdecimal() and len(part) <= _MOST_DIGITS for part in parts):
+        raise ValueError(text)
+    return tuple(int(part) for part in parts)
 
 
-def batch_size(text: str) -> int | Literal["auto"]:
-    """Number of replicas that run together, or "auto"."""
-    if text == "auto":
-        return "auto"
-    if not text.isdecimal() or len(text) > 9 or int(text) < 1:
-        raise InputError(
-            f"batch must be auto or a whole number of at least 1, below a billion, not {short_repr(text)}."
-        )
-    return int(text)
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers from ``0.1,0.5,0.9`` or ``start:stop:count``, both ends included."""
+    if ":" not in text:
+        return tuple(float(x) for x in text.split(","))
+    start, stop, count = text.split(":")
+    steps = int(count) - 1
+    if not 1 <= steps < MAX_REPLICAS:
+        raise ValueError(count)
+    return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
 
 
-def require_one(strain: float | None, error: float | None) -> None:
-    """Raise an InputError if both the sampled strain and a target for the error are given."""
-    if strain is not None and error is not None:
-        raise InputError("--strain and --error exclude each other: give one of them.")
-
-
-def chosen_for(error: float | None) -> dict[str, str]:
-    """The parameters that are chosen for a target of the error, unless they are given."""
-    return {} if error is None else dict.fromkeys(("grains", "timestep", "tolerance"), "auto")
+def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a requested error chooses unless it is given; a longer sample is cheaper than a second seed."""
+    automatic = {"grains": "auto", "timestep": "auto", "tolerance": "auto", "seeds": 1}
+    return automatic if "error" in given else {}
 
 
 def examples(commands: Mapping[str, str]) -> str:
     """The end of a help text: example commands and what they do."""
-    lines = [line for words, command in commands.items() for line in (f"  {words}:", f"    {command}")]
+    lines = [line for purpose, line in commands.items() for line in (f"  {purpose}:", f"    {line}")]
     return "\b\n" + "\n".join(["Examples:", *lines])

@@ -1,11 +1,10 @@
-"""The command ``explore``: a map as a page for a browser."""
+"""The command ``explore``: a map as an interactive page for a browser."""
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from jaxgran.cli.arguments import FILE, OVERWRITE, command
 from jaxgran.cli.terminal import say_written
+from jaxgran.maps.parameters import Option
 from jaxgran.model.checks import InputError, short_repr
 
 EXPLORE_EXAMPLES = {
@@ -14,13 +13,15 @@ EXPLORE_EXAMPLES = {
 }
 
 
-def explore_command(
-    file: Annotated[Path, typer.Argument(help="Dataset of a map.")],
-    output: Annotated[
-        Path | None, typer.Option(help="HTML file of the page. [default: the name of the dataset with .html]")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the output, whatever it holds.")] = False,
-) -> None:
+EXPLORE_OPTIONS = {
+    "output": Option(
+        "HTML file of the page.", Path, default="the name of the dataset with .html", short="o", example="FILE.html"
+    ),
+    "overwrite": OVERWRITE,
+}
+
+
+def run_explore_command(file: Path, output: Path | None = None, overwrite: bool = False) -> None:
     from jaxgran.io.atomic import require_place
     from jaxgran.maps.results import read_dataset
     from jaxgran.page.document import require_plotly
@@ -32,7 +33,12 @@ def explore_command(
     page = explore(read_dataset(file, needed=()))
     if path.exists() and not overwrite and not shows_same_map(path, page):
         raise InputError(
-            f"output must be another file, or --overwrite be given: {short_repr(str(path))} is no page of this map."
+            f"output {short_repr(str(path))} already exists and belongs to another map; "
+            "pass `overwrite=True` to replace it.",
+            field="output",
         )
     page.save(path)
     say_written([path])
+
+
+explore_command = command(EXPLORE_OPTIONS, run_explore_command, argument=FILE)

@@ -3,13 +3,12 @@
 import math
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import numpy as np
-import typer
-
+from jaxgran.cli.arguments import command
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say, stop
+from jaxgran.maps.parameters import Option
 from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.display import with_error
 
@@ -24,83 +23,77 @@ FIT_EXAMPLES = {
 }
 
 
-def fit_command(
-    file: Annotated[
-        Path,
-        typer.Argument(help="Tracks of discs (.gsd, .csv, .tsv, .txt, .h5, .hdf5, .lammpstrj, .dump), or a map (.nc)."),
-    ],
-    shear_rate: Annotated[
-        float | None, typer.Option(help="Of the tracks. [default: by the file, or by how its cell tilts]")
-    ] = None,
-    frame_strain: Annotated[
-        float | None, typer.Option(help="Strain from frame to frame of the tracks, in place of --frame-time.")
-    ] = None,
-    frame_time: Annotated[
-        float | None,
-        typer.Option(help="Time from frame to frame of the tracks. [default: by the file, or its velocities]"),
-    ] = None,
-    peculiar: Annotated[bool, typer.Option("--peculiar", help="The velocities of the tracks lack the shear.")] = False,
-    diameter: Annotated[float | None, typer.Option(help="Of all discs, where the tracks have none.")] = None,
-    every: Annotated[
-        int | None, typer.Option(help="Use each N-th frame of the tracks only, where contacts outlast a frame.")
-    ] = None,
-    position_noise: Annotated[
-        float | None,
-        typer.Option(help="Standard error of a coordinate. [default: by the straight parts of the tracks]"),
-    ] = None,
-    velocity_noise: Annotated[
-        float | None, typer.Option(help="Standard error of a velocity. [default: as above]")
-    ] = None,
-    diameter_noise: Annotated[
-        float | None, typer.Option(help="Standard error of the distance at contact. [default: as above]")
-    ] = None,
-    packing_fraction: Annotated[
-        float | None, typer.Option(help="Of a flow whose restitution is sought from its stresses, with a map.")
-    ] = None,
-    pressure: Annotated[float | None, typer.Option(help="Its pressure, in m γ̇².")] = None,
-    shear_stress: Annotated[float | None, typer.Option(help="Its shear stress, in m γ̇².")] = None,
-    relative_error: Annotated[float, typer.Option(help="Relative standard error of these stresses.")] = 0.0,
-) -> None:
-    require_number("relative_error", relative_error, lambda x: (x >= 0) & (x <= 1), "between 0 and 1")
+_POSITIVE = (lambda x: (x > 0) & (x < math.inf), "a positive number")
+_TRACKS = {
+    "shear_rate": Option("Shear rate of the tracks.", default="that of the file, or of its tilting cell"),
+    "frame_strain": Option("Strain between frames of the tracks, in place of --frame-time.", range=_POSITIVE),
+    "frame_time": Option(
+        "Time between frames of the tracks.", range=_POSITIVE, default="that of the file, or of its velocities"
+    ),
+    "peculiar": Option("The velocities of the tracks lack the shear.", bool),
+    "diameter": Option("Diameter of all discs, where the tracks have none."),
+    "stride": Option(
+        "Use every N-th frame of the tracks, where contacts outlast a frame.",
+        int,
+        range=(lambda x: x >= 1, "a whole number of at least 1"),
+        example="N",
+    ),
+    "position_noise": Option("Standard error of a coordinate.", default="estimated from straight parts of the tracks"),
+    "velocity_noise": Option("Standard error of a velocity component.", default="estimated in the same way"),
+    "diameter_noise": Option("Standard error of the distance at contact.", default="estimated from the collisions"),
+}
+_STRESSES = {
+    "packing_fraction": Option("Packing fraction of a flow whose restitution is inferred from its stresses, by a map."),
+    "pressure": Option("Its pressure, in m γ̇²."),
+    "shear_stress": Option("Its shear stress, in m γ̇²."),
+}
+FIT_OPTIONS = {
+    **_TRACKS,
+    **_STRESSES,
+    "relative_error": Option(
+        "Relative standard error of these stresses.", range=(lambda x: (x >= 0) & (x <= 1), "between 0 and 1")
+    ),
+}
+FIT_FILE = Option("Tracks of discs (.gsd, .csv, .tsv, .txt, .h5, .hdf5, .lammpstrj, .dump), or a map (.nc).", Path)
+
+
+def run_fit_command(file: Path, relative_error: float = 0.0, **given: Any) -> None:
     configured_jax()
-    stresses = {"packing_fraction": packing_fraction, "pressure": pressure, "shear_stress": shear_stress}
-    of_map = [name for name, value in stresses.items() if value is not None]
-    of_file = {"shear_rate": shear_rate, "frame_strain": frame_strain, "frame_time": frame_time, "diameter": diameter}
-    noise = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}
-    others = {"peculiar": peculiar or None, "every": every}
-    of_tracks = [name for name, value in (of_file | noise | others).items() if value is not None]
+    of_tracks, of_map = ({name: x for name, x in given.items() if name in table} for table in (_TRACKS, _STRESSES))
     if file.suffix != ".nc":
         if of_map:
-            raise InputError(f"{of_map[0]} goes with a map, and {short_repr(file.name)} is not one.")
-        thinned = {} if every is None else {"every": every}
-        _fit_tracks(file, _observed(peculiar=peculiar, **of_file) | thinned, noise)
-    else:
-        if of_tracks:
-            raise InputError(f"{of_tracks[0]} goes with tracks of discs, and {short_repr(file.name)} is a map.")
-        if 0 < len(of_map) < len(stresses):
-            missing = next(name for name in stresses if name not in of_map)
-            raise InputError(f"{missing} must be given too, or a restitution cannot be sought.")
-        _fit_map(file, list(stresses.values()) if of_map else None, relative_error)
+            name = next(iter(of_map))
+            raise InputError(f"{name} requires a map, and {short_repr(file.name)} is none.", field=name)
+        noise = {name: of_tracks.pop(name, None) for name in ("position_noise", "velocity_noise", "diameter_noise")}
+        _fit_tracks(file, _reading(**of_tracks), noise)
+        return
+    if of_tracks:
+        name = next(iter(of_tracks))
+        raise InputError(f"{name} requires tracks of discs, and {short_repr(file.name)} is a map.", field=name)
+    missing = [name for name in _STRESSES if name not in of_map]
+    if of_map and missing:
+        raise InputError(f"{missing[0]} must be given, too, to infer a restitution.", field=missing[0])
+    _fit_map(file, [of_map[name] for name in _STRESSES] if of_map else None, relative_error)
 
 
-def _observed(
-    shear_rate: float | None,
-    frame_strain: float | None,
-    frame_time: float | None,
-    diameter: float | None,
-    peculiar: bool,
-) -> dict:
+fit_command = command(FIT_OPTIONS, run_fit_command, argument=FIT_FILE)
+
+
+def _reading(
+    shear_rate: float | None = None,
+    frame_strain: float | None = None,
+    frame_time: float | None = None,
+    stride: int = 1,
+    **others: Any,
+) -> dict[str, Any]:
     """The arguments of ``read_tracks``: a strain between frames is a time, in units of 1/γ̇ where γ̇ is not given."""
-    for name, value in (("frame_strain", frame_strain), ("frame_time", frame_time)):
-        if value is not None:
-            require_number(name, value, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if frame_strain is not None:
         if frame_time is not None:
-            raise InputError("frame_strain goes without --frame-time, as each says the other.")
+            raise InputError("`frame_strain` and `frame_time` exclude each other.", field="frame_strain")
         shear_rate = 1.0 if shear_rate is None else shear_rate
         require_number("shear_rate", shear_rate, lambda x: x > 0, "positive beside a strain")
         frame_time = frame_strain / shear_rate
-    return {"interval": frame_time, "shear_rate": shear_rate, "peculiar": peculiar, "diameter": diameter}
+    return {"interval": frame_time, "shear_rate": shear_rate, "every": stride, **others}
 
 
 def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
@@ -111,13 +104,13 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
     tracks = read_tracks(file, **observed)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "the interval may not hold")  # it is said below
+            warnings.filterwarnings("ignore", "the interval may not hold")  # printed below
             found = fit_restitution(tracks, **noise)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)
     recorded = recorded_restitution(file)
     frames, grains = tracks.positions.shape[:2]
-    digits = 1 - math.floor(math.log10(found.stderr))  # those that an end of the interval is found to
+    digits = 1 - math.floor(math.log10(found.stderr))  # significant ones of an end of the interval
     rows = [
         ["restitution ± standard error", with_error(found.restitution, found.stderr)],
         ["95 % interval", f"{found.low:.{digits}f} to {found.high:.{digits}f}"],
@@ -133,11 +126,11 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
         ["misfit over the noise", f"{found.misfit:.2g}"],
     ]
     print_table(Table("", ("of the tracks", "value"), rows, numbers=False))
-    if words := caution(found):
-        say(f"caution: {words}")
+    if warning := caution(found):
+        say(f"caution: {warning}")
 
 
-def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: float) -> None:
+def _fit_map(file: Path, stresses: list[float] | None, relative_error: float) -> None:
     require_device()
     from jaxgran.inference.closure_fit import fit_closure
     from jaxgran.inference.cross_validation import leave_one_out
@@ -155,11 +148,11 @@ def _fit_map(file: Path, stresses: list[float | None] | None, relative_error: fl
     if stresses is None:
         print_table(table)
     else:
-        nu, pressure, shear = (float(x) for x in stresses if x is not None)
+        nu, pressure, shear = stresses
         noise = (relative_error * pressure, relative_error * shear)
         found = restitution_from_stresses(closure, nu, pressure, shear, *noise)
-        words = "" if bool(found.determined) else ", hardly determined: the stresses depend little on it there"
+        note = "" if bool(found.determined) else ", poorly determined: the stresses depend little on it there"
         if float(found.chi_squared) > _LARGEST_CHI_SQUARED:
-            words = ", the nearest in the map: none there has these stresses"
+            note = ", the nearest in the map: no restitution has these stresses"
         print_table(table)
-        print(f"restitution {with_error(float(found.restitution), float(found.stderr))}{words}")
+        print(f"restitution {with_error(float(found.restitution), float(found.stderr))}{note}")

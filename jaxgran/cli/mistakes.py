@@ -1,15 +1,19 @@
 """Mistakes on the command line as one sentence: the option, the given value, and what is accepted."""
 
 import re
+import sys
+from collections.abc import Container
+from difflib import get_close_matches
 from typing import Any
 
 import typer
+import typer.core
 
-from jaxgran.model.checks import short_repr
+from jaxgran.model.checks import InputError, short_repr
 
-UsageError: Any = typer.BadParameter.__base__  # typer raises it for options that it cannot read
-_LONGEST_SENTENCE = 500  # characters; a quoted value may be longer
-_KINDS_OF_NUMBER = {"integer": "a whole number", "number": "a number", "float": "a number"}
+_EXCEPTIONS: Any = sys.modules[typer.BadParameter.__module__]  # Click's, or Typer's copy of them
+UsageError: Any = _EXCEPTIONS.UsageError
+_PARAMETER = re.compile(r"`(\w+)(?:='?(\w+)'?)?`")  # in an InputError
 _COMMON_MISTAKES = {
     "--alpha": "--restitution",
     "-a": "--restitution",
@@ -18,74 +22,97 @@ _COMMON_MISTAKES = {
     "--density": "--packing-fraction",
     "--dt": "--timestep",
     "--time-step": "--timestep",
-    "-n": "--grains",
     "-N": "--grains",
-    "--seed": "--seeds",
+    "--seed": "--first-seed",
     "--jobs": "--workers",
     "-j": "--workers",
     "--gif": "--movie",
     "--out": "--output",
-    "-o": "--output",
+    "--like": "--from-map",
+    "--force": "--overwrite",
+    "-f": "--overwrite",
 }
 
 
-def by_option(sentence: str, options: frozenset[str]) -> str:
-    """The sentence with the option in place of the parameter name that it begins with."""
-    name, _, rest = sentence.partition(" ")
-    option = "--" + name.replace("_", "-")
-    return f"{option} {rest}" if option in options and re.match("must |goes ", rest) else sentence
+class Command(typer.core.TyperCommand):
+    """A command whose mistakes name a value without an option, and an option without its value."""
+
+    def __init__(self, *arguments: Any, **parameters: Any):
+        super().__init__(*arguments, **parameters)
+        self.allow_extra_args = True
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            extra = super().parse_args(ctx, args)
+        except _EXCEPTIONS.BadOptionUsage as mistake:
+            name = mistake.option_name
+            flag = any(getattr(one, "is_flag", False) for one in self.params if name in one.opts)
+            need = "takes no value" if flag else "requires a value"
+            raise InputError(f"{name} {need}: see {ctx.command_path} --help.") from None
+        if extra and not ctx.resilient_parsing:
+            given = short_repr(" ".join(extra))
+            raise InputError(f"{given} belongs to no option; values follow their options, and lists have no spaces.")
+        return extra
 
 
-def in_words(mistake: Any, arguments: list[str]) -> str:
-    """The message of typer about arguments that it cannot read, as one sentence that names the help."""
+class Group(typer.core.TyperGroup):
+    """The group of all commands, which names a command that does not exist."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name = args[0]
+        if name not in self.commands and not ctx.resilient_parsing:
+            similar = get_close_matches(name, self.commands, n=1)
+            meant = f", perhaps {similar[0]} is meant" if similar else ""
+            raise InputError(f"there is no command {short_repr(name)}{meant}: see jaxgran --help.")
+        return super().resolve_command(ctx, args)
+
+
+def option_name(field: str) -> str:
+    """The option of a parameter."""
+    return f"--{field.replace('_', '-')}"
+
+
+def with_options(text: str, names: Container[str]) -> str:
+    """The text with options in place of parameters in backticks: `overwrite=True` becomes --overwrite."""
+
+    def as_option(match: re.Match) -> str:
+        name, value = match.groups()
+        if name not in names:
+            return match[0]
+        return option_name(name) + ("" if value in (None, "True") else f" {value}")
+
+    return _PARAMETER.sub(as_option, text)
+
+
+def sentence_of(mistake: InputError, names: Container[str]) -> str:
+    """The message of an InputError in terms of the options of a command."""
+    text = with_options(str(mistake), names)
+    first, space, rest = text.partition(" ")  # the field, where it is named at all
+    return option_name(first) + space + rest if first in names and mistake.field in ("", first) else text
+
+
+def usage_sentence(mistake: Any) -> str:
+    """What is wrong with arguments that Typer cannot read, as one sentence that names the help."""
     context = getattr(mistake, "ctx", None)
-    words = " ".join(_words(mistake, arguments).split()).rstrip(".?")
-    words = words if len(words) <= _LONGEST_SENTENCE else _shortened(words)
-    return f"{words}: see {'jaxgran' if context is None else context.command_path} --help."
+    path = "jaxgran" if context is None else context.command_path
+    return f"{_usage(mistake)}: see {path} --help."
 
 
-def _shortened(words: str) -> str:
-    """The beginning and the end of a long sentence."""
-    half = _LONGEST_SENTENCE // 2
-    return f"{words[:half]} … {words[5 - half :]}"
-
-
-def _words(mistake: Any, arguments: list[str]) -> str:
-    """The message of typer in other words, without the name of the help."""
-    words = mistake.format_message()
-    parameter, option = getattr(mistake, "param", None), getattr(mistake, "option_name", None)
-    if words.startswith("No such option") and option is not None:
-        similar = [name for name in (mistake.possibilities or []) if name != "--help"]
+def _usage(mistake: Any) -> str:
+    if isinstance(mistake, _EXCEPTIONS.NoSuchOption):
         accepted = {name for one in mistake.ctx.command.params for name in one.opts}
-        meant = _COMMON_MISTAKES[option] if _COMMON_MISTAKES.get(option) in accepted else next(iter(similar), None)
+        similar = [name for name in (mistake.possibilities or []) if name != "--help"]
+        common = _COMMON_MISTAKES.get(mistake.option_name)
+        meant = common if common in accepted else next(iter(similar), None)
+        option = _shortened(mistake.option_name)
         return f"there is no option {option}" + (f", perhaps {meant} is meant" if meant else "")
-    if words.startswith("Missing") and parameter is not None:
-        return f"{parameter.opts[0] if parameter.opts[0].startswith('-') else parameter.name.upper()} must be given"
-    found = re.match("No such command '(.*?)'(?:. Did you mean '([^']*)')?", words, re.DOTALL)
-    if found:
-        command, meant = found.groups()
-        return f"there is no command {short_repr(command)}" + (f", perhaps {meant} is meant" if meant else "")
-    found = re.match(r"Got unexpected extra argument\(?s?\)? \((.*)\)", words, re.DOTALL)
-    if found:
-        return f"{short_repr(found[1])} stands alone, and values follow their options; a list has commas and no spaces"
-    found = re.search("(?:should be|is not) a valid (integer|number|float)", words)  # the latter before typer 0.29
-    if found and parameter is not None:
-        given = _given(arguments, parameter.opts[0])
-        return f"{parameter.opts[0]} must be {_KINDS_OF_NUMBER[found[1]]}" + (
-            "" if given is None else f", not {short_repr(given)}"
-        )
-    found = re.match(r"Invalid value for '(\S+)': (?:Value error, )?(.*) is not one of (.*)", words, re.DOTALL)
-    if found:
-        return f"{found[1]} must be one of {found[3].rstrip('.')}, not {found[2]}"
-    return words.replace("Value error, ", "")
+    if isinstance(mistake, _EXCEPTIONS.MissingParameter) and mistake.param is not None:
+        name = mistake.param.opts[0]
+        return f"{name if name.startswith('-') else name.upper()} must be given"
+    return _shortened(" ".join(mistake.format_message().split()).rstrip("."))
 
 
-def _given(arguments: list[str], option: str) -> str | None:
-    """The last value that was given for an option; None if there is none."""
-    next_word = dict(enumerate(arguments[1:]))
-    given = [
-        word.removeprefix(f"{option}=") if word.startswith(f"{option}=") else next_word.get(k)
-        for k, word in enumerate(arguments)
-        if word == option or word.startswith(f"{option}=")
-    ]
-    return given[-1] if given else None
+def _shortened(text: str, most: int = 300) -> str:
+    """The beginning and the end of a long text, on one line."""
+    text = " ".join(text.split())
+    return text if len(text) <= most else f"{text[: most // 2]} … {text[-most // 2 :]}"

@@ -2,25 +2,24 @@
 
 import math
 import os
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import typer
-
-from jaxgran.cli.arguments import RelativeError, chosen_for, numbers_or_auto, require_one
-from jaxgran.cli.measure import finish, measured, print_budget
+from jaxgran.cli.arguments import QUIET, command, for_error, of_map
+from jaxgran.cli.measure import finish, print_budget, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import configured_jax, say
+from jaxgran.maps.parameters import Option
 from jaxgran.maps.progress import counted
 from jaxgran.model.checks import InputError, require_number, short_repr
-from jaxgran.model.choices import Activation, EngineName, SolverName
 from jaxgran.model.display import with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
-_RECORDED_STRAIN = 5.0  # sampled strain where frames are kept and none is given
+_RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
 
-_GROUPS = {  # names of observables by what they tell; those that are not here are of the last group
+_GROUPS = {  # observables that are not here are in the last group
     "Forces": ("force_ratio", "contact_force", "binary_force", "force_second_moment"),
     "Stresses": (
         *("pressure", "contact_pressure", "binary_pressure", "kinetic_pressure"),
@@ -40,95 +39,61 @@ RUN_EXAMPLES = {
     "The same as a page for a browser, which pauses and steps": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
     "--page flow.html",
     "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 --packing-fraction 0.7 "
-    "--trajectory flow.gsd --every 0.01",
+    "--trajectory flow.gsd --frame-strain 0.01",
 }
 
 
-def run_command(
-    restitution: Annotated[float, typer.Option(help="Restitution, 0 to 1.")],
-    packing_fraction: Annotated[float, typer.Option(help="Packing fraction, up to 0.83.")],
-    grains: Annotated[int | None, typer.Option(help="Number of grains. [default: 256]")] = None,
-    strain: Annotated[
-        float | None, typer.Option(help="Sampled strain. [default: six memories of the flow, 5 where frames are kept]")
-    ] = None,
-    error: RelativeError = None,
-    timestep: Annotated[
-        str | None, typer.Option(help="Time step of the sample, in 1/shear rate, or auto. [default: 1e-3]")
-    ] = None,
-    seeds: Annotated[int, typer.Option(help="Independent replicas, averaged together.")] = 1,
-    seed: Annotated[int, typer.Option(help="Number of the first replica: another one begins from other grains.")] = 0,
-    tolerance: Annotated[
-        str | None, typer.Option(help="Relative residual of a contact solve, or auto. [default: 1e-4]")
-    ] = None,
-    solver: Annotated[
-        SolverName | None,
-        typer.Option(help="Method of the contact solve in the engine jax. [default: barzilai-borwein]"),
-    ] = None,
-    activation: Annotated[Activation | None, typer.Option(help="When a pair is a contact. [default: midpoint]")] = None,
-    engine: Annotated[EngineName, typer.Option(help="Program that advances the flow.")] = "auto",
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(
-            help="GSD file of the flow, frame by frame. Frames cut the flow elsewhere: its numbers change within their "
-            "errors."
-        ),
-    ] = None,
-    every: Annotated[
-        float | None,
-        typer.Option(help="Strain from frame to frame. [default: a hundredth of --strain, or 0.05 with --error]"),
-    ] = None,
-    movie: Annotated[
-        Path | None, typer.Option(help="GIF or MP4 of the flow: grains by their speed, and the forces between them.")
-    ] = None,
-    page: Annotated[
-        Path | None, typer.Option(help="HTML file that plays the flow in a browser, with its running averages.")
-    ] = None,
-    output: Annotated[Path | None, typer.Option(help="NetCDF file of the averages.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files, whatever they hold.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress on standard error.")] = False,
+RUN_OPTIONS = {
+    **of_map("run"),
+    "trajectory": Option(
+        "GSD file of the flow, frame by frame. Recording frames splits the run at different steps, so averages change "
+        "within their errors.",
+        Path,
+        example="FILE.gsd",
+    ),
+    "movie": Option(
+        "GIF or MP4 of the flow: grains by their speed, and the forces between them.", Path, example="FILE.gif"
+    ),
+    "page": Option("HTML file that plays the flow in a browser, with its running averages.", Path, example="FILE.html"),
+    "frame_strain": Option("Strain between frames.", default="a hundredth of --strain, or 0.05 with --error"),
+    "quiet": QUIET,
+}
+RUN_OPTIONS["strain"] = replace(RUN_OPTIONS["strain"], default=f"{RUN_OPTIONS['strain'].default}; 5 with frames")
+RUN_OPTIONS["seeds"] = replace(RUN_OPTIONS["seeds"], default="1")
+
+
+def run_run_command(
+    restitution: float,
+    packing_fraction: float,
+    trajectory: Path | None = None,
+    movie: Path | None = None,
+    page: Path | None = None,
+    frame_strain: float | None = None,
+    quiet: bool = False,
+    **given: Any,
 ) -> None:
-    step = numbers_or_auto(timestep, "timestep")
-    if isinstance(step, tuple):
-        raise InputError(f"timestep must be one number or auto, not {short_repr(timestep)}.")
-    require_one(strain, error)
-    residual = numbers_or_auto(tolerance, "tolerance")
-    if isinstance(residual, tuple):
-        raise InputError(f"tolerance must be one number or auto, not {short_repr(tolerance)}.")
     frames_wanted = any(x is not None for x in (trajectory, movie, page))
-    if seeds > 1 and frames_wanted:
-        raise InputError(
-            "--trajectory, --movie and --page show one replica: leave out --seeds, or choose one by --seed."
-        )
-    if strain is None and error is None and frames_wanted:
-        strain = _RECORDED_STRAIN
-    given = {
-        "grains": grains,
-        "timestep": step,
-        "strain": strain,
-        "error": error,
-        "tolerance": residual,
-        "solver": solver,
-        "activation": activation,
-    }
-    chosen = {
-        "restitution": (restitution,),
-        "packing_fraction": (packing_fraction,),
-        "seeds": seeds,
-        "first_seed": seed,
-        "engine": engine,
-        **chosen_for(error),
-        **{name: value for name, value in given.items() if value is not None},
-    }
+    chosen = {"seeds": 1, **for_error(given), **given}
+    if frames_wanted:
+        if chosen["seeds"] > 1:
+            raise InputError("`trajectory`, `movie` and `page` show one seed: leave out `seeds`.", field="seeds")
+        if "error" not in chosen:
+            chosen.setdefault("strain", _RECORDED_STRAIN)
+    strain = chosen.get("strain", _RECORDED_STRAIN)
     for name, file in (("trajectory", trajectory), ("movie", movie), ("page", page)):
-        if file is not None and os.path.isfile(file) and not overwrite:
-            raise InputError(f"{name} must be a new file, or --overwrite be given: {short_repr(str(file))} is there.")
-    recorder, frames, film = _recorder(trajectory, movie, page, every, strain or _RECORDED_STRAIN)
+        if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
+            raise InputError(
+                f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace it.", field=name
+            )
+    recorder, frames, film = _recorder(trajectory, movie, page, frame_strain, strain)
     record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
-    data, interrupted, written = measured(chosen, "auto", None, output, quiet, record=record, overwrite=overwrite)
+    output = chosen.get("output")
+    plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
+    data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     print_table(_summary_table(data))
     print_budget(data)
     if recorder is not None and recorder.frames:
-        say("frames cut the flow elsewhere: its numbers differ from those without frames, within their errors.")
+        say("recording frames split the run at different steps, so averages change within their errors.")
         if trajectory is not None:
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
@@ -136,17 +101,20 @@ def run_command(
         if film is not None and page is not None:
             film.page().save(page)
             say(f"wrote {page}: {len(film.frames.scenes)} frames")
-    finish(data, [output] if output and written else [], interrupted)
+    can_resume = output is not None and record is None
+    finish(data, [output] if output is not None and written else [], interrupted, can_resume)
 
 
-def _recorder(trajectory: Path | None, movie: Path | None, page: Path | None, every: float | None, strain: float):
-    """The recorder of the flow, the frames of its movie, and the film of its page; None if no file is asked for."""
+run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
+
+
+def _recorder(
+    trajectory: Path | None, movie: Path | None, page: Path | None, frame_strain: float | None, strain: float
+):
+    """The recorder of the flow, the frames of its movie, and the film of its page; None if there is no file for it."""
     if trajectory is None and movie is None and page is None:
-        if every is not None:
-            raise InputError(
-                "--every is the strain between frames: add --trajectory FILE.gsd, --movie FILE.gif or --page FILE.html "
-                "to have any."
-            )
+        if frame_strain is not None:
+            raise InputError("`frame_strain` requires `trajectory`, `movie` or `page`.", field="frame_strain")
         return None, None, None
     configured_jax()
     from jaxgran.io.atomic import require_place
@@ -154,11 +122,11 @@ def _recorder(trajectory: Path | None, movie: Path | None, page: Path | None, ev
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
-    if every is not None:
+    if frame_strain is not None:
         most_frames = MOST_RECORDED if movie is None and page is None else MOST_DRAWN
         least, most = strain / most_frames, strain
-        words = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
-        require_number("every", every, lambda x: (x >= 0.99 * least) & (x <= most), words)
+        accepted = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
+        require_number("frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted)
     keep, frames, film = [], Frames(), None
     if trajectory is not None:
         check_trajectory(trajectory)
@@ -174,7 +142,7 @@ def _recorder(trajectory: Path | None, movie: Path | None, page: Path | None, ev
         require_plotly()
         film = Film()
         keep.append(film.frames.keep)
-    return Recorder(strain / 100 if every is None else every, *keep), frames, film
+    return Recorder(strain / 100 if frame_strain is None else frame_strain, *keep), frames, film
 
 
 def _write_movie(movie: Path, frames, quiet: bool) -> None:

@@ -49,17 +49,17 @@ def require_device() -> None:
     try:
         devices()
     except RuntimeError as failure:
-        stop(f"JAX finds no device: {failure}. JAX_PLATFORMS=cpu takes the processor.")
+        stop(f"JAX finds no device: {failure}. Set JAX_PLATFORMS=cpu to use the CPU.")
 
 
 @cache
 def _say_cache() -> None:
-    """Print once if the cache is not in the user's folder. The caches of figures then go to the same place."""
+    """Print once if the cache is not in the user's folder; Matplotlib's cache then goes to the same place."""
     if not fallback_message():
         return
     say(fallback_message())
-    for words in ("the cache folder", "the numba engine is compiled anew"):
-        warnings.filterwarnings("ignore", words)
+    for message in ("the cache folder", "the numba engine is compiled anew"):
+        warnings.filterwarnings("ignore", message)
     folder = cache_folder()
     if folder is not None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
@@ -91,7 +91,7 @@ def sigterm_interrupts() -> Iterator[None]:
     def interrupt(*_: object) -> NoReturn:
         global _terminated
         _terminated = True
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what is done is being saved
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # finished points are being saved
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, interrupt)
@@ -104,10 +104,3 @@ def sigterm_interrupts() -> Iterator[None]:
 def stop_interrupted(sentence: str) -> NoReturn:
     """Print that the command was interrupted, and exit with the status of the signal."""
     stop(sentence, TERMINATED if _terminated else INTERRUPTED)
-
-
-def is_interruption(error: BaseException | None) -> bool:
-    """Whether Ctrl-C or SIGTERM led to the error: compiled code that is interrupted raises an error of its own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None

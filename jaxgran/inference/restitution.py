@@ -146,7 +146,7 @@ def fit_restitution(
         raise InputError(
             "tracks must show contacts that are shorter than the time between frames, and "
             f"{100 * share:.0f} % of the changes of velocity go on in the next frame: leave frames out, by "
-            f"every={every} of read_tracks or --every {every}."
+            f"every={every} of read_tracks or --stride {every}."
         )
     flights = weighed(flights, noise)
     with jax.enable_x64(True):

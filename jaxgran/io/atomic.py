@@ -31,13 +31,19 @@ class CorruptFile(Exception):
 def require_place(path: Path, option: str, ending: str) -> None:
     """Raise an InputError that says what is accepted, unless a file with this ending can be written to ``path``."""
     if path.suffix != ending:
-        raise InputError(f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.")
+        raise InputError(
+            f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.", field=option
+        )
     if len(os.fsencode(path.name)) > _LONGEST_NAME:
-        raise InputError(f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {short_repr(path.name)}.")
+        raise InputError(
+            f"{option} must be a file name of at most {_LONGEST_NAME} bytes, not {short_repr(path.name)}.", field=option
+        )
     if os.path.isdir(path):
-        raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.")
+        raise InputError(f"{option} must be a file, and {str(path)!r} is a folder.", field=option)
     if not os.path.isdir(path.parent):
-        raise InputError(f"{option} must be in a folder that exists, and {short_repr(str(path.parent))} does not.")
+        raise InputError(
+            f"{option} must be in a folder that exists, and {short_repr(str(path.parent))} does not.", field=option
+        )
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
@@ -46,7 +52,8 @@ def require_place(path: Path, option: str, ending: str) -> None:
                 pass
     except OSError as error:
         raise InputError(
-            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}."
+            f"{option} must be in a folder that can be written to, and {str(path)!r} cannot: {error.strerror}.",
+            field=option,
         ) from None
 
 
@@ -66,7 +73,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """The arrays and the description that ``write_arrays`` wrote; raises ``Damaged`` for any other content."""
+    """The arrays and the description that ``write_arrays`` wrote; raises ``CorruptFile`` for any other content."""
     import h5py
 
     try:

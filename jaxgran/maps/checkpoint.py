@@ -68,8 +68,9 @@ class Checkpoint:
             unfinished = (self.folder / "map.nc").exists() and self._batches()
             if unfinished and not resume:
                 raise InputError(
-                    f"there is an unfinished map in {str(self.folder)!r}: "
-                    "continue it with --resume, or remove the folder."
+                    f"output {str(output)!r} has an unfinished map: pass `resume=True` to continue it, or remove the "
+                    f"folder {str(self.folder)!r}.",
+                    field="output",
                 )
             if unfinished:
                 self._require_same()
@@ -204,8 +205,8 @@ class Checkpoint:
         for name, value in self._identity.items():
             if begun.get(name) != value:
                 raise InputError(
-                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r} and not {value!r}: "
-                    "repeat it as it was begun, or remove the folder."
+                    f"the unfinished map in {str(self.folder)!r} has {name} {begun.get(name)!r}, not {value!r}: "
+                    "resume it with the same parameters, or remove the folder."
                 )
 
     def _has_batch_of_this_map(self) -> bool:
@@ -245,7 +246,7 @@ def _locked(folder: Path, output: Path) -> int | None:
             folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError:
             raise InputError(
-                f"output needs the folder {str(folder)!r}, and there is a file of this name: rename it."
+                f"output needs the folder {str(folder)!r}, and a file has this name: rename it.", field="output"
             ) from None
         if fcntl is None:
             return None
@@ -258,7 +259,7 @@ def _locked(folder: Path, output: Path) -> int | None:
         except BlockingIOError:
             os.close(handle)
             raise InputError(
-                f"another process is writing {str(output)!r}: wait for it, or give another output."
+                f"another process is writing {str(output)!r}: wait for it, or choose another `output`."
             ) from None
         except OSError:
             return handle

@@ -28,7 +28,7 @@ _LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of large
 
 
 class Journal:
-    """A ``Drive`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
+    """An ``AdvanceBatch`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
 
     Args:
       path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
@@ -37,7 +37,7 @@ class Journal:
       seconds: time between two writes; None for ``SECONDS``, or longer if a write itself takes long.
 
     Raises:
-      Damaged: the file is the journal of another batch, or cannot be read.
+      CorruptFile: the file is the journal of another batch, or cannot be read.
     """
 
     def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: AdvanceBatch, seconds: float | None = None):

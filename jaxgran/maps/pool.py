@@ -114,7 +114,7 @@ def run_tasks(
       on_message: called with every message of a worker, see ``send``.
 
     Yields:
-      The number of the task, and its result or ``Died``.
+      The number of the task, and its result or ``WorkerDied``.
 
     Raises:
       ChildProcessError: workers die before they have a task.

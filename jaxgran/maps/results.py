@@ -85,7 +85,7 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
     chosen: dict[str, Any] = {}
     try:
         for field in fields(MapSettings):
-            if field.name in ("solver", "engine"):
+            if field.name in ("solver", "engine", "tolerance"):
                 continue
             attribute = next((name for name in (f"{field.name}_requested", field.name) if name in data.attrs), None)
             if field.name in data.coords:  # one number where one of a list was selected

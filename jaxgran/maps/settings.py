@@ -1,18 +1,19 @@
 """MapSettings: all parameters that the numbers of a ratio map depend on, checked before the run."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
-from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics, select_engine
-from jaxgran.model.checks import InputError, require_number, require_whole, short_repr, two_digits
-from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP, Activation
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
+from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
+from jaxgran.maps.parameters import MapParameters
+from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
+from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
@@ -21,88 +22,61 @@ from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
 _FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
-_LONGEST_EQUILIBRATION = 1e6  # strain before the sample
 _LARGEST_SEED = 2**30
-_ACCEPTED_TIMESTEP = 1e-6  # 1/γ̇; all flows accept it
+_AUTOMATIC_ERROR = 0.02  # of the stresses from an automatic time step, where no error is given
+_SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6, "tolerance": None}  # all flows accept these for "auto"
 
 
 @dataclass(frozen=True)
-class MapSettings:
-    """All parameters that the numbers of a map depend on; see ``ratio_map`` for their meaning."""
+class MapSettings(MapParameters):
+    """The parameters that the numbers of a map depend on, checked, without "auto", and with tuples for lists.
 
-    restitution: tuple[float, ...]
-    packing_fraction: tuple[float, ...]
-    grains: int | tuple[int, ...] = 256
-    seeds: int = 2
-    timestep: float | tuple[float, ...] = 1e-3
-    equilibrate: float | None = None
-    strain: float | None = None
-    error: float | None = None
-    solver: ProjectedMethod = DEFAULT_SOLVER
-    activation: Activation = "midpoint"
-    engine: Engine | None = None
-    grains_by_point: tuple[int, ...] | None = None  # in the order of ``flows``; ``grains`` is then the largest
-    snapshots: bool = False
-    first_seed: int = 0
+    ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None stands for the default
+    solver and for the automatic choice of an engine. A given ``tolerance`` becomes that of the solver.
+    """
 
     def __post_init__(self):
+        object.__setattr__(self, "solver", _with_tolerance(self.solver, self.tolerance))
+        object.__setattr__(self, "tolerance", None)
+        checked_numerics(self.solver, self.engine)
         for name, values in self.axes.items():
-            if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
-                raise InputError(f"{name} must be a list of at most {MAX_REPLICAS} numbers, not {short_repr(values)}.")
-            if len(values) == 0:
-                raise InputError(f"{name} must be a list of at least one number, and it is empty.")
-            if not all(
-                isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values
-            ):
-                raise InputError(f"{name} must be a list of numbers, not {short_repr(values)}.")
-            if len(set(values)) < len(values) or (
-                list(values) != sorted(values) and list(values) != sorted(values)[::-1]
-            ):
-                raise InputError(f"{name} must be sorted and without repetition, not {short_repr(list(values))}.")
+            _require_axis(name, values)
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
         require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
-        if not isinstance(self.snapshots, bool):
-            raise InputError(f"snapshots must be True or False, not {short_repr(self.snapshots)}.")
+        require_flag("snapshots", self.snapshots)
+        self._require_grains_by_point()
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
-            raise InputError(f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.")
-        if self.strain is not None:
-            require_number("strain", self.strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-        if self.error is not None:
-            require_number("error", self.error, lambda x: (x >= 1e-3) & (x <= 0.5), "between 1e-3 and 0.5")
-        if self.equilibrate is not None:
-            most, words = _LONGEST_EQUILIBRATION, f"a number of at least 0 and at most {_LONGEST_EQUILIBRATION:g}"
-            require_number("equilibrate", self.equilibrate, lambda x: (x >= 0) & (x <= most), words)
-        if not isinstance(self.timestep, tuple):
-            require_number("timestep", self.timestep, lambda x: x > 0, "a positive number")
-        checked_numerics(self.solver, self.engine)
+            raise InputError(
+                f"a map must have at most {MAX_REPLICAS} replicas, points times seeds, not {count}.", field="seeds"
+            )
+        for row in fields(MapParameters):
+            value, ranged = getattr(self, row.name), row.metadata["option"].range
+            if ranged is not None and value is not None and row.name not in self.axes:
+                require_number(row.name, value, *ranged)
         flows = stack_of_any_size(self._checked_flows())
         if self.engine is not None:
             select_engine(flows, self.numerics)
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
-            raise InputError(
-                f"timestep must be at least {SHORTEST_TIMESTEP:g} / shear rate, or the steps of a run would be too "
-                f"many to count, not {shortest:g}."
-            )
+            raise refused("timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate")
         strain = LEAST_SAMPLE if self.strain is None else self.strain
         if strain > MAX_STEPS * shortest:
-            raise InputError(
-                f"strain must be at most {MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}, not {strain:g}."
-            )
+            most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
+            raise refused("strain", strain, f"must be at most {most}")
         limits = longest_timestep(_temperature(flows), flows.packing_fraction, self.activation)
         excess = np.asarray(flows.timestep) / limits
         worst = int(np.argmax(excess))
         if excess[worst] > 1:
-            raise InputError(
-                f"timestep must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)}, or grains "
-                "would overlap deeply; auto chooses one."
+            raise refused(
+                "timestep",
+                float(np.asarray(flows.timestep)[worst]),
+                f"must be at most {two_digits(limits[worst], up=False)} at {_point(flows, worst)} to avoid deep "
+                "overlaps, or auto",
             )
         if round(strain / longest) < _FEWEST_STEPS:
-            raise InputError(
-                f"strain must be at least {_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * longest:g}, "
-                f"not {strain:g}."
-            )
+            least = f"{_FEWEST_STEPS} time steps, that is {_FEWEST_STEPS * longest:g}"
+            raise refused("strain", strain, f"must be at least {least}")
 
     @property
     def axes(self) -> dict[str, tuple[float, ...]]:
@@ -110,9 +84,10 @@ class MapSettings:
 
         ``grains`` and ``timestep`` are among them if they are lists.
         """
-        further = {"grains": self.grains, "timestep": self.timestep}
-        lists = {name: values for name, values in further.items() if isinstance(values, tuple)}
-        return {**lists, "packing_fraction": self.packing_fraction, "restitution": self.restitution}
+        optional: dict[str, Any] = {"grains": self.grains, "timestep": self.timestep}
+        lists = {name: values for name, values in optional.items() if isinstance(values, tuple)}
+        plane: dict[str, Any] = {"packing_fraction": self.packing_fraction, "restitution": self.restitution}
+        return lists | plane
 
     @property
     def numerics(self) -> Numerics:
@@ -124,11 +99,21 @@ class MapSettings:
         """The numbers of grains, at least one."""
         if self.grains_by_point is not None:
             return tuple(sorted(set(self.grains_by_point)))
-        return self.grains if isinstance(self.grains, tuple) else (self.grains,)
+        return self.axes.get("grains", (self.grains,))  # type: ignore[return-value]
 
     @property
     def _timesteps(self) -> tuple[float, ...]:
-        return self.timestep if isinstance(self.timestep, tuple) else (self.timestep,)
+        return self.axes.get("timestep", (self.timestep,))  # type: ignore[arg-type]
+
+    def _require_grains_by_point(self) -> None:
+        points = len(self._timesteps) * len(self.packing_fraction) * len(self.restitution)
+        if self.grains_by_point is not None and not (
+            isinstance(self.grains_by_point, tuple)
+            and len(self.grains_by_point) == points
+            and "grains" not in self.axes
+        ):
+            reason = f"must be a list of {points} numbers, one for each point"
+            raise refused("grains_by_point", self.grains_by_point, reason)
 
     def flows(self) -> list[ShearFlow]:
         """One flow for each point, in the order of ``axes``: the last one changes fastest."""
@@ -165,56 +150,90 @@ def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
     return stack([flow if flow.grains == largest else replace(flow, grains=largest) for flow in flows])
 
 
-def automatic(choices: Mapping[str, Any], target_error: float) -> tuple[dict[str, Any], str]:
-    """The parameters of a map with numbers in place of "auto", and a sentence about these numbers, or "".
+def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
+    """The settings of a map with numbers for "auto", and a sentence about these numbers, or "".
 
-    Args:
-      choices: keyword arguments of ``MapSettings``, and ``tolerance``, a number in place of that of the solver.
-        ``grains``, ``timestep`` and ``tolerance`` may be "auto". The grains are then chosen by point, for the ``error``
-        of the map.
-      target_error: largest accepted relative error of pressure and shear stress from the time step. A given ``error``
-        sets it.
+    With an ``error``, the grains are chosen for each point, and time step and tolerance for their shares of it.
+
+    Raises:
+      InputError: (a ValueError) a parameter is out of its range, or the error needs too many grains.
     """
-    require_number("target_error", target_error, lambda x: (x >= 1e-4) & (x <= 0.1), "between 1e-4 and 0.1")
-    chosen, words = dict(choices), []
-    tolerance, solver = chosen.pop("tolerance", None), chosen.get("solver", DEFAULT_SOLVER)
-    require_solver(solver)
-    error = chosen.get("error")
-    if error is not None:
-        MapSettings(**{**chosen, "grains": 256, "timestep": _ACCEPTED_TIMESTEP})  # checks the lists
-        target_error = SHARES["timestep"] * error
-    if isinstance(chosen.get("grains"), str):
-        if error is None:
-            raise InputError("grains may be auto only with a given error, which they are chosen for.")
-        grid = [(alpha, nu) for nu, alpha in product(chosen["packing_fraction"], chosen["restitution"])]
-        grains = [fewest_grains(*point, SHARES["size"] * error) for point in grid]
-        if max(grains) > MAX_GRAINS:
-            surely = MAX_GRAINS / 2**0.5  # numbers of grains are chosen in steps of √2
-            least = max(float(size_error(*point, surely)) for point in grid) / SHARES["size"]
-            raise InputError(
-                f"error must be at least {two_digits(least, up=True)} at these points, not {error:g}: it would "
-                f"need more than {MAX_GRAINS} grains."
-            )
-        steps = len(chosen["timestep"]) if isinstance(chosen.get("timestep"), tuple) else 1
-        chosen |= {"grains": max(grains), "grains_by_point": tuple(grains) * steps}
-        chosen.setdefault("seeds", 1)  # a longer sample is cheaper than a second preparation
-        sizes = " to ".join(str(size) for size in sorted({min(grains), max(grains)}))
-        words.append(f"{sizes} grains, {chosen['seeds']} seed{'s' if chosen['seeds'] > 1 else ''}")
-    if isinstance(chosen.get("timestep"), str) and chosen["timestep"] == "auto":
-        flows = stack_of_any_size(MapSettings(**{**chosen, "timestep": _ACCEPTED_TIMESTEP, "strain": 1.0}).flows())
-        steps = automatic_timestep(
-            _temperature(flows), flows.packing_fraction, chosen.get("activation", "midpoint"), target_error
-        )
+    rows = fields(MapParameters)
+    chosen: dict[str, Any] = {one.name: _plain(getattr(asked, one.name), one.metadata["option"].kind) for one in rows}
+    by_point = chosen["grains_by_point"]
+    if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
+        chosen["grains"] = max(by_point)
+    automatic = {name for name in _SAFE if isinstance(chosen[name], str) and chosen[name] == "auto"}
+    if not automatic:
+        return MapSettings(**chosen), ""
+    checked = MapSettings(**{**chosen, **{name: _SAFE[name] for name in automatic}, "strain": None})
+    target = _AUTOMATIC_ERROR if checked.error is None else SHARES["timestep"] * checked.error
+    notes = []
+    if "grains" in automatic:
+        if checked.error is None:
+            raise InputError("`grains='auto'` requires `error`.", field="grains", value="auto")
+        by_point = _grains_for(checked, checked.error)
+        chosen |= {"grains": max(by_point), "grains_by_point": by_point}
+        sizes = " to ".join(str(size) for size in sorted({min(by_point), max(by_point)}))
+        notes.append(f"{sizes} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}")
+    if "timestep" in automatic:
+        flows = stack_of_any_size(replace(checked, timestep=_SAFE["timestep"], strain=1.0).flows())
+        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, checked.activation, target)
         least = int(np.argmin(steps))
         chosen["timestep"] = float(two_digits(steps[least], up=False))
-        words.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
-    if isinstance(tolerance, str) and tolerance == "auto":
-        tolerance = float(two_digits(automatic_tolerance(target_error), up=False))
-        words.append(f"tolerance {tolerance:g}")
-    if tolerance is not None:
-        chosen["solver"] = replace(solver, tolerance=tolerance)
-    aim = f"{target_error:g} from the time step" if error is None else f"{error:g}"
-    return chosen, f"{'; '.join(words)}: for an error of {aim} in the stresses." if words else ""
+        notes.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
+    if "tolerance" in automatic:
+        chosen["tolerance"] = float(two_digits(automatic_tolerance(target), up=False))
+        notes.append(f"tolerance {chosen['tolerance']:g}")
+    aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
+    return MapSettings(**chosen), f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
+
+
+def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:
+    """The number of grains that each point needs for its share of an error."""
+    points = [(nu, alpha) for nu, alpha in product(settings.packing_fraction, settings.restitution)]
+    grains = [fewest_grains(alpha, nu, SHARES["size"] * error) for nu, alpha in points]
+    if max(grains) > MAX_GRAINS:
+        surely = MAX_GRAINS / 2**0.5  # numbers of grains are chosen in steps of √2
+        least = max(float(size_error(alpha, nu, surely)) for nu, alpha in points) / SHARES["size"]
+        reason = f"must be at least {two_digits(least, up=True)} at these points, to need at most {MAX_GRAINS} grains"
+        raise refused("error", error, reason)
+    return tuple(grains) * len(settings._timesteps)
+
+
+def _with_tolerance(solver: Any, tolerance: Any) -> Any:
+    """The solver with a given tolerance, or its own without one."""
+    solver = DEFAULT_SOLVER if solver is None else solver
+    require_solver(solver)
+    return solver if tolerance is None else replace(solver, tolerance=tolerance)
+
+
+def _require_axis(name: str, values: Any) -> None:
+    """Raise an InputError unless these are sorted numbers."""
+    if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
+        raise refused(name, values, f"must be a list of at most {MAX_REPLICAS} numbers")
+    if len(values) == 0:
+        raise refused(name, [], "must be a list of at least one number")
+    if not all(isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values):
+        raise refused(name, values, "must be a list of numbers")
+    if len(set(values)) < len(values) or list(values) not in (sorted(values), sorted(values)[::-1]):
+        raise refused(name, list(values), "must be sorted and without repetition")
+
+
+def _plain(value: Any, kind: Any) -> Any:
+    """A number as a Python number, a list or array of numbers as a tuple; ``MapSettings`` checks all other values.
+
+    Whole numbers of a list become floats unless ``kind`` is int.
+    """
+    try:
+        if isinstance(value, np.ma.MaskedArray) or (isinstance(value, Sequence) and len(value) > MAX_REPLICAS):
+            return value
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # a random key, or lists of different lengths
+        return value
+    real = array.ndim and array.dtype.kind in "iu" and kind is not int
+    plain = array.astype(float).tolist() if real else array.tolist()
+    return tuple(plain) if isinstance(plain, list) else plain
 
 
 def _temperature(flows: ShearFlow) -> np.ndarray:
@@ -224,6 +243,6 @@ def _temperature(flows: ShearFlow) -> np.ndarray:
 
 
 def _point(flows: ShearFlow, k: int) -> str:
-    """Flow ``k`` of a batch in words."""
+    """Restitution and packing fraction of flow ``k`` of a batch, for a message."""
     alpha, nu = (float(np.asarray(x)[k]) for x in (flows.restitution, flows.packing_fraction))
     return f"restitution {alpha:g} and packing fraction {nu:g}"

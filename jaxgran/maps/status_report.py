@@ -1,4 +1,4 @@
-"""What went wrong at the points of a map, in words: for the command line, and for the warnings of ``ratio_map``."""
+"""What went wrong at the points of a map: sentences for the command line and for the warnings of ``ratio_map``."""
 
 import math
 
@@ -9,8 +9,12 @@ from jaxgran.sampling.correlation_strain import FEWEST_CORRELATION_STRAINS
 _MOST_NAMED = 6  # points of a map in one sentence
 
 
+class BadPoints(UserWarning):
+    """Points of a map have a bad status, or their samples are short."""
+
+
 def bad_points(data: MapData) -> dict[str, list[str]]:
-    """The points whose status is not ok, in words, by the name of the status."""
+    """Descriptions of the points whose status is not ok, by the name of the status."""
     names = dict(
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
     )
@@ -26,22 +30,24 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
     return bad
 
 
-def in_words(bad: dict[str, list[str]]) -> str:
-    """The bad points by status, and what each status means; remedies are named as on the command line."""
-    words = "; ".join(f"{name.replace('_', ' ')}: {_some(points)}" for name, points in bad.items())
-    meanings = (f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS)
-    return f"{words}. What that means: {'; '.join(meanings)}."
+def format(data: MapData, bad: dict[str, list[str]]) -> str:
+    """How many points have a bad status, which ones, and what to do."""
+    failed = sum(map(len, bad.values()))
+    count = "the flow" if data.status.size == 1 else f"{failed} of {data.status.size} points"
+    parts = [f"{name.replace('_', ' ')} at {_some(points)}" for name, points in bad.items()]
+    hints = [f"{name.replace('_', ' ')}: {MEANINGS[name]}" for name in bad if name in MEANINGS]
+    return f"{count} failed: {'; '.join(parts)}. Meaning: {'; '.join(hints)}."
 
 
-def short_in_words(data: MapData, points: list[str], option: str) -> str:
-    """Which samples are shorter than a few memories, and the strain that would do, by ``option`` and the number."""
+def format_short(data: MapData, points: list[str]) -> str:
+    """Which samples are shorter than a few correlation strains, and the strain that they need."""
     code = data.status.attrs["flag_meanings"].split().index("short_sample")
     short = data.status == data.status.attrs["flag_values"][code]
     enough = FEWEST_CORRELATION_STRAINS * float(data.correlation_strain.where(short).max())
     which = "" if data.status.size == 1 else f" at {_some(points)}"
     return (
-        f"short sample{which}: it lasts less than {FEWEST_CORRELATION_STRAINS:g} correlation strains of the flow, so "
-        f"its errors may be too small. Add {option}{math.ceil(enough)}."
+        f"short sample{which}: less than {FEWEST_CORRELATION_STRAINS:g} correlation strains, so its errors may be too "
+        f"small; set `strain={math.ceil(enough)}`."
     )
 
 

@@ -1,5 +1,6 @@
 """Checks of user input: an InputError says in one sentence what is accepted."""
 
+from collections.abc import Callable, Sequence
 from reprlib import Repr
 from typing import Any
 
@@ -7,13 +8,38 @@ import numpy as np
 
 
 class InputError(ValueError):
-    """A mistake in the user's input; the message is one sentence that says what is accepted."""
+    """Input that is not accepted; the message is one sentence that says what is.
+
+    Parameter names in the message stand in backticks, unless the message begins with the name of ``field``. So a caller
+    with other names for the parameters, such as the command line, can replace them.
+
+    Attributes:
+      field: the parameter at fault, or "".
+      value: what was given for it.
+      reason: what is wrong with it, such as "must be between 0 and 1", or "".
+    """
+
+    def __init__(self, message: str, *, field: str = "", value: Any = None, reason: str = ""):
+        super().__init__(message)
+        self.field, self.value, self.reason = field, value, reason
+
+    def __reduce__(self):  # errors of worker processes are pickled
+        return _input_error, (str(self), self.field, self.reason)
+
+
+def _input_error(message: str, field: str, reason: str) -> InputError:
+    return InputError(message, field=field, reason=reason)
+
+
+def refused(field: str, value: Any, reason: str) -> InputError:
+    """The error of a parameter whose value is not accepted: "FIELD REASON, not VALUE."."""
+    return InputError(f"{field} {reason}, not {short_repr(value)}.", field=field, value=value, reason=reason)
 
 
 def concrete_or_none(value: Any) -> np.ndarray | None:
     """The value as an array; None while JAX traces it.
 
-    What is neither a number nor an array of numbers becomes ``array(None)``, which no check accepts.
+    Anything but a number or an array of numbers becomes ``array(None)``, which no check accepts.
     """
     if isinstance(value, (bool, int, float)):
         return np.asarray(value)
@@ -24,7 +50,7 @@ def concrete_or_none(value: Any) -> np.ndarray | None:
         return None
     key = isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended)
     number = isinstance(value, (np.generic, np.ndarray, jax.Array)) and not key
-    number = number and not isinstance(value, np.ma.MaskedArray)  # masked values have no meaning
+    number = number and not isinstance(value, np.ma.MaskedArray)  # its mask would be ignored
     return np.asarray(value if number else None)
 
 
@@ -46,13 +72,20 @@ def short_repr(value: Any) -> str:
         return f"this {type(value).__name__}"
 
 
-def require(name: str, value, accepts, words: str) -> None:
-    """Raise an InputError with ``words`` unless all numbers of ``value`` are accepted; traced values pass."""
+def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
+    """Raise an InputError unless all numbers of ``value`` are accepted; traced values pass.
+
+    Args:
+      name: the parameter.
+      value: a number or an array of numbers.
+      accepts: whether numbers are accepted, as a function of an array.
+      accepted: the same in words, such as "between 0 and 1".
+    """
     numbers = concrete_or_none(value)
     if numbers is None:
         return
     if numbers.dtype.kind not in "iuf" or numbers.size == 0 or not np.all(accepts(numbers)):
-        raise InputError(f"{name} must be {words}, not {short_repr(value)}.")
+        raise refused(name, value, f"must be {accepted}")
 
 
 def as_array(values: Any) -> Any:
@@ -64,26 +97,38 @@ def as_array(values: Any) -> Any:
     return np.asarray(values, float) if numbers else values
 
 
-def require_number(name: str, value, accepts, words: str) -> None:
+def require_number(name: str, value: Any, accepts: Callable, accepted: str) -> None:
     """The check ``require`` for a single number."""
-    require(name, value, lambda x: (x.ndim == 0) & accepts(x), words)
+    require(name, value, lambda x: (x.ndim == 0) & accepts(x), accepted)
 
 
-def require_whole(name: str, value: Any, least: int, most: int, why: str) -> None:
-    """Raise an InputError unless the value is a whole number in [least, most]; ``why`` explains the upper limit."""
+def require_whole(name: str, value: Any, least: int, most: int, because: str = "") -> None:
+    """Raise an InputError unless the value is a whole number in [least, most]; ``because`` explains the upper limit."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise InputError(f"{name} must be a whole number of at least {least}, not {short_repr(value)}.")
+        raise refused(name, value, f"must be a whole number of at least {least}")
     if value > most:
-        raise InputError(f"{name} must be at most {most}, {why}, not {short_repr(value)}.")
+        raise refused(name, value, f"must be at most {most}{', ' if because else ''}{because}")
+
+
+def require_flag(name: str, value: Any) -> None:
+    """Raise an InputError unless the value is True or False."""
+    if not isinstance(value, bool):
+        raise refused(name, value, "must be True or False")
+
+
+def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Raise an InputError unless the value is one of several words."""
+    if not isinstance(value, str) or value not in choices:
+        raise refused(name, value, f"must be {', '.join(choices[:-1])} or {choices[-1]}")
 
 
 def require_untraced(name: str, instead: str, *values: Any) -> None:
-    """Raise an InputError where JAX traces values of what is computed in Python; ``instead`` says what to do."""
+    """Raise an InputError if JAX traces a value that is needed in Python; ``instead`` says what to do."""
     import jax
     from jax.core import Tracer
 
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
-        raise InputError(f"{name} is not transformed by jax.jit, jax.vmap, jax.grad and their kin: {instead}.")
+        raise InputError(f"{name} cannot be transformed by jax.jit, jax.vmap or jax.grad: {instead}.")
 
 
 def require_key(key: Any) -> None:

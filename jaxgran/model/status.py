@@ -13,7 +13,7 @@ class Status(IntEnum):
 
     ok = 0
     iteration_limit = 1  # a contact solve ended above the tolerance
-    short_sample = 2  # the sample lasts only a few memories of the flow, so its errors may be too small
+    short_sample = 2  # the sample lasts only a few correlation strains, so its errors may be too small
     not_steady = 3  # the flow was not shown to be steady
     deep_overlap = 4  # more than a tenth of the contacts overlapped by more than 1e-2 mean diameters
     infeasible = 5  # no impulses satisfy the contact law: the packing is jammed
@@ -27,13 +27,13 @@ DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by 
 
 MEANINGS = {
     "iteration_limit": "some contact solve ended above the tolerance",
-    "short_sample": "the sample lasts only a few memories of the flow, so its errors may be too small",
-    "not_steady": "temperature or pressure still drifted, sample a longer strain or prepare longer with --equilibrate",
+    "short_sample": "the sample lasts only a few correlation strains, so its errors may be too small",
+    "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by `equilibrate`",
     "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
     "infeasible": "no impulses satisfy the contact law, the packing is jammed",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
-    "failed": "its processes died again and again, perhaps for lack of memory; add --resume to try once more",
-    "not_run": "the point is missing",
+    "failed": "its processes died again and again, perhaps for lack of memory; pass `resume=True` to try once more",
+    "not_run": "the point was not run",
 }
 """What each status means for a user, and what to do."""

@@ -2,14 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from jaxgran.maps.parameters import options
 from jaxgran.maps.schema import FINEST, MapData, require_map
 from jaxgran.model.checks import InputError
-from jaxgran.model.choices import Activation, EngineName, SolverName
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
 from jaxgran.plotting.encoding import EXCESS_LEVELS
@@ -31,7 +31,7 @@ _TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_ci95")
 _GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
 _LEFT_OUT = ("status", "point_grains")
-_NAMED = {"activation": get_args(Activation), "solver": get_args(SolverName), "engine": get_args(EngineName)}
+_NAMED = {name: one.kind for name, one in options("map").items() if isinstance(one.kind, tuple)}  # choices of a run
 _SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
 
 
@@ -209,18 +209,18 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     """
     if not {"seeds", "tolerance", *_NAMED} <= data.attrs.keys() | {"engine"} or "seeds/strain" not in data:
         return None
-    options = {}
+    chosen = {}
     for name, accepted in _NAMED.items():
         value = data.attrs.get(f"{name}_requested", data.attrs.get(name, accepted[0]))
         if value not in accepted:
             return None
-        options[name] = value
+        chosen[name] = value
     try:
-        options["tolerance"] = f"{float(data.attrs['tolerance']):g}"
+        chosen["tolerance"] = f"{float(data.attrs['tolerance']):g}"
         seeds = int(data.attrs["seeds"])
     except (TypeError, ValueError):
         return None
-    words = [f"--{name} {value}" for name, value in options.items() if value != "auto"]
+    words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
     strain = _column(data["seeds/strain"].mean("seed"), data, dims)
     return {"seeds": seeds, "options": " ".join(words), "strain": _numbers(strain)}
 

@@ -1,0 +1,80 @@
+"""Batches of a map: replicas of one number of grains and of similar cost, the most expensive first.
+
+So no core waits long at the end. The numbers of a replica do not depend on its batch.
+"""
+
+import math
+from collections.abc import Container
+from typing import Literal
+
+import jax
+
+from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.replica import Key
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.batch import in_lockstep
+
+_LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
+_PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs
+_GRAIN_BYTES = 2500  # of memory for each grain: lists, network and state; grains are rounded up to a power of two
+_SHARE_OF_MEMORY = 0.5  # of a device, for one batch
+_DEFAULT_MEMORY = 8 * 2**30  # bytes of a device that does not report its memory
+_LARGEST_COST_RATIO = 2  # between replicas that advance in lockstep
+
+
+def predicted_cost(flow: ShearFlow) -> float:
+    """Relative cost of a unit of strain of a flow, a fit to measured times.
+
+    The cost is proportional to the number of grains. Dense and dissipative flows form contact networks; the second
+    factor is their cost at dt = 1e-3. Steps without a contact are jumped over, so ten times as many steps cost little
+    more than twice as much.
+    """
+    alpha, nu, dt = (float(x) for x in (flow.restitution, flow.packing_fraction, flow.timestep))
+    return flow.grains * (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
+
+
+def remaining_batches(
+    settings: MapSettings, size: int | Literal["auto"], workers: int, checkpoint: Checkpoint | None
+) -> list[list[Key]]:
+    """The batches that a checkpoint does not have yet, the interrupted ones first."""
+    if checkpoint is None:
+        return batches(settings, size, workers)
+    interrupted = checkpoint.journals()
+    excluded = {*checkpoint.done, *(key for task in interrupted for key in task)}
+    return interrupted + batches(settings, size, workers, excluded)
+
+
+def batches(
+    settings: MapSettings, size: int | Literal["auto"], workers: int, without: Container[Key] = ()
+) -> list[list[Key]]:
+    """The replicas in batches of one number of grains and of similar cost, the most expensive first."""
+    flows = settings.flows()
+    costs = [predicted_cost(flow) for flow in flows]
+    order = sorted(range(len(costs)), key=lambda point: -costs[point])
+    lockstep = in_lockstep(settings.engine)
+    tasks: list[list[Key]] = []
+    for grains in {flow.grains: None for flow in flows}:
+        points = [point for point in order if flows[point].grains == grains]
+        keys = [(point, seed) for point in points for seed in range(settings.seeds) if (point, seed) not in without]
+        most = batch_size(grains, len(keys), workers) if size == "auto" and keys else size
+        alike: list[list[Key]] = []
+        for key in keys:
+            full = not alike or len(alike[-1]) == most
+            if full or (lockstep and costs[key[0]] < costs[alike[-1][0][0]] / _LARGEST_COST_RATIO):
+                alike.append([])
+            alike[-1].append(key)
+        tasks += alike
+    return sorted(tasks, key=lambda task: -costs[task[0][0]])
+
+
+def batch_size(grains: int, count: int, workers: int) -> int:
+    """Replicas of a batch: a few on a CPU, as many as fit into half the memory on an accelerator."""
+    devices, device = jax.device_count(), jax.local_devices()[0]
+    if device.platform == "cpu":
+        largest = max(min(devices, count), min(_LARGEST_CPU_BATCH * devices, count // (8 * workers)))
+        # equal batches: a smaller last one would compile again
+        return next(size for size in range(largest, 0, -1) if count % size == 0)
+    memory = (device.memory_stats() or {}).get("bytes_limit", _DEFAULT_MEMORY)
+    per_replica = _GRAIN_BYTES * max(64, 1 << (grains - 1).bit_length()) + _PAIR_BYTES * min(grains, 512) ** 2
+    return int(max(1, min(count, _SHARE_OF_MEMORY * memory * devices / per_replica)))
