@@ -269,7 +269,9 @@ def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, fo
 def test_gradients_of_a_batch_are_those_of_its_replicas(tilting, derivative, score_of, events_of):
     at, events = parameters(*tilting), events_of(STEPS)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), at) | {"restitution": jnp.asarray([0.6, 0.3])}
-    one = jax.grad(lambda values: score_of(exact_advance(*changed(*tilting, values), jnp.int32(STEPS), events)[0]))
+    one = jax.grad(
+        lambda values: score_of(exact_advance(*changed(*tilting, values), jnp.int32(STEPS), True, events)[0])
+    )
     found = jax.jit(jax.vmap(one, axis_name="replica"))(batch)
     for name in NAMES:
         scale = float(jnp.max(jnp.abs(derivative[1][name]))) + 1
