@@ -158,7 +158,7 @@ def row(duration: float, runs: int, folder: Path) -> dict:
                 words = [sys.executable, "-m", "jaxgran", "fit", path.name, *name.split()]
                 done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
                 printed[name] = done.stdout + done.stderr
-            tracks = jg.read_tracks(path, every=way.every)
+            tracks = jg.read_tracks(path, stride=way.every)
             if way.positions_alone:
                 tracks = replace(tracks, velocities=np.full_like(tracks.velocities, np.nan))
             try:

@@ -97,7 +97,7 @@ def configure_jax() -> None:
     """Keep whatever is compiled."""
     import jax
 
-    from jaxgran import persistent_jit
+    from jaxgran.cache import persistent_jit
 
     jax.config.update("jax_compilation_cache_dir", str(compiled_programs()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)

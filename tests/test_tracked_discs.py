@@ -15,7 +15,7 @@ from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "notebooks" / "tracked_discs.csv"
 PAGE = (ROOT / "docs" / "how-to" / "tracked-discs.md").read_text(encoding="utf-8")
-QUICK = {"fit positions.csv", "fit tracked_discs.csv --every 4"}  # fitted in every run
+QUICK = {"fit positions.csv", "fit tracked_discs.csv --stride 4"}  # fitted in every run
 FITS = re.findall(r"^\| `jaxgran (fit \w+\.csv[^`]*)` \| ([^|]+) \| ([^|]+) \| (\d+) \|$", PAGE, re.MULTILINE)
 
 

@@ -41,7 +41,7 @@ def fit_command(
     ] = None,
     peculiar: Annotated[bool, typer.Option("--peculiar", help="The velocities of the tracks lack the shear.")] = False,
     diameter: Annotated[float | None, typer.Option(help="Of all discs, where the tracks have none.")] = None,
-    every: Annotated[
+    stride: Annotated[
         int | None, typer.Option(help="Use each N-th frame of the tracks only, where contacts outlast a frame.")
     ] = None,
     position_noise: Annotated[
@@ -67,12 +67,12 @@ def fit_command(
     of_map = [name for name, value in stresses.items() if value is not None]
     of_file = {"shear_rate": shear_rate, "frame_strain": frame_strain, "frame_time": frame_time, "diameter": diameter}
     noise = {"position_noise": position_noise, "velocity_noise": velocity_noise, "diameter_noise": diameter_noise}
-    others = {"peculiar": peculiar or None, "every": every}
+    others = {"peculiar": peculiar or None, "stride": stride}
     of_tracks = [name for name, value in (of_file | noise | others).items() if value is not None]
     if file.suffix != ".nc":
         if of_map:
             raise InputError(f"{of_map[0]} goes with a map, and {short_repr(file.name)} is not one.")
-        thinned = {} if every is None else {"every": every}
+        thinned = {} if stride is None else {"stride": stride}
         _fit_tracks(file, _observed(peculiar=peculiar, **of_file) | thinned, noise)
     else:
         if of_tracks:
@@ -111,7 +111,7 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
     tracks = read_tracks(file, **observed)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "the interval may not hold")  # it is said below
+            warnings.filterwarnings("ignore", "the interval may be too narrow")  # printed below
             found = fit_restitution(tracks, **noise)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)

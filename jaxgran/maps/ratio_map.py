@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.io.atomic import CorruptFile, require_place
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
@@ -34,7 +35,6 @@ from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.choices import MAX_REPLICAS, Activation, Engine, Solver
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.persistent_jit import persistent_jit
 from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper, Report, advance_batch, in_lockstep, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch

@@ -17,6 +17,7 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.advance import advance, register_numba
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
@@ -24,7 +25,6 @@ from jaxgran.model.choices import Engine
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.persistent_jit import persistent_jit
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
 AdvanceBatch = Callable[[ShearFlow, State, Array], tuple[State, Tally]]  # advances each replica by its number of steps
