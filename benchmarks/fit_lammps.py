@@ -48,7 +48,7 @@ DUMP = "id x y vx vy radius"
 class Way(NamedTuple):
     """How a dump is fitted."""
 
-    every: int
+    stride: int
     noise: dict[str, float]
     positions_alone: bool = False
 
@@ -56,9 +56,9 @@ class Way(NamedTuple):
 NOISE = {"position_noise": 1e-3, "velocity_noise": 5e-3}  # σ and σ/t: what a contact of some duration is off by
 WAYS = {  # by the options of the command
     "": Way(1, {}),
-    "--every 3": Way(3, {}),
-    "--every 3 --position-noise 0.001 --velocity-noise 0.005": Way(3, NOISE),
-    "--every 3 --position-noise 0.001, positions alone": Way(3, {"position_noise": 1e-3}, True),
+    "--stride 3": Way(3, {}),
+    "--stride 3 --position-noise 0.001 --velocity-noise 0.005": Way(3, NOISE),
+    "--stride 3 --position-noise 0.001, positions alone": Way(3, {"position_noise": 1e-3}, True),
 }
 
 
@@ -158,7 +158,7 @@ def row(duration: float, runs: int, folder: Path) -> dict:
                 words = [sys.executable, "-m", "jaxgran", "fit", path.name, *name.split()]
                 done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
                 printed[name] = done.stdout + done.stderr
-            tracks = jg.read_tracks(path, stride=way.every)
+            tracks = jg.read_tracks(path, stride=way.stride)
             if way.positions_alone:
                 tracks = replace(tracks, velocities=np.full_like(tracks.velocities, np.nan))
             try:

@@ -72,8 +72,8 @@ class TrackNoise:
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None or field.name != "velocity":
-                words = "a number of at least 0" + (" or None" if field.name == "velocity" else "")
-                require_number(field.name, value, lambda x: (x >= 0) & np.isfinite(x), words)
+                accepted = "a number of at least 0" + (" or None" if field.name == "velocity" else "")
+                require_number(field.name, value, lambda x: (x >= 0) & np.isfinite(x), accepted)
 
 
 @dataclass(frozen=True)

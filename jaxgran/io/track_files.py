@@ -270,9 +270,9 @@ def _numbers(name: str, column: np.ndarray) -> np.ndarray:
     try:
         numbers = np.asarray(column, float)
     except (TypeError, ValueError):
-        words = [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in column.ravel()]
-        numeric: Any = pd.to_numeric(pd.Series(words), errors="coerce")
-        bad = np.array(words)[np.isnan(np.asarray(numeric, float))]
+        entries = [x.decode(errors="replace") if isinstance(x, bytes) else str(x) for x in column.ravel()]
+        numeric: Any = pd.to_numeric(pd.Series(entries), errors="coerce")
+        bad = np.array(entries)[np.isnan(np.asarray(numeric, float))]
         raise InputError(f"the column {name} has {short_repr(str(bad[0])[:30])}, which is not a number") from None
     if numbers.ndim != 1:
         raise InputError(f"the column {name} is not one-dimensional")
