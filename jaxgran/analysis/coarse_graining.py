@@ -141,5 +141,10 @@ def heaviside(radius: float | Array) -> CoarseGraining:
 
 
 def _of_width(width: float | Array, kernel: Kernel) -> CoarseGraining:
-    require_number("the width of the coarse-graining", width, lambda x: (x > 0) & np.isfinite(x), "positive and finite")
+    require_number(
+        "the width of the coarse-graining",
+        width,
+        lambda x: (x > 0) & np.isfinite(x),
+        "positive and at most what fits into the cell",
+    )
     return CoarseGraining(width, kernel)
