@@ -49,7 +49,7 @@ DUMP = "id x y vx vy radius"
 class Way(NamedTuple):
     """How a dump is fitted."""
 
-    every: int
+    stride: int
     noise: dict[str, float]
     positions_alone: bool = False
 
@@ -149,7 +149,7 @@ def row(duration: float, runs: int, folder: Path) -> dict:
                 words = [sys.executable, "-m", "jaxgran", "fit", path.name, *name.split()]
                 done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
                 printed[name] = done.stdout + done.stderr
-            tracks = jg.read_tracks(path, every=way.every)
+            tracks = jg.read_tracks(path, stride=way.stride)
             if way.positions_alone:
                 tracks = replace(tracks, velocities=np.full_like(tracks.velocities, np.nan))
             try:

@@ -2,7 +2,7 @@
 
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
-from .caches import enable_cache
+from .cache.folder import enable_cache
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
     BarzilaiBorwein,

@@ -1,4 +1,4 @@
-"""Software and hardware of a run: versions, commit, processor, cores, memory, devices and precision."""
+"""Software and hardware of this process: versions, commit, processor, cores, memory, devices, precision."""
 
 import hashlib
 import os
@@ -11,12 +11,12 @@ from pathlib import Path
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
-    """The installed versions of packages, by name."""
+    """Installed versions by package name."""
     return {name: version(name) for name in packages}
 
 
 def commit() -> str:
-    """The commit of the repository that this package runs from; empty outside a repository."""
+    """Git commit of the repository that the package is imported from; "" outside a repository."""
     folder = Path(__file__).parents[1]
     if not (folder / ".git").exists():
         return ""
@@ -38,13 +38,13 @@ def processor() -> str:
 
 
 def processor_features() -> str:
-    """The list of the processor's instruction sets; its name on systems without such a list."""
+    """The instruction sets of the processor; its name where the system does not list them."""
     features = (line for line in processor_lines() if line.startswith(("flags", "Features")))
     return next(features, platform.processor())
 
 
 def processor_kind() -> str:
-    """A name for folders of compiled programs: processors with the same instruction sets have the same."""
+    """A short hash of the instruction sets, which names the cache folder of a kind of processor."""
     return hashlib.sha256(processor_features().encode()).hexdigest()[:12]
 
 
@@ -55,12 +55,12 @@ def processor_lines() -> list[str]:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def memory() -> str:
-    """The memory of the machine in GiB, or "unknown"."""
+    """Total memory in GiB, or "unknown"."""
     try:
         return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
     except (AttributeError, ValueError, OSError):
@@ -68,18 +68,18 @@ def memory() -> str:
 
 
 def devices() -> list[str]:
-    """Platform and kind of each JAX device; RuntimeError if there is none, or if a driver does not answer."""
+    """Platform and kind of each JAX device; RuntimeError if JAX finds none."""
     import jax
 
     try:
         return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    except (RuntimeError, AssertionError) as failure:  # JAX asserts that a platform it was asked for is there
-        why = " ".join(str(failure).split()).partition(" (set JAX_PLATFORMS")[0].rstrip(".")
-        raise RuntimeError(why or f"none is there for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}") from failure
+    except (RuntimeError, AssertionError) as failure:  # JAX asserts that a requested platform exists
+        message = " ".join(str(failure).split()).rstrip(".")
+        raise RuntimeError(message or f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')} has none") from failure
 
 
 def precision() -> str:
-    """The precision of JAX: float64 or float32."""
+    """JAX's default floating-point type: float64 or float32."""
     import jax
 
     return "float64" if jax.config.read("jax_enable_x64") else "float32"

@@ -1,10 +1,7 @@
-"""Files that exist whole or not at all, and those of a cache.
+"""Atomic writes, file locks, and cache files with a checksum.
 
-A file is written under a temporary name in its final folder, synced, and renamed. A process that is killed leaves the
-old file or the new one, never half of one.
-
-A file of a cache is read with its checksum, and the oldest are removed. Processes that miss the same file wait for the
-first of them, and then read what it has written.
+A file is written under a temporary name in its final folder, synced, and renamed. A killed process leaves either the
+old file or the new one, never a part of one.
 """
 
 import hashlib
@@ -16,15 +13,15 @@ from pathlib import Path
 
 try:
     import fcntl
-except ImportError:  # a system without such locks: every process writes the file
+except ImportError:  # a system without file locks: every process writes the file
     fcntl = None
 
-_DIGEST = 32  # bytes at the beginning of a file: the hash of what follows
+_DIGEST = 32  # bytes at the start of a cache file: the SHA-256 hash of the rest
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """The name of a temporary file to write beside ``path``; after success it replaces ``path``."""
+    """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block succeeds."""
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
@@ -39,12 +36,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def file_lock(path: Path) -> Iterator[None]:
-    """Wait until no other process is in this block for the same file; it leaves when it ends, however it ends."""
+    """Let one process at a time enter the block for a file; the lock is released even if the process dies."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = path.with_suffix(".lock").open("w")
-    except OSError:  # nothing can be kept there, so there is nothing to wait for
+    except OSError:  # the folder is not writable, so there will be no file to wait for
         yield
         return
     with lock:
@@ -58,31 +55,31 @@ def file_lock(path: Path) -> Iterator[None]:
 
 
 def read_cached(path: Path) -> bytes | None:
-    """The content of a file of a cache; None if there is none, or if it is damaged."""
+    """The content of a cache file; None if it is missing or damaged."""
     with suppress(OSError):
-        text = path.read_bytes()
-        if hashlib.sha256(text[_DIGEST:]).digest() == text[:_DIGEST]:
-            return text[_DIGEST:]
+        content = path.read_bytes()
+        if hashlib.sha256(content[_DIGEST:]).digest() == content[:_DIGEST]:
+            return content[_DIGEST:]
     return None
 
 
 def write_cached(path: Path, content: bytes, most: int) -> None:
-    """Write a file of a cache, and remove the oldest of its kind beside it if they are more than ``most``.
+    """Write a cache file, then remove the oldest files with its suffix beyond the newest ``most``.
 
     Raises:
-      OSError: the folder cannot be made, or not be written to.
+      OSError: the folder cannot be created or written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
     with suppress(OSError):
-        kept = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda one: one.stat().st_mtime, reverse=True)
-        for old in kept[most:]:
+        newest_first = sorted(path.parent.glob(f"*{path.suffix}"), key=lambda x: x.stat().st_mtime, reverse=True)
+        for old in newest_first[most:]:
             old.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file or a folder is on the disc."""
+    """Flush a file or a folder to disk."""
     handle = os.open(path, os.O_RDWR if path.is_file() else os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,8 +1,8 @@
-"""Standard errors of estimates from sums over blocks, correlations of errors and of blocks, the drift of a series.
+"""Standard errors of estimates from block sums, error correlations, statistical inefficiency, drift of a series.
 
-``standard_errors`` infers how long the blocks remember from the blocks themselves. Its intervals hold where a seed is
-several memories long. ``jackknife`` assumes that merged blocks are independent. Its errors are too small where few
-merged blocks are.
+``standard_errors`` infers the correlation time from the blocks themselves; its intervals have the stated coverage when
+each seed is several correlation times long. ``jackknife`` assumes that merged blocks are independent, and
+underestimates errors when few merged blocks are.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,23 +12,23 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # blocks in a group; with 32 blocks a seed, the last compares whole seeds
+BLOCK_MERGES = (1, 2, 4, 8, 16, 32)  # blocks per group; with 32 blocks per seed, the last compares whole seeds
 _FEWEST_GROUPS = 4  # the spread over fewer groups is too uncertain; single blocks are used in any case
-_MOST_BLOCKS = 32  # of a seed in ``standard_errors``; more are merged
-_MEMORIES = np.geomspace(0.2, 20, 12)  # of a series, in blocks
-_WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # of the variance of a block, which the next block does not remember
-_EXPECTED_MEMORY = 2.5  # blocks; longer ones are less and less likely before the blocks are seen
+_MOST_BLOCKS = 32  # per seed in ``standard_errors``; more are merged
+_TIMES = np.geomspace(0.2, 20, 12)  # correlation times, in blocks
+_WHITE_SHARES = np.array([0.0, 0.5, 0.9])  # share of white noise in the variance of a block
+_EXPECTED_TIME = 2.5  # blocks, beyond which the prior of the correlation time falls
 _LEVEL = 0.95  # of an interval of 1.96 standard errors
 _NORMAL_QUANTILE = 1.959964
 _NEWTON_STEPS = 4
-_MOST_FREEDOM = 2000  # degrees of freedom, from where Student's distribution is Gaussian
+_MOST_FREEDOM = 2000  # degrees of freedom beyond which Student's distribution counts as Gaussian
 Estimates = dict[str, np.ndarray]
 
 
 class _Posterior(NamedTuple):
-    """What is known about n means: a mixture of Student's t distributions over the (models,) of the correlation.
+    """Posterior of n means: a mixture of Student's t distributions, one for each of the (models,) of the correlation.
 
-    ``shift`` is the mean of a model less the plain mean, and ``width`` its scale, both (models, n), as ``weight``.
+    ``weight``, ``shift`` (mean of a model minus the plain mean) and ``width`` (its scale) have shape (models, n).
     """
 
     weight: np.ndarray
@@ -40,52 +40,53 @@ class _Posterior(NamedTuple):
 def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
-    The error is the half-width of the 95 % interval over 1.96. So two errors are an interval that holds, also where few
-    blocks are independent and Student's distribution is wide. The series of an estimate is the influence of each block,
-    from the jackknife. It is a mean plus Gaussian noise with the correlation
+    The error is the half-width of the 95 % interval divided by 1.96, so ±1.96 errors is a 95 % interval even if few
+    blocks are independent and Student's distribution is wide. The jackknife influence of each block makes a series,
+    modelled as a mean plus Gaussian noise with the correlation
 
         R_ij = (1 - w) exp(-|i - j| / t) + w δ_ij
 
-    within a seed, and none between seeds: a first-order autoregressive process plus white noise. The memory t, in
-    blocks, and the white share w are not known. For given (t, w), with flat priors of the mean and of ln σ, the mean is
-    distributed as Student's t with M - 1 degrees of freedom for M blocks in all. Its centre is the generalised
-    least-squares mean μ = 1'R⁻¹x / 1'R⁻¹1, its scale is S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ), and its
-    weight is |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 memories from 0.2 to 20
-    blocks and three white shares, around the plain mean. The prior is t^(1/4) / (1 + (t/2.5)²) in ln t and flat in w.
+    within a seed and none between seeds: a first-order autoregressive process plus white noise. The correlation time
+    t, in blocks, and the share w of white noise are unknown. For given (t, w), with flat priors for the mean and for
+    ln σ, the mean has a Student's t distribution with M - 1 degrees of freedom for M blocks in all. Its centre is the
+    generalised least-squares mean μ = 1'R⁻¹x / 1'R⁻¹1, its scale S / √((M - 1) 1'R⁻¹1) with S² = (x - μ)'R⁻¹(x - μ),
+    and its weight |R|^(-1/2) (1'R⁻¹1)^(-1/2) S^(1 - M). The interval is that of the mixture over 12 correlation times
+    from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4) / (1 + (t/2.5)²) in ln t
+    and flat in w.
 
-    With 32 blocks of a seed, intervals of sheared flows hold where a seed is eight memories of the flow long or more,
-    and those of most flows from four (``python -m benchmarks coverage``).
+    With 32 blocks per seed, intervals for sheared flows have their nominal coverage if a seed is at least eight
+    correlation strains long, and for most flows from four (``python -m benchmarks coverage``).
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to named estimates with the same leading axes.
+      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks,
-      and zero where all blocks are equal.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for fewer than two blocks,
+      and zero if all blocks are equal.
 
     Examples:
-      Eight blocks that drift. Independent blocks would have an error of 0.87.
+      Eight blocks with a trend. Independent blocks would have an error of 0.87.
 
       >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
       >>> value, error = standard_errors(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
       >>> float(value["mean"]), round(float(error["mean"]), 1)
       (4.5, 2.4)
     """
-    whole, influence, scale, named = _influences(estimate, sums)
+    whole, influence, scale, by_name = _influences(estimate, sums)
     if influence.shape[0] * influence.shape[1] < 2:
-        return named(whole), named(np.full_like(whole, np.nan))
-    return named(whole), named(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
+        return by_name(whole), by_name(np.full_like(whole, np.nan))
+    return by_name(whole), by_name(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
 
 
 def error_correlation(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> np.ndarray:
-    """Correlation (n, n) of the errors of n scalar estimates: that of the influences of the blocks on them.
+    """Correlation matrix (n, n) of the errors of n scalar estimates, from the influences of the blocks.
 
     Args:
       estimate, sums: as in ``standard_errors``.
 
     Returns:
-      The matrix in the order of the estimates; NaN where an estimate does not vary.
+      The matrix in the order of the estimates; NaN for an estimate that does not vary.
     """
     _, influence, _, _ = _influences(estimate, sums)
     flat = influence.reshape(-1, influence.shape[-1])
@@ -97,20 +98,19 @@ def error_correlation(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -
 def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
-    Every estimate is a function of sums, usually a ratio. Its error comes from leaving out one block at a time.
-    Successive blocks are correlated, and groups of up to 32 merged blocks are less so. The error returned is the
-    largest over the group sizes that leave at least four groups (the blocking method: Flyvbjerg and Petersen,
-    J. Chem. Phys. 91, 461, 1989).
+    An estimate is a function of sums, usually a ratio. Its error comes from leaving out one group of blocks at a time.
+    Successive blocks are correlated, larger groups less so: the error returned is the largest over group sizes up to
+    32 that leave at least four groups (the blocking method: Flyvbjerg and Petersen, J. Chem. Phys. 91, 461, 1989).
 
     Args:
-      estimate: maps a pytree of sums with any leading axes to named estimates with the same leading axes.
+      estimate: maps a pytree of sums with any leading axes to by_name estimates with the same leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN with fewer than two blocks.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for fewer than two blocks.
 
     Examples:
-      Eight blocks that drift. Independent blocks would have an error of 0.87. Merged in pairs they have a larger one.
+      Eight blocks with a trend. Independent blocks would have an error of 0.87; pairs of blocks have a larger one.
 
       >>> blocks = {"x": np.arange(1.0, 9.0)[None], "steps": np.ones((1, 8))}
       >>> value, error = jackknife(lambda sums: {"mean": sums["x"] / sums["steps"]}, blocks)
@@ -120,37 +120,36 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     merges = [m for m in BLOCK_MERGES if seeds * (blocks // m) >= (2 if m == 1 else _FEWEST_GROUPS)]
     edges = np.cumsum([1, *(seeds * (blocks // m) for m in merges)])
-    flat, named = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
+    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), sums)))
     spreads = [np.full_like(flat[0], np.nan), *(_spread(part) for part in np.split(flat, edges)[1:-1])]
-    return named(flat[0]), named(np.fmax.reduce(spreads))
+    return by_name(flat[0]), by_name(np.fmax.reduce(spreads))
 
 
 def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> Estimates:
-    """Number of successive blocks that count as one independent sample, for every estimate; at least one.
+    """Statistical inefficiency: the number of successive blocks that count as one independent sample, at least one.
 
-    It is the statistical inefficiency g = 1 + 2 Σ (1 − k/B) ρ_k: n blocks are worth n/g independent samples. ρ_k is the
-    autocorrelation at lag k of the B blocks of a seed, averaged over the seeds. It is that of the influence of each
-    block on the estimate, from the jackknife. The sum ends before the first pair ρ_2k + ρ_2k+1 that is not positive
-    (C. J. Geyer, Stat. Sci. 7, 473, 1992), because later terms are only noise. A series that is not many times longer
-    than g gives too small a value: with 32 blocks it is 3 instead of 4, and 4.6 instead of 9.
+    g = 1 + 2 Σ (1 − k/B) ρ_k, where ρ_k is the autocorrelation at lag k of the jackknife influences of the B blocks of
+    a seed, averaged over seeds: n blocks are worth n/g independent samples. The sum ends before the first pair
+    ρ_2k + ρ_2k+1 that is not positive, since later terms are noise (C. J. Geyer, Stat. Sci. 7, 473, 1992). A series
+    not many times longer than g underestimates it: 32 blocks give 3 instead of 4, and 4.6 instead of 9.
 
     Args:
       estimate, sums: as in ``jackknife``.
 
     Returns:
-      Lengths in blocks, NaN with fewer than four blocks a seed.
+      g of each estimate, in blocks; NaN for fewer than four blocks per seed.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    flat, named = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_merged(x, 1)), sums)))
-    return named(_inefficiency(flat.reshape(seeds, blocks, -1)))
+    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_merged(x, 1)), sums)))
+    return by_name(_inefficiency(flat.reshape(seeds, blocks, -1)))
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
-    """Difference of the means of the second and first half of a series, and its standard error.
+    """Mean of the second half of a series minus that of the first half, and its standard error.
 
     The error includes the correlation of neighbouring values: the variance of a mean is multiplied by
-    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series gives too
-    small a ρ, so it is limited to the range from ``least_correlation`` to 0.9. The series has at least four values.
+    (1 + ρ)/(1 − ρ), with ρ the lag-one autocorrelation of the halves about their own means. A short series
+    underestimates ρ, so it is clipped to the range from ``least_correlation`` to 0.9. The series needs four values.
     """
     half = len(series) // 2
     halves = np.stack([series[:half], series[-half:]])
@@ -166,30 +165,31 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
 def _influences(
     estimate: Callable[[Any], Mapping[str, Any]], sums: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """All estimates (n,), influences of at most ``_MOST_BLOCKS`` blocks (seeds, blocks, n), their scale, and names.
+    """Estimates (n,), influences of at most ``_MOST_BLOCKS`` blocks a seed (seeds, blocks, n), scale, ``by_name``.
 
-    The influence of a block is n_blocks θ - (n_blocks - 1) θ without the block, less the mean of all, over the scale.
+    The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one without the block,
+    for B blocks in all, divided by the scale (its root mean square).
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
     fewer = min(blocks, _MOST_BLOCKS)
     first = np.arange(fewer) * blocks // fewer
     merged = jax.tree.map(lambda x: np.add.reduceat(x, first, axis=1), sums)
     merges = [1] if seeds * fewer > 1 else []
-    flat, named = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), merged)))
+    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), merged)))
     without = flat[1:].astype(float) if merges else np.full(flat.shape, np.nan)
     influence = (seeds * fewer - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
     influence = influence / np.where(scale > 0, scale, 1)
-    return flat[0], influence.reshape(seeds, fewer, -1), scale, named
+    return flat[0], influence.reshape(seeds, fewer, -1), scale, by_name
 
 
 @lru_cache(maxsize=_MOST_BLOCKS)
 def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eigenvectors (memories, blocks, modes), eigenvalues (memories, white, modes) and logarithm of the prior."""
+    """Eigenvectors (times, blocks, modes), eigenvalues (times, white, modes) and logarithm of the prior."""
     lag = np.abs(np.subtract.outer(np.arange(blocks), np.arange(blocks)))
-    values, vectors = np.linalg.eigh(np.exp(-lag / _MEMORIES[:, None, None]))
+    values, vectors = np.linalg.eigh(np.exp(-lag / _TIMES[:, None, None]))
     eigenvalues = (1 - _WHITE_SHARES[:, None]) * values[:, None] + _WHITE_SHARES[:, None]
-    prior = np.log(_MEMORIES**0.25 / (1 + (_MEMORIES / _EXPECTED_MEMORY) ** 2))
+    prior = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
     return vectors, eigenvalues, np.repeat(prior, len(_WHITE_SHARES))
 
 
@@ -199,7 +199,7 @@ def _posterior(series: np.ndarray) -> _Posterior:
     vectors, eigenvalues, prior = _correlation_models(blocks)
     models, freedom = len(prior), seeds * blocks - 1
     flat = series.transpose(1, 0, 2).reshape(blocks, -1)
-    modes = vectors.swapaxes(1, 2) @ flat  # (memories, modes, seeds * n)
+    modes = vectors.swapaxes(1, 2) @ flat  # (times, modes, seeds * n)
     ones = vectors.sum(axis=1)[:, None]
     squares = (modes**2).reshape(len(modes), blocks, seeds, count).sum(axis=2)
     sums = modes.reshape(len(modes), blocks, seeds, count).sum(axis=2)
@@ -215,10 +215,10 @@ def _posterior(series: np.ndarray) -> _Posterior:
 
 
 def _half_width(posterior: _Posterior) -> np.ndarray:
-    """Half-width (n,) of the interval around zero that holds a mean with the probability ``_LEVEL``.
+    """Half-width (n,) of the interval around zero that contains a mean with probability ``_LEVEL``.
 
-    It is found by Newton's method. Student's distribution is interpolated from a table of z/√(ν + z²), because it is
-    evaluated 300 times for each mean.
+    Newton's method, with Student's distribution interpolated from a table over z/√(ν + z²), since it is evaluated
+    300 times for each mean.
     """
     weight, shift, width, freedom = posterior
     freedom = min(freedom, _MOST_FREEDOM)
@@ -226,7 +226,7 @@ def _half_width(posterior: _Posterior) -> np.ndarray:
     half = np.sqrt(np.sum(weight * ((quantile * width) ** 2 + shift**2), axis=0))
     for _ in range(_NEWTON_STEPS):
         z = np.stack([half - shift, half + shift]) / width
-        place = z / np.hypot(np.sqrt(freedom), z)  # a series of equal values has a z whose square overflows
+        place = z / np.hypot(np.sqrt(freedom), z)  # z of a constant series is so large that its square overflows
         excess = np.sum(weight * np.interp(place, places, probability), axis=(0, 1)) - 1 - _LEVEL
         slope = np.sum(weight / width * np.interp(place, places, density), axis=(0, 1))
         half = np.clip(half - excess / slope, half / 2, 2 * half)
@@ -235,7 +235,7 @@ def _half_width(posterior: _Posterior) -> np.ndarray:
 
 @lru_cache(maxsize=32)
 def _student(freedom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Places u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of the interval.
+    """Points u = z/√(ν + z²), distribution and density of Student's t there, and its quantile of the interval.
 
     With u = sin φ the density of φ is proportional to cos^(ν - 1) φ.
     """
@@ -257,31 +257,31 @@ def _merged(x: np.ndarray, merge: int) -> np.ndarray:
 
 
 def _whole_and_parts(x: np.ndarray, merges: list[int]) -> np.ndarray:
-    """The sum over all blocks, then for each merge those over all groups but one, (1 + groups + groups + ..., ...)."""
+    """The sum over all blocks, then for each merge the leave-one-out sums, (1 + groups + groups + ..., ...)."""
     return np.concatenate([x.sum(axis=(0, 1))[None], *(_all_but_one(_merged(x, m)) for m in merges)])
 
 
 def _all_but_one(groups: np.ndarray) -> np.ndarray:
-    """Sums over all groups but one, (groups, ...)."""
+    """Leave-one-out sums, (groups, ...)."""
     return groups.sum(axis=0) - groups
 
 
 def _spread(without: np.ndarray) -> np.ndarray:
-    """Jackknife standard errors (n,) of n estimates, from the estimates without one group each, (groups, n)."""
+    """Jackknife standard errors (n,) from the leave-one-out estimates (groups, n)."""
     return np.sqrt((len(without) - 1) * np.mean((without - without.mean(axis=0)) ** 2, axis=0))
 
 
 def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """All estimates with a leading axis as one array (rows, n), and a function that names the parts of a row (n,)."""
+    """All estimates with a leading axis as one array (rows, n), and a function that splits a row (n,) by name."""
     arrays = {name: np.asarray(x) for name, x in estimates.items()}
     rows = len(next(iter(arrays.values())))
     edges = np.cumsum([x[0].size for x in arrays.values()])[:-1]
 
-    def named(row: np.ndarray) -> Estimates:
+    def by_name(row: np.ndarray) -> Estimates:
         parts = zip(arrays.items(), np.split(row, edges), strict=True)
         return {name: part.reshape(x.shape[1:]) for (name, x), part in parts}
 
-    return np.concatenate([x.reshape(rows, -1) for x in arrays.values()], axis=1), named
+    return np.concatenate([x.reshape(rows, -1) for x in arrays.values()], axis=1), by_name
 
 
 def _inefficiency(series: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ import numpy as np
 import jaxgran as jg
 from jaxgran.analysis.sensitivity import growth
 from jaxgran.inference.collision_model import Collisions
-from jaxgran.inference.collisions import Noise, candidates, flights_of, weighed
+from jaxgran.inference.collisions import Noise, candidates, flights_of, with_masses
 from jaxgran.inference.selection import of_two_discs, without_repeats
 
 jax.config.update("jax_enable_x64", True)
@@ -74,7 +74,7 @@ print(f"noise of positions {fit.position_noise:.4f} mm, of velocities {fit.veloc
 # %%
 flights, length, duration = flights_of(tracks)
 noise = Noise(fit.position_noise / length, fit.velocity_noise * duration / length, fit.diameter_noise / length)
-flights = weighed(flights, noise)
+flights = with_masses(flights, noise)
 collisions = Collisions(candidates(flights, noise), noise)
 best = collisions.fitted(fit.restitution)
 chosen = np.flatnonzero(without_repeats(collisions, best, of_two_discs(collisions, best)))
@@ -106,7 +106,7 @@ plt.show()
 
 # %%
 def fitted(every: int, velocities: bool) -> jg.RestitutionFit:
-    thinned = jg.read_tracks("tracked_discs.csv", every=every)
+    thinned = jg.read_tracks("tracked_discs.csv", stride=every)
     hidden = np.full_like(thinned.velocities, np.nan)
     return jg.fit_restitution(thinned if velocities else replace(thinned, velocities=hidden))
 

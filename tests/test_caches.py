@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxgran import caches
+from jaxgran.cache import folder as cache
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have no owner")
 
@@ -25,27 +25,27 @@ def nothing_for_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert caches.cache_folder() == caches.users_folder() == tmp_path / "cache" / "jaxgran"
-    assert not list(caches.users_folder().iterdir())
+    assert cache.cache_folder() == cache.users_folder() == tmp_path / "cache" / "jaxgran"
+    assert not list(cache.users_folder().iterdir())
 
 
 def test_a_temporary_folder_that_nobody_else_can_write_takes_its_place(nothing_for_the_user: Path) -> None:
-    assert caches.why_unwritable(caches.users_folder()) == "Not a directory"
-    folder = caches.cache_folder()
+    assert cache.why_unwritable(cache.users_folder()) == "Not a directory"
+    folder = cache.cache_folder()
     assert folder is not None and folder.parent == nothing_for_the_user
     assert folder.stat().st_mode & 0o777 == 0o700
-    assert caches.cache_folder() == folder
+    assert cache.cache_folder() == folder
 
 
 def test_a_temporary_folder_of_others_is_not_used(nothing_for_the_user: Path) -> None:
     folder = nothing_for_the_user / f"jaxgran-{os.getuid()}"
     folder.mkdir()
     folder.chmod(0o777)
-    assert caches.cache_folder() is None
+    assert cache.cache_folder() is None
     folder.rmdir()
     (nothing_for_the_user / "elsewhere").mkdir(mode=0o700)
     folder.symlink_to("elsewhere")
-    assert caches.cache_folder() is None
+    assert cache.cache_folder() is None
 
 
 @pytest.mark.parametrize("shared", [False, True])

@@ -471,16 +471,16 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
     found.rejected = 123
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
     assert outcome.status == 0 and rows_of(outcome.out)["collisions, rejected"] == "123, 123"
-    assert outcome.err.startswith("caution: the interval may not hold, as 123 changes of velocity were left out")
+    assert outcome.err.startswith("caution: the interval may be too narrow, as 123 velocity changes were rejected")
 
 
 def test_fit_that_fails_has_a_status_of_its_own(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_, **__) -> NoReturn:
-        raise RuntimeError("the restitution did not settle.")
+        raise RuntimeError("the restitution did not converge.")
 
     monkeypatch.setattr(restitution, "fit_restitution", fails)
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
-    assert outcome == (3, "", "jaxgran: the restitution did not settle.\n")
+    assert outcome == (3, "", "jaxgran: the restitution did not converge.\n")
 
 
 @pytest.mark.slow
@@ -494,7 +494,7 @@ def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.out) == (3, "")
-    assert outcome.err.startswith("jaxgran: the restitution did not settle: it was last 0.")
+    assert outcome.err.startswith("jaxgran: the restitution did not converge, and was 0.")
     assert one_sentence(outcome.err.rstrip("\n"))
 
 

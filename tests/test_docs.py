@@ -1,5 +1,6 @@
-"""The documentation is whole: its pages, names and examples; the examples of docstrings, pages and README run."""
+"""The documentation is complete: pages, names and links exist; examples of docstrings, pages and README run."""
 
+import ast
 import doctest
 import os
 import re
@@ -9,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import jax
+import netCDF4
 import pytest
 
 import jaxgran
@@ -45,6 +47,50 @@ def test_tests_that_pages_name_are_there() -> None:
     named = set(re.findall(r"`(test_\w+)`", text))
     there = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py"))
     assert named and named <= set(re.findall(r"^def (test_\w+)", there, re.MULTILINE))
+
+
+# Names of other programs, endings of files, and names that branches under way add
+FOREIGN = """NO_MKDOCS_2_WARNING MapParameters ProjectedMethod RunParameters as css csv data_columns dev diagnostics
+    dirty equilibration_strain error_source h5 hdf5 import install-completion js lammpstrj lees_edwards lint-imports
+    mp4 nc ncdump no-caption pyplot pyright pytest_cache select show-completion src tcp tsv txt vjp"""
+PLACEHOLDERS = "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
+COMMANDS = "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
+FOLDERS = ("", "jaxgran", "tests", "benchmarks", "docs", "notebooks", "benchmarks/results")
+_FIELDS = ("id", "attr", "name", "arg", "value")  # of syntax trees: names, attributes, definitions, arguments, strings
+
+
+def names_of_the_project() -> set[str]:
+    """Identifiers and strings of the source code, files and folders, names in the file of a map."""
+    names = {"jaxgran", *FOREIGN.split()}
+    files = [path for folder in ("benchmarks", "tests", "docs/_build") for path in (ROOT / folder).rglob("*.py")]
+    for path in [*SOURCES, *files]:
+        names.update(path.relative_to(ROOT).parts, [path.stem])
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names.update(x for field in _FIELDS if isinstance(x := getattr(node, field, None), str))
+    with netCDF4.Dataset(ROOT / "benchmarks" / "results" / "paper.nc") as data:
+        for group in (data, *data.groups.values()):
+            names.update(group.variables, group.dimensions, group.ncattrs(), [group.name])
+    return names
+
+
+def unknown_names(code: str, names: set[str]) -> list[str]:
+    """Names in a piece of code that do not exist."""
+    first = code.split()[0]
+    if first in COMMANDS.split() or "=" in first or any((ROOT / folder / code).exists() for folder in FOLDERS):
+        return []
+    words = re.findall(r"(?<![\w-])-*([A-Za-z_][\w-]*)", code)
+    words = [word for word in words if len(word) > 1 and not {*word.split("_")} & {*PLACEHOLDERS.split()}]
+    return [word for word in words if not {word, word.replace("-", "_")} & names]
+
+
+def test_every_name_in_backticks_exists() -> None:
+    names = names_of_the_project()
+    unknown = {}
+    for path in [ROOT / "CONTRIBUTING.md", *(DOCS / page for page in PAGES)]:
+        text = re.sub(r"^ *```.*?^ *```$", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        codes = sorted(set(re.findall(r"`([^`\n]+)`", text)))
+        unknown |= {f"{path.name}: {code}": found for code in codes if (found := unknown_names(code, names))}
+    assert not unknown, "\n".join(f"{place} has {', '.join(found)}" for place, found in unknown.items())
 
 
 def test_every_public_name_is_in_the_reference() -> None:

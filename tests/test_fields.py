@@ -18,7 +18,7 @@ from jax import lax
 from scipy.integrate import quad
 
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
-from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid, plane_flux
+from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
@@ -55,6 +55,32 @@ def points(seen) -> jax.Array:
     centre = seen.state.positions[seen.contacts.j[contact]]
     middle = centre + seen.contacts.normals[contact] * seen.contacts.distances[contact] / 2
     return jnp.asarray(np.stack([*anywhere, centre, middle]))
+
+
+@jax.jit
+def plane_flux(seen: Snapshot, heights: jax.Array) -> jax.Array:
+    """Momentum (heights, 2) that crosses planes y = h upwards in the step of a snapshot, per length and time, in mγ̇².
+
+    Contacts whose branch crosses the plane transfer their impulse; grains that cross it in the flight carry their
+    momentum relative to the mean flow at the plane. The average over heights is the stress Σ^{yb}.
+    """
+    state, contacts = collided(seen), seen.contacts
+    y, (cx, cy), area = state.positions[:, 1], state.velocities.T, state.side * seen.timestep
+
+    def crossings(start, rise, height):
+        return jnp.floor((start + rise - height) / state.side) - jnp.floor((start - height) / state.side)
+
+    def through(height):
+        crossing_impulses = (
+            crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height) * seen.impulses
+        )
+        crossing_masses = crossings(y, seen.timestep * cy, height) * state.grains.masses
+        above = y - height
+        above = above - state.side * jnp.round(above / state.side)
+        velocities = jnp.stack([cx + seen.shear_rate * above, cy], axis=-1)
+        return (crossing_impulses @ contacts.normals + crossing_masses @ velocities) / area
+
+    return lax.map(through, heights, batch_size=max(1, min(heights.size, 128)))
 
 
 def densities(fields: Fields) -> jax.Array:

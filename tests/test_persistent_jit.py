@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran import files, persistent_jit
+from jaxgran import files
+from jaxgran.cache import persistent_jit
 
 
 @pytest.fixture
@@ -19,7 +20,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def counted(traces: list):
-    """A program of its own for each process: a new ``kept_jit`` has nothing in memory."""
+    """A program of its own for each process: a new ``persistent_jit`` has nothing in memory."""
 
     def slope(pair, factor):
         traces.append(None)
@@ -124,6 +125,6 @@ def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None
 def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "file")
-    with pytest.warns(UserWarning, match="compiled programs are not kept"):
+    with pytest.warns(UserWarning, match="compiled programs are not cached"):
         found = counted([])(*ARGUMENTS)
     np.testing.assert_array_equal(found["sum"], [1.0, 2.0, 3.0])

@@ -118,7 +118,7 @@ def test_contacts_that_outlast_a_frame_are_refused(known: bool) -> None:
     """They would be taken for collisions of a small restitution."""
     seen = tracks()
     lasting = lasting_contacts(seen, 4)
-    with pytest.raises(InputError, match=r"contacts that are shorter .* or --stride [3-9]"):
+    with pytest.raises(InputError, match=r"contacts that are shorter .* read with stride=[3-9]"):
         fit_restitution(lasting if known else without_velocities(lasting))
 
 
@@ -144,7 +144,7 @@ def test_discs_of_several_restitutions_are_told() -> None:
         np.tile([np.inf, np.inf, 0.0], (FRAMES, 1)),
         0.0,
     )
-    with pytest.warns(UserWarning, match=r"the interval may not hold, as .* not all alike") as told:
+    with pytest.warns(UserWarning, match=r"the interval may be too narrow, as .* restitutions differ") as told:
         fit = fit_restitution(together)
     assert fit.rejected >= fit.collisions
     assert one_sentence(str(told[0].message))

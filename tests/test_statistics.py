@@ -177,7 +177,7 @@ def test_interval_is_that_of_the_posterior_integrated_by_brute_force() -> None:
     spacing = np.hypot(means, half)
     log_deviation = np.linspace(-4, 9, 131)[:, None]
     mass = np.zeros(means.size)
-    for memory in statistics._MEMORIES:
+    for memory in statistics._TIMES:
         for white in statistics._WHITE_SHARES:
             correlation = (1 - white) * np.exp(-lag / memory) + white * np.eye(4)
             residuals = (x - x.mean())[:, :, None] - means

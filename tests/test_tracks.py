@@ -178,11 +178,11 @@ def test_the_brightness_that_trackpy_calls_mass_is_no_mass(tmp_path: Path) -> No
 
 def test_frames_are_left_out(tmp_path: Path) -> None:
     write_dump(tmp_path / "flow.dump", tracks())
-    every, third = read_tracks(tmp_path / "flow.dump"), read_tracks(tmp_path / "flow.dump", every=3)
+    every, third = read_tracks(tmp_path / "flow.dump"), read_tracks(tmp_path / "flow.dump", stride=3)
     np.testing.assert_array_equal(third.positions, every.positions[::3])
     np.testing.assert_array_equal(third.time, every.time[::3])
-    with pytest.raises(InputError, match=r"every must be less than .*, 60 in 'flow\.dump', not 60"):
-        read_tracks(tmp_path / "flow.dump", every=60)
+    with pytest.raises(InputError, match=r"stride must be less than .*, 60 in 'flow\.dump', not 60"):
+        read_tracks(tmp_path / "flow.dump", stride=60)
 
 
 def test_time_between_frames_is_that_of_the_displacements(tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_states_are_tracks_and_so_is_their_file(dtype: type, tmp_path: Path) -> 
     write_trajectory(tmp_path / "flow.gsd", flow, states, np.round(seen.time, 4))
     read = read_tracks(tmp_path / "flow.gsd")
     np.testing.assert_array_equal(read.positions, found.positions)
-    with pytest.raises(InputError, match="says its time, shear rate and diameters itself"):
+    with pytest.raises(InputError, match="contains its time, shear rate and diameters"):
         read_tracks(tmp_path / "flow.gsd", interval=1.0)
 
 

@@ -17,10 +17,8 @@ from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io.trajectory import (
     Trajectory,
-    append_frame,
     check_trajectory,
     read_trajectory,
-    start_trajectory,
     write_frame,
     write_trajectory,
 )
@@ -100,8 +98,8 @@ def first_frame(path: Path):
 
 @pytest.mark.parametrize("tilt", TILTS)
 def test_a_state_is_read_back_to_the_bit(seen, tilt: float, tmp_path: Path) -> None:
-    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
-    append_frame(tmp_path / "flow.gsd", seen[TILTS[0]], 700)
+    write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
+    write_frame(tmp_path / "flow.gsd", seen[TILTS[0]], 700)
     read = read_trajectory(tmp_path / "flow.gsd")
     assert_same_bits(frame_of(read, 0), seen[tilt].state)
     assert_same_bits(frame_of(read, 1), seen[TILTS[0]].state)
@@ -113,7 +111,7 @@ def test_a_state_is_read_back_to_the_bit(seen, tilt: float, tmp_path: Path) -> N
 
 def test_a_state_in_single_precision_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, seen[0.3])
-    start_trajectory(tmp_path / "flow.gsd", single)
+    write_frame(tmp_path / "flow.gsd", single, 0)
     read = read_trajectory(tmp_path / "flow.gsd")
     for a, b in zip(jax.tree.leaves(frame_of(read, 0)), jax.tree.leaves(single.state), strict=True):
         assert a.dtype == np.float32
@@ -127,13 +125,13 @@ def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: P
     read = read_trajectory(path)
     assert_same_bits(read.state, states)
     np.testing.assert_array_equal(read.step, [0, 12, 30])
-    start_trajectory(tmp_path / "one.gsd", seen[TILTS[0]])
+    write_frame(tmp_path / "one.gsd", seen[TILTS[0]], 0)
     for file in (path, tmp_path / "one.gsd"):
         with gsd.hoomd.open(file) as frames:
             forces = frames[0].log["bonds/force"]
         impulses = np.asarray(seen[TILTS[0]].impulses)
         np.testing.assert_allclose(forces, impulses[impulses > 0] / 1e-3, rtol=1e-12)
-    with pytest.raises(InputError, match=r"^path must be another file, or overwrite be True: .*flow\.gsd' exists\.$"):
+    with pytest.raises(InputError, match=r"^path must be a new file, or overwrite .*flow\.gsd' exists\.$"):
         write_trajectory(path, flow, states, strains)
     with pytest.raises(InputError, match=r"^strain must increase by at least one time step"):
         write_trajectory(path, flow, states, [0.5, 0.5001, 0.53], overwrite=True)
@@ -218,7 +216,7 @@ def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: P
 def test_box_is_the_sheared_cell_and_holds_all_grains(seen, tilt: float, tmp_path: Path) -> None:
     state = seen[tilt].state
     assert abs(state.tilt.item() - tilt) < 0.1  # it had to be sheared on until there were forces
-    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
     frame = first_frame(tmp_path / "flow.gsd")
     side, tilt = state.side.item(), state.tilt.item()
     np.testing.assert_allclose(frame.configuration.box, [side, side, 0, tilt, 0, 0], rtol=1e-6)
@@ -237,7 +235,7 @@ def test_box_is_the_sheared_cell_and_holds_all_grains(seen, tilt: float, tmp_pat
 @pytest.mark.parametrize("tilt", TILTS)
 def test_distances_in_the_box_are_those_of_the_flow(seen, tilt: float, tmp_path: Path) -> None:
     state = seen[tilt].state
-    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
     frame = first_frame(tmp_path / "flow.gsd")
     box = freud.box.Box.from_box(frame.configuration.box)
     near = freud.locality.AABBQuery(box, frame.particles.position)
@@ -251,7 +249,7 @@ def test_distances_in_the_box_are_those_of_the_flow(seen, tilt: float, tmp_path:
 @pytest.mark.parametrize("tilt", TILTS)
 def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, tilt: float, tmp_path: Path) -> None:
     """By the bonds, by the neighbours that overlap by the middle of the step, and by the sums of the step."""
-    start_trajectory(tmp_path / "flow.gsd", seen[tilt])
+    write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
     frame = first_frame(tmp_path / "flow.gsd")
     _, tally = run(flow, seen[tilt].state, 1)
     assert frame.bonds.types == ["contact"]
@@ -281,9 +279,9 @@ def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, t
 
 def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
     lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
-    start_trajectory(tmp_path / "flow.gsd", seen[0.3])
-    append_frame(tmp_path / "flow.gsd", lost, 1)
-    append_frame(tmp_path / "flow.gsd", seen[0.0], 2)
+    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
+    write_frame(tmp_path / "flow.gsd", lost, 1)
+    write_frame(tmp_path / "flow.gsd", seen[0.0], 2)
     with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
         counts = [frame.bonds.N for frame in file]
         assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
@@ -396,10 +394,10 @@ def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Pat
         "head": content[:256],
     }.items():
         (tmp_path / f"{name}.gsd").write_bytes(torn)
-        assert_refused(tmp_path / f"{name}.gsd", "is not a GSD file that can be read")
+        assert_refused(tmp_path / f"{name}.gsd", "is not a readable GSD file")
     with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
         pass
-    assert_refused(tmp_path / "other.gsd", "its schema is 'rods'")
+    assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -424,10 +422,10 @@ def test_an_old_file_stays_until_the_first_frame_is_there(seen, tmp_path: Path, 
     with monkeypatch.context() as patch:
         patch.setattr(gsd.hoomd.HOOMDTrajectory, "append", interrupts)
         with pytest.raises(KeyboardInterrupt):
-            start_trajectory(path, seen[0.3])
+            write_frame(path, seen[0.3], 0)
     assert path.read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["flow.gsd"]
-    start_trajectory(path, seen[0.3])
+    write_frame(path, seen[0.3], 0)
     assert len(read_trajectory(path).step) == 1
 
 
@@ -441,10 +439,10 @@ def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
 ) -> None:
     """And can be added to."""
     path = tmp_path / "flow.gsd"
-    start_trajectory(path, seen[0.3])
-    append_frame(path, seen[0.0], 1)
+    write_frame(path, seen[0.3], 0)
+    write_frame(path, seen[0.0], 1)
     before = read_trajectory(path)
-    append = partial(append_frame, path, seen[-0.4], 2)
+    append = partial(write_frame, path, seen[-0.4], 2)
     with monkeypatch.context() as patch:
         library = gsd.fl.open
         patch.setattr(gsd.fl, "open", lambda *words, **more: Interrupted(library(*words, **more), chunk))

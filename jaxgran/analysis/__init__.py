@@ -1,4 +1,4 @@
-"""Numbers from snapshots: force chains, order, velocities, coarse-grained fields.
+"""Analysis of snapshots: force chains, order, velocity statistics, coarse-grained fields.
 
 It imports `dynamics` and the folders below it, but neither `sampling` nor `io`. Begin with `series`.
 """

@@ -1,7 +1,6 @@
-"""Coarse-graining functions: how a grain is spread over the plane, and a contact along its branch.
+"""Coarse-graining functions, which spread a grain over the plane and a contact along its branch.
 
-Each function is normalised in the plane. Its integral along a line is known in closed form. To add a function, give
-the two functions and the two numbers of ``Kernel``.
+Each is normalised in the plane and has a closed-form line integral. To add one, supply the four fields of ``Kernel``.
 """
 
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.model.checks import require_number
 
-_ON_CENTRE = 1e-100  # b² in squared widths, at or below which a line passes through the centre
+_ON_CENTRE = 1e-100  # squared widths: a line with b² at or below this passes through the centre
 
 
 class Kernel(NamedTuple):
@@ -26,7 +25,7 @@ class Kernel(NamedTuple):
     field          signature       meaning
     =============  ==============  ==========================================================================
     value          q² → g          the function
-    line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line that passes the centre at the distance b
+    line           s, b² → ()      ∫₀ˢ g(√(b² + t²)) dt along a line at the distance b from the centre
     second_moment  number          ∫ g q_x² d²q
     reach          number          distance beyond which g is zero or negligible
     =============  ==============  ==========================================================================
@@ -39,12 +38,12 @@ class Kernel(NamedTuple):
 
 
 def _root(square: Array) -> Array:
-    """A square root with derivative zero at zero; it is only used in odd powers of three and more."""
+    """Square root with derivative zero at zero, for use in odd powers from the third."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _in_disc(s: Array, b2: Array) -> Array:
-    """s limited to the chord of the unit disc at the distance b from the centre; zero outside the disc."""
+    """s clipped to the chord of the unit disc at the distance b from the centre; zero outside the disc."""
     half = jnp.sqrt(jnp.where(b2 < 1, 1 - b2, 1))
     return jnp.where(b2 < 1, jnp.clip(s, -half, half), 0)
 
@@ -79,12 +78,12 @@ HEAVISIDE = Kernel(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoarseGraining:
-    """A coarse-graining function G of some width; made by ``gaussian``, ``lucy`` and ``heaviside``.
+    """A coarse-graining function G of given width, made by ``gaussian``, ``lucy`` or ``heaviside``.
 
     ======  ======  ====  ======================================
     field   shape   unit  meaning
     ======  ======  ====  ======================================
-    width   ()      σ     length by which the kernel is stretched
+    width   ()      σ     factor that scales the unit kernel
     kernel  static  –     the function at unit width
     ======  ======  ====  ======================================
     """
@@ -127,7 +126,7 @@ class CoarseGraining:
 
 
 def gaussian(width: float | Array) -> CoarseGraining:
-    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w (σ). It is smooth and not cut off within the cell."""
+    """The Gaussian exp(−r²/2w²)/2πw² of standard deviation w (σ); smooth, not truncated within the cell."""
     return _of_width(width, GAUSSIAN)
 
 
@@ -137,11 +136,15 @@ def lucy(radius: float | Array) -> CoarseGraining:
 
 
 def heaviside(radius: float | Array) -> CoarseGraining:
-    """The average over a disc of radius c (σ), 1/(πc²). Fields jump where a grain enters and have no derivatives."""
+    """The uniform weight 1/(πc²) in a disc of radius c (σ); fields are discontinuous and not differentiable."""
     return _of_width(radius, HEAVISIDE)
 
 
 def _of_width(width: float | Array, kernel: Kernel) -> CoarseGraining:
-    words = "positive and at most what fits into the cell"
-    require_number("the width of the coarse-graining", width, lambda x: (x > 0) & np.isfinite(x), words)
+    require_number(
+        "the width of the coarse-graining",
+        width,
+        lambda x: (x > 0) & np.isfinite(x),
+        "positive and at most what fits into the cell",
+    )
     return CoarseGraining(width, kernel)

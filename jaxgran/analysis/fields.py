@@ -1,16 +1,15 @@
-"""Fields: density, velocity, stress, dissipation and heat flux at any points, coarse-grained from a snapshot.
+"""Coarse-grained fields of a snapshot: density, velocity, stress, dissipation and heat flux at any points.
 
-A coarse-graining function G spreads every grain over the plane. Quantities that grains carry are weighted by
-G(r − r_i). Quantities that contacts transfer are weighted by ∫₀¹ G(r − r_i + s σ_ij) ds. This is the mean of G over
-the branch σ_ij = r_i − r_j between the centres. With these weights the fields obey the balance equations of mass,
-momentum and energy exactly, at every point and for every G:
+A coarse-graining function G spreads every grain over the plane. Quantities carried by grains are weighted by
+G(r − r_i), quantities transferred by contacts by ∫₀¹ G(r − r_i + s σ_ij) ds, the mean of G over the branch
+σ_ij = r_i − r_j between the centres. With these weights the fields obey the balance equations of mass, momentum and
+energy exactly, at every point and for every G:
 
     ∂ρ/∂t = −∇·(ρV),   ∂(ρV)/∂t = −∇·(ρVV + Σ),   ∂(ρe)/∂t = −∇·(ρeV + Σ·V + J_Q) − ζ.
 
-A time step is an instantaneous collision, then a flight. Quantities that grains carry use the velocities of the
-flight, after the collision. Forces are impulses over dt. So the fields of a snapshot belong to the step that begins
-with it. Over this step the densities change by dt times the right-hand sides: exactly for the contacts, to first order
-in dt for the flight.
+A time step is an instantaneous collision followed by a flight. Quantities carried by grains use the velocities after
+the collision; forces are impulses over dt. The fields of a snapshot are those of the step that begins with it, over
+which the densities change by dt times the right-hand sides: exactly for contacts, to first order in dt for flight.
 
 Sources: Lois, Lemaître and Carlson for ρ, ρV and Σ (their energy equation has the opposite signs on the right);
 Goldhirsch and Goldenberg, Eur. Phys. J. E 9, 245 (2002), for the line integral.
@@ -54,7 +53,7 @@ class Fields:
     heat_flux       (points, 2)     mσγ̇³     J_Q = ½ Σ m |v − V|² (v − V) G + Σ σ F·((v̄_i + v̄_j)/2 − V) ∫G, with v̄ the
                                              mean of the velocities before and after the collision
     dissipation     (points,)       mγ̇³      ζ: energy lost in contacts, half of each loss at either grain; negative
-                                             where neighbours press a contact together and it gains energy from them
+                                             where a contact gains energy because its neighbours compress it
     ==============  ==============  =======  ===========================================================================
     """
 
@@ -100,7 +99,7 @@ class Fields:
 
 
 class _Branches(NamedTuple):
-    """Branches of the contacts, and what each contact transfers.
+    """Branches of contacts and the quantities transferred along them.
 
     ===========  =============  ==============================================================================
     middles      (contacts, 2)  middle of the branch, σ
@@ -119,44 +118,44 @@ class _Branches(NamedTuple):
     loaded: Bool[Array, " contacts"]
 
 
-def fields_at(seen: Snapshot, points: Float[Array, "points 2"], graining: CoarseGraining) -> Fields:
-    """Fields of a snapshot at any points of the plane; ``jit``, ``lax.map`` and derivatives apply.
+def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: CoarseGraining) -> Fields:
+    """Fields of a snapshot at any points of the plane; supports ``jit``, ``lax.map`` and differentiation.
 
     Args:
-      seen: one snapshot.
-      points: (points, 2) in σ, in the cell or in any of its images, for example from ``grid``.
-      graining: G. Its width is traced, so a new width needs no new compilation.
+      snapshot: one snapshot.
+      points: (points, 2) in σ, in the cell or any image of it, for example from ``grid``.
+      graining: G. Its width is traced: another width needs no recompilation.
 
     Returns:
-      The fields of the step that begins with the snapshot: ρ, V and Σ_k after its collision.
+      Fields of the step that begins with the snapshot; ρ, V and Σ_k are those after its collision.
 
     Raises:
-      InputError: the width is not positive, or G reaches farther than half the side less the largest radius. A point
-        would then be within reach of two images of one grain. The reach of a Gaussian is six widths: the next images
-        are neglected, and they are at most e⁻¹⁸ = 1.5e-8 of the peak.
-
-    Sources: see the top of this file.
+      InputError: the width is not positive, or G reaches beyond half the side minus the largest radius, so that two
+        images of a grain would be within reach of a point. The reach of a Gaussian is six widths, where it has
+        fallen to e⁻¹⁸ = 1.5e-8 of its peak.
     """
-    if not isinstance(seen, Snapshot) or jnp.ndim(seen.state.positions) != 2:
-        raise InputError("seen must be one Snapshot: one of a series is jax.tree.map(lambda x: x[k], series).")
+    if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
+        raise InputError(
+            "snapshot must be a single Snapshot; take one of a series by jax.tree.map(lambda x: x[k], series)."
+        )
     if not isinstance(graining, CoarseGraining):
-        raise InputError(f"graining must be made by gaussian, lucy or heaviside, not {short_repr(graining)}.")
-    words = "an array (points, 2) of finite numbers"
-    require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), words)
-    _check(graining, seen.state)
-    return _fields_at(seen, points, graining)
+        raise InputError(f"graining must come from gaussian, lucy or heaviside, not {short_repr(graining)}.")
+    accepted = "an array (points, 2) of finite numbers"
+    require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted)
+    _check(graining, snapshot.state)
+    return _fields_at(snapshot, points, graining)
 
 
 def flight_fields_at(
     state: State, shear_rate: float | Array, points: Float[Array, "points 2"], graining: CoarseGraining
 ) -> Fields:
-    """Fields of grains in free flight: ``fields_at`` without contact impulses; arguments as there."""
+    """``fields_at`` for grains in free flight, without contact impulses."""
     _check(graining, state)
     return _flight_fields_at(state, shear_rate, points, graining)
 
 
 def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
-    """Points (count², 2) that fill the cell evenly, row by row: ``reshape(count, count)`` has y first, then x.
+    """A regular grid of points (count², 2) in the cell, row by row: ``reshape(count, count)`` gives axes (y, x).
 
     The square [0, L)² is one cell of the sheared lattice at any tilt.
     """
@@ -164,54 +163,25 @@ def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
     return jnp.stack([jnp.tile(ticks, count), jnp.repeat(ticks, count)], axis=-1)
 
 
-@jax.jit
-def plane_flux(seen: Snapshot, heights: Float[Array, " heights"]) -> Float[Array, "heights 2"]:
-    """Momentum that crosses planes y = h upwards during the step of a snapshot, per length and time, in mγ̇².
-
-    Contacts whose branch crosses the plane transfer their impulse. Grains that cross it in the flight carry their
-    momentum relative to the mean flow at the plane. Averaged over all heights, the contacts give (1/A) Σ σ_y F, and the
-    grains give the average over the flight of (1/A) Σ m c_y c. So this is a second way to measure the stress Σ^{yb}.
-
-    Args:
-      seen: one snapshot.
-      heights: (heights,) in σ, any numbers.
-    """
-    state, contacts = collided(seen), seen.contacts
-    y, (cx, cy), area = state.positions[:, 1], state.velocities.T, state.side * seen.timestep
-
-    def crossings(start: Array, rise: Array, height: Array) -> Array:
-        return jnp.floor((start + rise - height) / state.side) - jnp.floor((start - height) / state.side)
-
-    def through(height: Array) -> Array:
-        crossing_impulses = (
-            crossings(y[contacts.j], contacts.normals[:, 1] * contacts.distances, height) * seen.impulses
-        )
-        crossing_masses = crossings(y, seen.timestep * cy, height) * state.grains.masses
-        above = y - height
-        above = above - state.side * jnp.round(above / state.side)
-        velocities = jnp.stack([cx + seen.shear_rate * above, cy], axis=-1)
-        return (_dot(crossing_impulses, contacts.normals) + _dot(crossing_masses, velocities)) / area
-
-    return lax.map(through, heights, batch_size=max(1, min(heights.size, _POINTS_AT_ONCE)))
-
-
 def _check(graining: CoarseGraining, state: State) -> None:
     limit = np.inf
     if not isinstance(state.side, Tracer) and not isinstance(state.grains.radii, Tracer):
         limit = (float(state.side) / 2 - np.max(np.asarray(state.grains.radii))) / graining.kernel.reach
-    words = f"positive and at most {limit:.4g} in this cell"
-    require("the width of the coarse-graining", graining.width, lambda w: (w > 0) & (w <= limit), words)
+    accepted = f"positive and at most {limit:.4g} in this cell"
+    require("the width of the coarse-graining", graining.width, lambda w: (w > 0) & (w <= limit), accepted)
 
 
 @jax.jit
-def _fields_at(seen: Snapshot, points: Array, graining: CoarseGraining) -> Fields:
-    before, after, contacts = seen.state, collided(seen), seen.contacts
+def _fields_at(snapshot: Snapshot, points: Array, graining: CoarseGraining) -> Fields:
+    before, after, contacts = snapshot.state, collided(snapshot), snapshot.contacts
     mean = (before.velocities + after.velocities) / 2
     velocity_i, velocity_j = mean[contacts.i], mean[contacts.j]
     branches = contacts.normals * contacts.distances[:, None]
-    forces = contacts.normals * (seen.impulses / seen.timestep)[:, None]
+    forces = contacts.normals * (snapshot.impulses / snapshot.timestep)[:, None]
 
-    power_lost = -jnp.sum(forces * (velocity_i - velocity_j), axis=1) - seen.shear_rate * forces[:, 0] * branches[:, 1]
+    power_lost = (
+        -jnp.sum(forces * (velocity_i - velocity_j), axis=1) - snapshot.shear_rate * forces[:, 0] * branches[:, 1]
+    )
     loss = power_lost / 2  # half of the loss goes to each of the two grains
     losses = jnp.zeros_like(before.grains.masses).at[contacts.i].add(loss).at[contacts.j].add(loss)
 
@@ -219,8 +189,8 @@ def _fields_at(seen: Snapshot, points: Array, graining: CoarseGraining) -> Field
     work = branches * jnp.sum(forces * (velocity_i + velocity_j) / 2, axis=1)[:, None]
     transferred = jnp.concatenate([stress.reshape(-1, 4), work], axis=1)
     middles = before.positions[contacts.j] + branches / 2
-    transfers = _Branches(middles, contacts.normals, contacts.distances, transferred, seen.impulses > 0)
-    return _coarse_grained(after, losses, _in_blocks(transfers), seen.shear_rate, points, graining)
+    transfers = _Branches(middles, contacts.normals, contacts.distances, transferred, snapshot.impulses > 0)
+    return _coarse_grained(after, losses, _in_blocks(transfers), snapshot.shear_rate, points, graining)
 
 
 @jax.jit
@@ -229,7 +199,7 @@ def _flight_fields_at(state: State, shear_rate: Array, points: Array, graining: 
 
 
 def _in_blocks(branches: _Branches) -> _Branches:
-    """The branches, loaded ones first, in blocks (blocks, size)."""
+    """The branches in blocks (blocks, size), loaded ones first."""
     order = jnp.argsort(~branches.loaded)
     size = min(order.size, _BRANCHES_AT_ONCE)
     order = jnp.pad(order, (0, -order.size % size), constant_values=order.size).reshape(-1, size)
@@ -241,10 +211,10 @@ def _in_blocks(branches: _Branches) -> _Branches:
 def _coarse_grained(
     state: State, losses: Array, blocks: _Branches | None, shear_rate: Array, points: Array, graining: CoarseGraining
 ) -> Fields:
-    """The fields, written for one point; ``lax.map`` evaluates many points at once as matrix products.
+    """The fields, written for one point; ``lax.map`` evaluates batches of points as matrix products.
 
-    All sums are taken in the frame of the mean flow at the point. There an image at the separation d has the velocity
-    w = c − γ̇ d_y x̂. So the velocities of images need no correction, and far from the origin no digits cancel.
+    Sums are taken in the frame of the mean flow at the point, where an image at the separation d has the velocity
+    w = c − γ̇ d_y x̂: images need no correction, and no digits cancel far from the origin.
     """
     masses, (cx, cy) = state.grains.masses, state.velocities.T
     carried = jnp.stack([masses, masses * cy, masses * cy**2, masses * cy**3, jnp.ones_like(cy), losses], axis=1)

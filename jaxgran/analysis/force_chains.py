@@ -1,12 +1,12 @@
-"""Force chains: clusters of grains that push at the same time, their lifetimes, their forces and their fabric.
+"""Force chains: clusters of grains in loaded contact, their lifetimes, forces and fabric.
 
-A contact is *loaded* when it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
+A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts are loaded when they are used
+import scipy  # loads its submodules on first use
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
@@ -18,7 +18,7 @@ _DIRECTIONS = 12  # bins of 15° on the half circle, for the mean force at an an
 
 
 class Loaded(NamedTuple):
-    """The loaded contacts of all times in one list.
+    """The loaded contacts of all snapshots, as one list.
 
     ==========  =============  =====  ========================================
     field       shape          unit   meaning
@@ -44,13 +44,13 @@ class Loaded(NamedTuple):
 
 
 class PairForces(NamedTuple):
-    """The pairs of grains that push each other at any time of a series, and their mean forces over all its times.
+    """Pairs of grains in loaded contact at any time of a series, and their mean forces over the series.
 
     =============  ========  =====  ===================================================================
     field          shape     unit   meaning
     =============  ========  =====  ===================================================================
     i, j           (pairs,)  –      grains, i < j
-    force          (pairs,)  mσγ̇²   mean over the times of p/dt, zero at times without a load
+    force          (pairs,)  mσγ̇²   mean of p/dt over all snapshots, loaded or not
     cluster_share  (pairs,)  –      share of the force that acts within clusters of three or more grains
     =============  ========  =====  ===================================================================
     """
@@ -62,13 +62,13 @@ class PairForces(NamedTuple):
 
 
 class Clusters(NamedTuple):
-    """Clusters at each time; no label occurs at two times.
+    """Clusters at each time; labels are unique over all times.
 
     ======  ===============  ====  ==================================================================
     field   shape            unit  meaning
     ======  ===============  ====  ==================================================================
-    labels  (times, grains)  –     number of the cluster of each grain
-    sizes   (times, grains)  –     grains in the cluster of each grain, 1 for one without a load
+    labels  (times, grains)  –     label of the cluster of each grain
+    sizes   (times, grains)  –     size of the cluster of each grain; 1 without loaded contacts
     ======  ===============  ====  ==================================================================
     """
 
@@ -77,11 +77,10 @@ class Clusters(NamedTuple):
 
 
 class ClusterShare(NamedTuple):
-    """Shares of clusters of three or more grains in the loaded contacts, and in their force, pressure and shear stress.
+    """Shares of loaded contacts, and of their force, pressure and shear stress, in clusters of three or more grains.
 
-    All are scalars between snapshots of one series. The pressure of the contacts is Σ tr(σF)/2, their shear stress
-    −Σ σ^x F^y. Clusters of two grains are binary collisions, in which F = F_bc exactly. So only larger clusters can
-    raise the force ratio above one.
+    Each is a scalar over the whole series. The contact pressure is Σ tr(σF)/2, the contact shear stress −Σ σ^x F^y. In
+    a cluster of two, a binary collision, F = F_bc exactly: only larger ones raise the force ratio above 1.
     """
 
     contacts: Measured
@@ -91,7 +90,7 @@ class ClusterShare(NamedTuple):
 
 
 class Persistence(NamedTuple):
-    """Probability C(τ) that grains joined at t are joined at t + τ, and the lifetime: the τ at which C falls to 1/e.
+    """Probability C(τ) that grains joined at t are joined at t + τ, and the lifetime at which it falls to 1/e.
 
     ================  =========  ======  ===========================================
     field             shape      unit    meaning
@@ -102,8 +101,8 @@ class Persistence(NamedTuple):
     cluster_lifetime  ()         strain  of the clusters
     ================  =========  ======  ===========================================
 
-    A lifetime shorter than the first lag is interpolated from C(0) = 1, so it is only an order of magnitude. A lifetime
-    longer than the last lag is NaN.
+    A lifetime below the first lag is interpolated from C(0) = 1, so only its order of magnitude is meaningful. One
+    beyond the last lag is NaN.
     """
 
     contact: Curve
@@ -135,19 +134,19 @@ class Fabric(NamedTuple):
     stress_anisotropy: Measured
 
 
-def loaded_contacts(seen: Snapshot) -> Loaded:
-    """The contacts of all times that carry an impulse."""
-    frames = series(seen)
+def loaded_contacts(snapshots: Snapshot) -> Loaded:
+    """The contacts that carry an impulse, of all snapshots."""
+    frames = series(snapshots)
     time, slot = np.nonzero(frames.contacts.used & (frames.impulses > 0))
     force = frames.impulses[time, slot] / frames.timestep[time]
     picked = (x[time, slot] for x in (frames.contacts.normals, frames.contacts.distances))
     return Loaded(time, frames.contacts.i[time, slot], frames.contacts.j[time, slot], force, *picked)
 
 
-def clusters(seen: Snapshot) -> Clusters:
+def clusters(snapshots: Snapshot) -> Clusters:
     """Clusters of grains connected by loaded contacts, at each time."""
-    times, grains = series(seen).state.positions.shape[:2]
-    load = loaded_contacts(seen)
+    times, grains = series(snapshots).state.positions.shape[:2]
+    load = loaded_contacts(snapshots)
     edges = load.time * grains + load.i, load.time * grains + load.j
     graph = scipy.sparse.coo_array((np.ones(load.time.size), edges), shape=(times * grains, times * grains))
     labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
@@ -155,9 +154,9 @@ def clusters(seen: Snapshot) -> Clusters:
     return Clusters(labels.reshape(times, grains), sizes.reshape(times, grains))
 
 
-def pair_forces(seen: Snapshot) -> PairForces:
-    """Mean force of each pair over a series. With one snapshot a time step it is the impulse over the elapsed time."""
-    load, sizes = loaded_contacts(seen), clusters(seen).sizes
+def pair_forces(snapshots: Snapshot) -> PairForces:
+    """Mean force of each pair over a series; with a snapshot every time step, its impulse over the elapsed time."""
+    load, sizes = loaded_contacts(snapshots), clusters(snapshots).sizes
     times, grains = sizes.shape
     keys = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
     pairs, pair = np.unique(keys, return_inverse=True)
@@ -166,23 +165,23 @@ def pair_forces(seen: Snapshot) -> PairForces:
     return PairForces(pairs // grains, pairs % grains, total / times, ratio(clustered, total))
 
 
-def cluster_sizes(seen: Snapshot, edges: ArrayLike | None = None) -> Curve:
+def cluster_sizes(snapshots: Snapshot, edges: ArrayLike | None = None) -> Curve:
     """Share of each size among the clusters of two or more grains, averaged over the sizes in each bin.
 
-    ``edges`` are the edges of the bins, whole numbers; a bin contains its lower edge. Without them each size is a bin.
+    ``edges`` are integer bin edges; a bin contains its lower edge. By default each size is a bin.
     """
-    sizes = clusters(seen).sizes
+    sizes = clusters(snapshots).sizes
     edges = np.arange(2, max(sizes.max(), 2) + 2) if edges is None else np.asarray(edges)
     time = np.repeat(np.arange(len(sizes)), sizes.shape[1])
-    weights = np.where(sizes > 1, 1 / sizes, 0)  # the weights of the grains of a cluster add up to one
+    weights = np.where(sizes > 1, 1 / sizes, 0)  # the grains of a cluster have a total weight of one
     sums = {"n": histograms(len(sizes), time, sizes.ravel(), edges, weights.ravel()), "all": weights.sum(axis=1)}
-    found = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
-    return Curve(centres(edges) - 0.5, *found)
+    estimates = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
+    return Curve(centres(edges) - 0.5, *estimates)
 
 
-def cluster_share(seen: Snapshot) -> ClusterShare:
+def cluster_share(snapshots: Snapshot) -> ClusterShare:
     """Shares of clusters of three or more grains in the contacts, forces and contact stress."""
-    load, sizes = loaded_contacts(seen), clusters(seen).sizes
+    load, sizes = loaded_contacts(snapshots), clusters(snapshots).sizes
     moments = load.moments()
     pressure, shear = (moments[:, 0, 0] + moments[:, 1, 1]) / 2, -moments[:, 0, 1]
     carried = np.stack([np.ones_like(load.force), load.force, pressure, shear], axis=-1)
@@ -191,21 +190,21 @@ def cluster_share(seen: Snapshot) -> ClusterShare:
         "all": by_time(len(sizes), load.time, carried),
         "many": by_time(len(sizes), load.time, carried * in_cluster),
     }
-    found = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
-    return ClusterShare(*(Measured(*share) for share in zip(*found, strict=True)))
+    estimates = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
+    return ClusterShare(*(Measured(*share) for share in zip(*estimates, strict=True)))
 
 
-def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence:
-    """How long contacts and clusters last: the intermittent correlation function, in which a pair may part in between.
+def persistence(snapshots: Snapshot, interval: float, lags: ArrayLike) -> Persistence:
+    """How long contacts and clusters last, by the intermittent correlation function: a pair may separate in between.
 
     Args:
-      seen: a series at equal intervals of strain, best with a snapshot of every time step.
+      snapshots: a series at equal intervals of strain, ideally of every time step.
       interval: strain between successive snapshots.
-      lags: whole numbers of snapshots in rising order, at least 1 and below the number of times.
+      lags: increasing integers, numbers of snapshots from 1 to below the length of the series.
 
     Source: D. C. Rapaport, Mol. Phys. 50, 1151 (1983), for bonds.
     """
-    labels, load = clusters(seen).labels, loaded_contacts(seen)
+    labels, load = clusters(snapshots).labels, loaded_contacts(snapshots)
     times, grains = labels.shape
     bond = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
     bonds = scipy.sparse.coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
@@ -227,29 +226,29 @@ def persistence(seen: Snapshot, interval: float, lags: ArrayLike) -> Persistence
         lifetimes = {name: _decay(all_lags, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}
         return {"curves": curves, **lifetimes}
 
-    found = with_errors(estimate, sums)
-    contact, cluster = (Curve(all_lags * interval, *(x[:, k] for x in found["curves"])) for k in (0, 1))
-    lifetimes = (Measured(*(np.asarray(x * interval) for x in found[name])) for name in ("contact", "cluster"))
+    estimates = with_errors(estimate, sums)
+    contact, cluster = (Curve(all_lags * interval, *(x[:, k] for x in estimates["curves"])) for k in (0, 1))
+    lifetimes = (Measured(*(np.asarray(x * interval) for x in estimates[name])) for name in ("contact", "cluster"))
     return Persistence(contact, cluster, *lifetimes)
 
 
-def force_distribution(seen: Snapshot, edges: ArrayLike) -> Curve:
-    """Probability density of F/⟨F⟩ over the loaded contacts, in bins with the given edges; its integral is one."""
-    load, edges = loaded_contacts(seen), np.asarray(edges)
-    times = len(series(seen).impulses)
+def force_distribution(snapshots: Snapshot, edges: ArrayLike) -> Curve:
+    """Probability density of F/⟨F⟩ over the loaded contacts, in bins with the given edges."""
+    load, edges = loaded_contacts(snapshots), np.asarray(edges)
+    times = len(series(snapshots).impulses)
     counts = histograms(times, load.time, load.force * load.force.size / load.force.sum(), edges)
     sums = {"n": counts, "all": np.bincount(load.time, minlength=times)}
-    found = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
-    return Curve(centres(edges), *found)
+    estimates = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
+    return Curve(centres(edges), *estimates)
 
 
-def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
-    """Correlation g_F(r) = ⟨F F'⟩(r)/⟨F⟩² − 1 of loaded contacts of one time whose contact points are r apart.
+def force_correlation(snapshots: Snapshot, edges: ArrayLike) -> Curve:
+    """Correlation g_F(r) = ⟨F F'⟩(r)/⟨F⟩² − 1 of simultaneous loaded contacts whose contact points are r apart.
 
-    ⟨F⟩ is the mean over the series. Variations common to all forces of a snapshot therefore remain as a constant at
-    large r. The edges of the bins, in σ, are below half the side.
+    ⟨F⟩ is the mean over the series, so fluctuations common to all forces of a snapshot leave a constant at large r.
+    ``edges`` (σ) must lie below half the side.
     """
-    frames, load, edges = series(seen), loaded_contacts(seen), np.asarray(edges)
+    frames, load, edges = series(snapshots), loaded_contacts(snapshots), np.asarray(edges)
     radii, times = frames.state.grains.radii, len(frames.impulses)
     contact_distances = radii[load.time, load.i] + radii[load.time, load.j]
     from_j = radii[load.time, load.j] / contact_distances * load.distances
@@ -270,19 +269,19 @@ def force_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
     return Curve(centres(edges), *with_errors(estimate, sums)["g"])
 
 
-def fabric(seen: Snapshot) -> Fabric:
+def fabric(snapshots: Snapshot) -> Fabric:
     """Fabric tensor and the anisotropies of contacts and forces.
 
-    For discs of about one size whose principal directions agree, the stress follows from them:
-    (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, or (a_c + a_n)/(2 + a_c a_n) with the product kept. The mean force at an
-    angle is taken in bins of 15°. The anisotropies of force are NaN if a bin is empty.
+    For nearly monodisperse discs with aligned principal directions they give the stress:
+    (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, or (a_c + a_n)/(2 + a_c a_n) to second order. The mean force at an angle is
+    taken in bins of 15°; the force anisotropy is NaN if a bin is empty.
 
     Source: L. Rothenburg and R. J. Bathurst, Géotechnique 39, 601 (1989).
     """
-    load, times = loaded_contacts(seen), len(series(seen).impulses)
+    load, times = loaded_contacts(snapshots), len(series(snapshots).impulses)
     angle = np.arctan2(load.normals[:, 1], load.normals[:, 0]) % np.pi
     edges = np.linspace(0, np.pi, _DIRECTIONS + 1)
-    angle = np.minimum(angle, np.nextafter(np.pi, 0))  # a tiny negative angle rounds to π
+    angle = np.minimum(angle, np.nextafter(np.pi, 0))  # a tiny negative angle modulo π rounds to π
     sums = {
         "nn": by_time(times, load.time, load.normals[:, :, None] * load.normals[:, None, :]),
         "stress": by_time(times, load.time, load.moments()),
@@ -316,7 +315,7 @@ def _mode(x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def _decay(at: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """Where a curve (..., points) that starts at one first falls to 1/e, by interpolation; NaN if it does not."""
+    """Interpolated point at which a curve (..., points) starting at one first falls to 1/e; NaN if it does not."""
     below = curve < 1 / np.e
     k = np.maximum(np.argmax(below, axis=-1), 1)
     low, high = (np.take_along_axis(curve, n[..., None], axis=-1)[..., 0] for n in (k, k - 1))

@@ -1,4 +1,4 @@
-"""An instant of a flow on the host: where its grains are, how fast they are, and which of them push each other."""
+"""An instant of a flow on the host: positions and speeds of its grains, and the forces between them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from jaxgran.model.cell import centred
 
 
 class Instant(NamedTuple):
-    """The grains of a flow at one time, and the mean forces between them over a short strain around it.
+    """The grains of a flow at one time, and the forces between them averaged over a short strain around it.
 
     =========  ===========  ======  ============================================================
     field      shape        unit    meaning
@@ -22,12 +22,12 @@ class Instant(NamedTuple):
     positions  (grains, 2)  σ       centres, in the sheared cell whose centre is the origin
     radii      (grains,)    σ       radii
     speed      (grains,)    σγ̇      |c|, the peculiar speed
-    pairs      (pairs, 2)   –       numbers of the two grains of each pair that pushes, i < j
+    pairs      (pairs, 2)   –       indices i < j of each pair in loaded contact
     force      (pairs,)     mσγ̇²    mean over the window
-    clustered  (pairs,)     –       whether most of it acts within clusters of three or more
+    clustered  (pairs,)     –       whether most of it acts in clusters of three or more
     side       ()           σ       side of the cell
     tilt       ()           –       offset of the image row above, in sides of the cell
-    window     ()           strain  over which the forces are averaged
+    window     ()           strain  over which forces are averaged
     =========  ===========  ======  ============================================================
     """
 
@@ -44,32 +44,32 @@ class Instant(NamedTuple):
 
 def instant_of(frame: Snapshot) -> Instant:
     """The instant of one snapshot, with the forces of its time step."""
-    seen = jax.tree.map(np.asarray, frame)
-    state, rate, found = seen.state, seen.shear_rate.item(), pair_forces(seen)
+    arrays = jax.tree.map(np.asarray, frame)
+    state, rate, pairs = arrays.state, arrays.shear_rate.item(), pair_forces(arrays)
     side, tilt = state.side.item(), state.tilt.item()
     return Instant(
         positions=centred(state.positions, side, tilt),
         radii=state.grains.radii,
         speed=np.hypot(*state.velocities.T) / rate,
-        pairs=np.stack([found.i, found.j], axis=-1),
-        force=found.force / rate**2,
-        clustered=found.cluster_share > 0.5,
+        pairs=np.stack([pairs.i, pairs.j], axis=-1),
+        force=pairs.force / rate**2,
+        clustered=pairs.cluster_share > 0.5,
         side=side,
         tilt=tilt,
-        window=seen.timestep.item() * rate,
+        window=arrays.timestep.item() * rate,
     )
 
 
 def averaged(instants: Sequence[Instant]) -> Instant:
-    """One instant from those of successive time steps: the grains of the middle one, and the mean forces over all."""
+    """One instant from those of successive time steps: grains of the middle one, forces averaged over all."""
     middle = instants[len(instants) // 2]
     pairs, force, clustered = (
         np.concatenate([getattr(one, name) for one in instants]) for name in ("pairs", "force", "clustered")
     )
-    kept, pair = np.unique(pairs, axis=0, return_inverse=True)
-    total, in_clusters = (np.bincount(pair.ravel(), force * w, minlength=len(kept)) for w in (1, clustered))
+    distinct, pair = np.unique(pairs, axis=0, return_inverse=True)
+    total, in_clusters = (np.bincount(pair.ravel(), force * w, minlength=len(distinct)) for w in (1, clustered))
     return middle._replace(
-        pairs=kept,
+        pairs=distinct,
         force=total / len(instants),
         clustered=ratio(in_clusters, total) > 0.5,
         window=sum(one.window for one in instants),

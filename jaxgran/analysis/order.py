@@ -1,4 +1,4 @@
-"""Structure of a flow: coordination, pair correlation, hexatic order and profiles, from snapshots."""
+"""Structure of a flow from snapshots: coordination, pair correlation, hexatic order, profiles."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ from jaxgran.analysis.force_chains import loaded_contacts
 from jaxgran.analysis.series import Curve, Measured, all_pairs, centres, histograms, ratio, series, with_errors
 from jaxgran.dynamics.snapshots import Snapshot
 
-_IMAGE_SPACINGS = 5  # margin of images around the cell, in mean grain spacings; longer than any Delaunay edge
+_IMAGE_SPACINGS = 5  # margin of images in mean grain spacings, longer than any Delaunay edge
 
 
 class Coordination(NamedTuple):
-    """Contacts per grain: twice the number of contacts over the number of grains.
+    """Coordination number: twice the number of contacts over the number of grains.
 
-    A rattler has fewer than three contacts. Rattlers are removed until none is left.
+    Rattlers, grains with fewer than three contacts, are removed recursively.
     """
 
     loaded: Measured
@@ -27,9 +27,9 @@ class Coordination(NamedTuple):
 
 
 class HexaticOrder(NamedTuple):
-    """``overall`` |⟨ψ₆⟩| over the grains, about N^(−1/2) without order, and ``local`` ⟨|ψ₆|⟩.
+    """``overall`` |⟨ψ₆⟩| and ``local`` ⟨|ψ₆|⟩ over the grains; both are 1 in a hexagonal crystal.
 
-    Both are 1 in a hexagonal crystal.
+    Without order, the former is about N^(−1/2).
     """
 
     overall: Measured
@@ -44,14 +44,13 @@ class Profiles(NamedTuple):
     laboratory_velocity: Curve
 
 
-def coordination(seen: Snapshot, tolerance: float = 1e-3) -> Coordination:
+def coordination(snapshots: Snapshot, tolerance: float = 1e-3) -> Coordination:
     """Coordination number of the loaded contacts, and of all pairs whose gap is at most ``tolerance`` (σ)."""
-    frames, load = series(seen), loaded_contacts(seen)
+    frames, load = series(snapshots), loaded_contacts(snapshots)
     times, grains = frames.state.positions.shape[:2]
     radii = frames.state.grains.radii
-    ends = np.zeros(
-        (4, times)
-    )  # twice the contacts: loaded, loaded without rattlers, touching, touching without rattlers
+    # rows: loaded, loaded without rattlers, touching, touching without rattlers
+    ends = np.zeros((4, times))  # twice the contacts
     kept = np.full((4, times), float(grains))
     for t, (i, j, separations) in enumerate(all_pairs(frames)):
         touching = np.linalg.norm(separations, axis=-1) - radii[t, i] - radii[t, j] <= tolerance
@@ -59,17 +58,17 @@ def coordination(seen: Snapshot, tolerance: float = 1e-3) -> Coordination:
         for k, (a, b) in enumerate(((load.i[here], load.j[here]), (i[touching], j[touching]))):
             ends[2 * k, t] = 2 * len(a)
             ends[2 * k + 1, t], kept[2 * k + 1, t] = _without_rattlers(a, b, grains)
-    found = with_errors(lambda s: {"z": ratio(s["ends"], s["kept"])}, {"ends": ends.T, "kept": kept.T})["z"]
-    return Coordination(*(Measured(*number) for number in zip(*found, strict=True)))
+    z = with_errors(lambda s: {"z": ratio(s["ends"], s["kept"])}, {"ends": ends.T, "kept": kept.T})["z"]
+    return Coordination(*(Measured(*number) for number in zip(*z, strict=True)))
 
 
-def pair_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
-    """Pair correlation g against r/((d_i + d_j)/2), the separation over the contact distance, so that contact is at 1.
+def pair_correlation(snapshots: Snapshot, edges: ArrayLike) -> Curve:
+    """Pair correlation g against the separation over the contact distance, r/((d_i + d_j)/2).
 
-    g is the number of pairs in a bin over the number for random points in the cell: g = 1 without correlations. It is
-    valid while the last edge times the largest diameter is below half the side.
+    g is the number of pairs in a bin over that of random points in the cell. It is valid as long as the last edge times
+    the largest diameter is below half the side.
     """
-    frames, edges = series(seen), np.asarray(edges)
+    frames, edges = series(snapshots), np.asarray(edges)
     i, j = np.triu_indices(frames.state.positions.shape[1], 1)
     contact_distances = frames.state.grains.radii[:, i] + frames.state.grains.radii[:, j]
     pairs = [
@@ -78,18 +77,18 @@ def pair_correlation(seen: Snapshot, edges: ArrayLike) -> Curve:
     ]
     at_random = np.pi * np.sum(contact_distances**2, axis=1) / frames.state.side**2
     expected = at_random[:, None] * np.diff(edges**2)
-    found = with_errors(
+    estimates = with_errors(
         lambda s: {"g": ratio(s["pairs"], s["expected"])}, {"pairs": np.stack(pairs), "expected": expected}
     )
-    return Curve(centres(edges), *found["g"])
+    return Curve(centres(edges), *estimates["g"])
 
 
-def hexatic_order(seen: Snapshot) -> HexaticOrder:
-    """Sixfold order of the bond angles θ: ψ₆ of a grain is the mean of exp(6iθ) over its Delaunay neighbours.
+def hexatic_order(snapshots: Snapshot) -> HexaticOrder:
+    """Sixfold bond-orientational order: ψ₆ of a grain is the mean of exp(6iθ) over its Delaunay neighbours.
 
     Source: D. R. Nelson and B. I. Halperin, Phys. Rev. B 19, 2457 (1979).
     """
-    state = series(seen).state
+    state = series(snapshots).state
     orders = []
     for positions, side, tilt in zip(state.positions, state.side, state.tilt, strict=True):
         points, grains = _with_images(positions, side, tilt), len(positions)
@@ -99,13 +98,13 @@ def hexatic_order(seen: Snapshot) -> HexaticOrder:
         waves = np.exp(6j * np.arctan2(bonds[:, 1], bonds[:, 0]))
         psi = np.add.reduceat(waves, first[:grains]) / count
         orders.append([1.0, np.abs(psi.mean()), np.abs(psi).mean()])
-    found = with_errors(lambda s: {"psi": s["x"][..., 1:] / s["x"][..., :1]}, {"x": np.array(orders)})["psi"]
-    return HexaticOrder(*(Measured(*order) for order in zip(*found, strict=True)))
+    psi6 = with_errors(lambda s: {"psi": s["x"][..., 1:] / s["x"][..., :1]}, {"x": np.array(orders)})["psi"]
+    return HexaticOrder(*(Measured(*order) for order in zip(*psi6, strict=True)))
 
 
-def profiles(seen: Snapshot, bins: int = 10) -> Profiles:
-    """Density and mean velocity in bands of equal height across the cell. The side must be the same at all times."""
-    frames = series(seen)
+def profiles(snapshots: Snapshot, bins: int = 10) -> Profiles:
+    """Density and mean velocity in bands of equal height; the side must be the same at all times."""
+    frames = series(snapshots)
     state, shear_rate = frames.state, frames.shear_rate
     times, grains = state.positions.shape[:2]
     edges = np.linspace(0, state.side[0], bins + 1)
@@ -114,14 +113,14 @@ def profiles(seen: Snapshot, bins: int = 10) -> Profiles:
     weights = {"n": np.ones_like(masses), "m": masses, "p": masses * state.velocities[..., 0]}
     sums = {name: histograms(times, time, height, edges, x.ravel()) for name, x in weights.items()}
     sums["area"] = state.side**2 / bins
-    found = with_errors(lambda s: {"n": s["n"] / s["area"][..., None], "c": ratio(s["p"], s["m"])}, sums)
+    estimates = with_errors(lambda s: {"n": s["n"] / s["area"][..., None], "c": ratio(s["p"], s["m"])}, sums)
     heights = centres(edges)
-    laboratory = Curve(heights, found["c"].value + shear_rate[0] * heights, found["c"].error)
-    return Profiles(Curve(heights, *found["n"]), Curve(heights, *found["c"]), laboratory)
+    laboratory = Curve(heights, estimates["c"].value + shear_rate[0] * heights, estimates["c"].error)
+    return Profiles(Curve(heights, *estimates["n"]), Curve(heights, *estimates["c"]), laboratory)
 
 
 def _without_rattlers(i: np.ndarray, j: np.ndarray, grains: int) -> tuple[int, int]:
-    """Twice the contacts, and the grains, left when grains with fewer than three contacts are removed in turn."""
+    """Twice the contacts, and the grains, that remain when rattlers are removed recursively."""
     while True:
         count = np.bincount(np.concatenate([i, j]), minlength=grains)
         kept = (count[i] > 2) & (count[j] > 2)
@@ -131,7 +130,7 @@ def _without_rattlers(i: np.ndarray, j: np.ndarray, grains: int) -> tuple[int, i
 
 
 def _with_images(positions: Float[np.ndarray, "grains 2"], side: float, tilt: float) -> Float[np.ndarray, "points 2"]:
-    """Positions of the grains, then of their images in a margin around the cell."""
+    """Positions of the grains, followed by those of their images in a margin around the cell."""
     lattice = side * np.array([[1, 0], [tilt, 1]])
     fractional = positions @ np.linalg.inv(lattice)
     fractional -= np.floor(fractional)

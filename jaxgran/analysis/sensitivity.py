@@ -1,16 +1,15 @@
-"""How fast the derivatives of a flow grow with strain, and how near a run comes to points without a derivative.
+"""How fast the derivatives of a flow grow with strain.
 
 Colliding discs are chaotic: the effect of a change of the restitution on the state grows exponentially with strain.
-The derivative of the state is exact, but it is useless beyond the strain at which it exceeds the size of the state.
+The derivative of the state is exact, but useless beyond the strain at which it exceeds the size of the state.
 
-Within the fixed time steps of a run the state is a smooth function of its parameters, except at two kinds of points. At
-one kind a contact of the solve neither presses nor parts. At the other a pair becomes a contact exactly at the end of a
-step. There left and right derivatives differ, and the derivative returned is that of the contacts found.
+At fixed time steps the state is a smooth function of its parameters except where a contact of the solve neither presses
+nor separates, or where a pair becomes a contact exactly at the end of a step. There the left and right derivatives
+differ, and the one returned is that of the contacts in the solve.
 """
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,32 +17,28 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import delassus_product, diagonal
-from jaxgran.contact.network import first_contact_time
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
 from jaxgran.dynamics.jax_engine import advance_by_jax
-from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.checks import require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
 
 _EXACT = BarzilaiBorwein(tolerance=1e-8)
-_MOST_POINTS = 10**6  # of a growth curve, which is held in memory
+_MOST_POINTS = 10**6  # of a growth curve, held in memory
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Growth:
-    """Growth of ∂(state)/∂α along a flow.
+    """Growth of ∂(state)/∂α with strain.
 
     ==========  =========  ====  ==================================================================
     field       shape      unit  meaning
     ==========  =========  ====  ==================================================================
-    strain      (points,)  –     strain since the beginning, where the derivative is zero
+    strain      (points,)  –     strain since the start, where the derivative is zero
     derivative  (points,)  –     root mean square over the grains of |∂(position)/∂α| in σ and
                                  |∂(velocity)/∂α| in σγ̇, together
-    status      (points,)  –     worst status since the beginning
+    status      (points,)  –     worst status since the start
     ==========  =========  ====  ==================================================================
     """
 
@@ -61,18 +56,18 @@ def growth(
     *,
     solver: ProjectedMethod = _EXACT,
 ) -> Growth:
-    """The derivative of a flow with respect to its restitution at equal intervals of strain.
+    """Size of the derivative of a flow with respect to its restitution, at equal intervals of strain.
 
     Args:
       flow: parameters of the state.
-      state: the flow at the beginning.
+      state: initial state of the flow.
       strain: total strain.
       count: number of points, static.
-      moving_contacts: whether the derivative lets contacts move in time, see ``dynamics.jax_engine``.
-      solver: solves the contacts of each step; derivatives want a tolerance of 1e-8 or less.
+      moving_contacts: whether the derivative includes the change of contact times, see ``dynamics.jax_engine``.
+      solver: solves the contacts of each step, with a tolerance of 1e-8 or less.
 
     Raises:
-      InputError: (a ValueError) the strain is shorter than a time step for each point.
+      InputError: the strain is shorter than ``count`` time steps.
     """
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_POINTS, "as memory is limited")
@@ -113,8 +108,8 @@ def _growth(
 def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float, float]:
     """Rate λ of |∂(state)/∂α| ∝ exp(λ γ), per unit strain γ, with its standard error.
 
-    The rate of each run is the least-squares slope over the last three quarters of its strain, because the derivative
-    is zero at the beginning. The error is that of the mean over runs.
+    The rate of a run is the least-squares slope over the last three quarters of its strain, since the derivative starts
+    from zero. The error is that of the mean over runs.
 
     Args:
       strain: (points,).
@@ -123,51 +118,3 @@ def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float
     later = strain >= strain[-1] / 4
     slopes = np.polyfit(strain[later], np.log(derivative[:, later]).T, 1)[0]
     return float(slopes.mean()), float(slopes.std(ddof=1) / np.sqrt(len(slopes)))
-
-
-class Margins(NamedTuple):
-    """How far each step of a run is from a change of its contacts; zero at a point without a derivative.
-
-    ==========  ========  ====  ============================================================================
-    field       shape     unit  meaning
-    ==========  ========  ====  ============================================================================
-    pressing    (times,)  –     for each contact the larger of W_kk p_k and the velocity at which it parts;
-                                the smallest of these over the root mean square velocity of approach;
-                                infinite without contacts
-    activation  (times,)  dt    for each pair the time between its touching and the end of the look-ahead
-                                that makes it a contact; the smallest of these
-    ==========  ========  ====  ============================================================================
-    """
-
-    pressing: Float[Array, " times"]
-    activation: Float[Array, " times"]
-
-
-@partial(jax.jit, static_argnums=0)
-def margins(activation_fraction: float, series: Snapshot) -> Margins:
-    """Margins of the steps of a run, from a snapshot of every step (``snapshot_series`` with a count of its steps).
-
-    All pairs of grains are compared, so memory and time grow as N².
-
-    Args:
-      activation_fraction: look-ahead of the flow in time steps, static.
-      series: snapshots with a leading (times,) axis.
-    """
-
-    def one(seen: Snapshot) -> tuple[Array, Array]:
-        state, contacts = seen.state, seen.contacts
-        count = state.grains.radii.size
-        impulses = seen.impulses / (1 + seen.restitution)
-        pressing = diagonal(contacts, count) * impulses
-        parting = delassus_product(contacts, impulses, count) + contacts.approach
-        used = jnp.sum(contacts.used.astype(pressing.dtype))
-        scale = jnp.sqrt(jnp.sum(contacts.approach**2) / jnp.maximum(1, used))
-        strict = jnp.where(contacts.used, jnp.maximum(pressing, parting), jnp.inf)
-        i, j = jnp.triu_indices(count, 1)
-        separations = displacement(state.positions[i], state.positions[j], state.side, state.tilt)
-        velocities = relative_velocity(state.velocities, i, j, separations, seen.shear_rate)
-        time, _ = first_contact_time(separations, velocities, state.grains.radii[i] + state.grains.radii[j])
-        late = jnp.abs(time / seen.timestep - activation_fraction)
-        return jnp.min(strict) / jnp.where(scale > 0, scale, 1), jnp.min(late)
-
-    return Margins(*lax.map(one, series))

@@ -1,7 +1,6 @@
 """Averages over a series of snapshots on the host, with standard errors.
 
-The standard errors are those of the jackknife over blocks of successive times, because successive times are correlated
-(``statistics``).
+Errors come from the jackknife over blocks of times, since successive times are correlated (``statistics``).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +20,7 @@ BLOCKS = 32  # of successive times, for the standard errors
 
 
 class Measured(NamedTuple):
-    """An average over the times of a series and its standard error, of one shape; NaN where nothing was counted."""
+    """An average over the times of a series and its standard error, of equal shape; NaN where nothing was counted."""
 
     value: np.ndarray
     error: np.ndarray
@@ -35,18 +34,17 @@ class Curve(NamedTuple):
     error: np.ndarray
 
 
-def series(seen: Snapshot) -> Any:
-    """A Snapshot with NumPy arrays in place of JAX arrays; a single snapshot becomes a series of one time."""
-    seen = jax.tree.map(np.asarray, seen)
-    return seen if seen.state.side.ndim else jax.tree.map(lambda x: x[None], seen)
+def series(snapshots: Snapshot) -> Any:
+    """A Snapshot with NumPy instead of JAX arrays; a single snapshot becomes a series of length one."""
+    frames = jax.tree.map(np.asarray, snapshots)
+    return frames if frames.state.side.ndim else jax.tree.map(lambda x: x[None], frames)
 
 
 def with_errors(estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]) -> dict[str, Measured]:
     """Estimates from sums of shape (times, ...) and their standard errors by the jackknife over blocks of times.
 
-    ``estimate`` maps sums with any leading axes in place of (times,) to named estimates with the same leading axes. The
-    times are joined into at most ``BLOCKS`` blocks, and these into larger ones. So the errors include the correlation
-    between times.
+    ``estimate`` maps sums with any leading axes to named estimates with the same leading axes. Times are merged into at
+    most ``BLOCKS`` blocks, and these into larger ones, so the errors include the correlation between times.
     """
     times = len(next(iter(sums.values())))
     blocks = min(times, BLOCKS)
@@ -58,13 +56,13 @@ def with_errors(estimate: Callable[[Sums], Sums], sums: Mapping[str, np.ndarray]
 
 
 def ratio(numerator: Any, denominator: Any) -> np.ndarray:
-    """A quotient that is NaN, without a warning, where the denominator is zero."""
+    """A quotient that is NaN where the denominator is zero, without a warning."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator != 0)
 
 
 def all_pairs(frames: Any) -> Iterator[tuple[np.ndarray, np.ndarray, Float[np.ndarray, "pairs 2"]]]:
-    """For each time of a series: grains i < j of every pair, and the minimum-image separation from j to i in σ."""
+    """For each time of a series, grains i < j of every pair and the minimum-image separation from j to i (σ)."""
     i, j = np.triu_indices(frames.state.positions.shape[1], 1)
     for positions, side, tilt in zip(frames.state.positions, frames.state.side, frames.state.tilt, strict=True):
         yield i, j, minimum_image(positions[i] - positions[j], side, tilt)
@@ -80,7 +78,7 @@ def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:
 def histograms(
     times: int, time: np.ndarray, x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None
 ) -> Float[np.ndarray, "times bins"]:
-    """A histogram for each time; bins contain their lower edge."""
+    """A histogram for each time; a bin contains its lower edge."""
     bins = len(edges) - 1
     place = np.searchsorted(edges, x, side="right") - 1
     inside = (place >= 0) & (place < bins)

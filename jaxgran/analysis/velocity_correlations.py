@@ -1,17 +1,17 @@
-"""Tests of the assumptions of kinetic theory on snapshots: velocities, pairs at contact, and their correlation.
+"""Tests of the assumptions of kinetic theory on snapshots: velocity distribution and pairs at contact.
 
-Enskog theory makes two assumptions about a pair that is about to collide. The velocities of its grains are independent
-(molecular chaos) and nearly Gaussian. The number of such pairs is that of equilibrium, χ times that of random points.
+Enskog theory assumes that two grains about to collide have independent (molecular chaos), nearly Gaussian velocities,
+and that the number of such pairs is that of equilibrium, χ times that of random points.
 
 A snapshot is taken before its contacts act, so the pairs about to collide are those that approach each other. Their
-density over the gap g is extrapolated to contact. A sum over the approaching pairs with 0 ≤ g < ε, weighted by
+density over the gap g is extrapolated to contact: the sum over approaching pairs with 0 ≤ g < ε, weighted by
 W(g) = (9 − 36 g/ε + 30 g²/ε²)/ε, is the value at g = 0 of the least-squares parabola.
 
-Overlapping pairs have no weight. A contact may act up to half a step's flight after touching, so they would be counted
-in addition. Receding pairs are left out: they describe the collision behind them, not the next one. Within a step's
-flight of contact they are also too few.
+Overlapping pairs have no weight: a contact may act up to half a step's flight after touching, so they would be counted
+twice. Receding pairs are excluded because they describe the previous collision, and because they are depleted within
+a step's flight of contact.
 
-Snapshots are read on the host. Standard errors are those of blocks of times, see ``series``.
+Snapshots are analysed on the host; standard errors come from blocks of times, see ``series``.
 """
 
 from typing import Any, NamedTuple
@@ -42,13 +42,13 @@ class VelocityDistribution(NamedTuple):
     sonine              ()         –       a₂ of ⟨w⁴⟩ = 2⟨w²⟩²(1 + a₂)
     sonine_excess       ()         –       a₂ less that of an anisotropic Gaussian
     size_classes        (classes,) σ       mean diameters of classes of equally many grains
-    size_temperatures   (classes,) mσ²γ̇²   T of each class; all equal with equipartition
+    size_temperatures   (classes,) mσ²γ̇²   T of each class; equal under equipartition
     size_tensors        (classes,  mσ²γ̇²   ⟨w w⟩ of each class
                         2, 2)
     ==================  =========  ======  ============================================================================
 
     An anisotropic Gaussian has ⟨w⁴⟩ = (tr S)² + 2 tr S² with S = ⟨w w⟩, hence a₂ = (anisotropy² + shear²)/2.
-    If the temperature differs from grain to grain or varies in time, its relative variance adds to a₂.
+    If the temperature varies between grains or in time, its relative variance adds to a₂.
     """
 
     temperature: Measured
@@ -72,15 +72,15 @@ class NearContact(NamedTuple):
     contact_ratio         ()      –      contact_value over the χ of an equilibrium mixture
     collision_rate        ()      –      collisions per grain and unit strain; each grain counts all its collisions
     rate_ratio            ()      –      collision_rate over Enskog's
-    binary_stress         (2, 2)  mγ̇²    collisional stress of kinetic theory, its integral taken over these pairs
+    binary_stress         (2, 2)  mγ̇²    collisional stress of kinetic theory, summed over these pairs
     speed_ratio           ()      –      ⟨u_n²⟩ over that of independent Gaussian velocities
     velocity_correlation  ()      –      ⟨w_i·w_j⟩/2T, w = √m c; 0 for independent velocities
     ====================  ======  =====  =========================================================================
 
     The binary stress is Σ^{ab} = (1/A) Σ W r n^a n^b (1 + α) μ u_n², μ the reduced mass and u_n the normal velocity. It
-    gives the stress of the binary forces without using any contact (Lois, Lemaître and Carlson, equation of Σ_bc).
-    Enskog's rate has isotropic directions. The speed ratio uses the measured directions, so that fabric does not enter.
-    The collision rate counts encounters. It does not count the steps in which a lasting contact goes on approaching.
+    gives the stress of the binary forces without any contact (Σ_bc of Lois, Lemaître and Carlson). Enskog's rate
+    assumes isotropic directions; the speed ratio uses the measured ones, so fabric does not enter. The collision rate
+    counts encounters, not the steps in which a lasting contact continues to approach.
 
     Source for χ before, not after, the collision: R. Soto and M. Mareschal, Phys. Rev. E 63, 041303 (2001).
     """
@@ -94,14 +94,14 @@ class NearContact(NamedTuple):
     velocity_correlation: Measured
 
 
-def velocity_distribution(seen: Snapshot, classes: int = SIZE_CLASSES) -> VelocityDistribution:
+def velocity_distribution(snapshots: Snapshot, classes: int = SIZE_CLASSES) -> VelocityDistribution:
     """Temperature tensor, equipartition and kurtosis of the peculiar velocities.
 
     Args:
-      seen: a series of snapshots.
-      classes: number of size classes, of equally many grains each.
+      snapshots: a series.
+      classes: number of size classes, with equally many grains each.
     """
-    state = series(seen).state
+    state = series(snapshots).state
     w = np.sqrt(state.grains.masses)[..., None] * state.velocities
     square = np.sum(w**2, axis=-1)
     radii = state.grains.radii[0]
@@ -136,10 +136,10 @@ def velocity_distribution(seen: Snapshot, classes: int = SIZE_CLASSES) -> Veloci
 
 
 def mixture_contact_value(d_i: Any, d_j: Any, radii: Float[np.ndarray, " grains"], nu: float) -> Any:
-    """χ of pairs of discs of diameters d_i and d_j, numbers or arrays in σ, in an equilibrium mixture.
+    """Contact value χ of discs of diameters d_i and d_j (σ, broadcast) in an equilibrium mixture.
 
-    ``radii`` (grains,) in σ are those of the mixture, ν is its packing fraction.
-    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)². For discs of one size it is Henderson's value.
+    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)², with ⟨·⟩ over the ``radii`` (grains,) of the
+    mixture and ν its packing fraction. For discs of one size it is Henderson's value.
 
     Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
@@ -150,22 +150,22 @@ def mixture_contact_value(d_i: Any, d_j: Any, radii: Float[np.ndarray, " grains"
 def contact_shell(packing_fraction: float) -> float:
     """Width ε (σ) of the shell of gaps around a grain that holds about one neighbour, (1 − ν)²/8ν, at most 0.1.
 
-    The number of neighbours per unit gap is 8νχ at contact. It decreases over about the gap that holds one neighbour.
+    The number of neighbours per unit gap is 8νχ at contact, and decays over about the gap that holds one neighbour.
     """
     return min(WIDEST_SHELL, (1 - packing_fraction) ** 2 / (8 * packing_fraction))
 
 
-def near_contact(seen: Snapshot, shell: float | None = None) -> NearContact:
+def near_contact(snapshots: Snapshot, shell: float | None = None) -> NearContact:
     """Contact value, collision rate, binary stress and velocity correlation of the pairs at contact.
 
     Args:
-      seen: a series. Several snapshots during the time in which a pair crosses the shell add little.
-      shell: ε in σ, over which the densities are extrapolated, by default ``contact_shell``. It should be several times
-        the flight of a time step. If the results keep changing as it is narrowed, as in clustering flows, the density
-        has no value at contact. The results are then those of the pairs within ε.
+      snapshots: a series. Snapshots closer in time than a pair takes to cross the shell add little.
+      shell: ε in σ, over which densities are extrapolated, by default ``contact_shell``. It should be several times the
+        flight of a time step. If results keep changing as it narrows, as in clustering flows, the density has no limit
+        at contact and the results are those of the pairs within ε.
     """
-    frames = series(seen)
-    state, velocities = frames.state, velocity_distribution(seen)
+    frames = series(snapshots)
+    state, velocities = frames.state, velocity_distribution(snapshots)
     radii, masses, side, shear_rate = state.grains.radii[0], state.grains.masses[0], state.side[0], frames.shear_rate[0]
     shell = shell or contact_shell(np.pi * np.sum(radii**2) / side**2)
     tensors = _grain_tensors(radii, velocities) / masses[:, None, None]  # of c
@@ -219,14 +219,14 @@ def _grain_tensors(radii: np.ndarray, velocities: VelocityDistribution) -> Float
 
 
 def _normal_variance(tensors: np.ndarray, i: np.ndarray, j: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Variance of the relative velocity along n of independent grains; n is (pairs, 2)."""
+    """Variance of the relative velocity of independent grains along n (pairs, 2)."""
     x, y = n[..., 0], n[..., 1]
     relative = tensors[i] + tensors[j]
     return x * x * relative[:, 0, 0] + 2 * x * y * relative[:, 0, 1] + y * y * relative[:, 1, 1]
 
 
 def _approach_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Averages of 1, −u and u² over the negative values of a Gaussian u, zero elsewhere."""
+    """Averages of 1, −u and u² over the negative values of a Gaussian u."""
     deviation = np.sqrt(np.maximum(variance, _TINY))
     z = -mean / deviation
     share, bell = ndtr(z), np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
@@ -236,9 +236,9 @@ def _approach_moments(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarra
 def _enskog(
     radii: np.ndarray, masses: np.ndarray, tensors: np.ndarray, side: float, shear_rate: float
 ) -> tuple[float, float, float]:
-    """Approaching pairs per gap at contact: of random points, with Enskog's χ, and the flux of the latter to contact.
+    """Approaching pairs per gap at contact: for random points, with Enskog's χ, and the flux of the latter to contact.
 
-    Each is a sum over all pairs of (d/A) ∮ dn, without or with χ, of a moment of the approach of Gaussian velocities.
+    Each is a sum over all pairs of (d/A) ∮ dn, without or with χ, of a moment of Gaussian approach velocities.
     """
     i, j = np.triu_indices(len(radii), 1)
     contact_distances = radii[i] + radii[j]

@@ -104,7 +104,7 @@ def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:
     tracks = read_tracks(file, **observed)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "the interval may not hold")  # printed below
+            warnings.filterwarnings("ignore", "the interval may be too narrow")  # printed below
             found = fit_restitution(tracks, **noise)
     except RuntimeError as failure:
         stop(str(failure), BAD_STATUS)

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from jaxgran import environment
-from jaxgran.caches import users_folder, why_unwritable
+from jaxgran.cache.folder import users_folder, why_unwritable
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}

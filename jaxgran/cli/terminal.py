@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
-from jaxgran.caches import cache_folder, enable_cache, fallback_message
+from jaxgran.cache.folder import cache_folder, enable_cache, fallback_message
 from jaxgran.environment import devices
 
 NO_FILE = 1

@@ -1,19 +1,19 @@
-"""A closure for flows beyond kinetic theory: its stresses times fitted corrections, and a law of the force ratio.
+"""A closure beyond kinetic theory: fitted corrections to its stresses, and a law for the force ratio.
 
-ε = 1 − α² is the share of energy that a collision loses, ν_J the packing fraction of jamming and x = −ln(1 − ν/ν_J) the
+ε = 1 − α² is the relative energy loss of a collision, ν_J the packing fraction at jamming, and x = −ln(1 − ν/ν_J) the
 crowding. The laws are
 
     ln(P/P_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · a
     ln(μ/μ_theory)      = (ε, ε⁶) ⊗ (ν, x, x²) · b,  μ = τ/P
     ln(force ratio − 1) = (1, 1 − α, ln(1 − α), x, (1 − α) x) · c
 
-The theory is that of anisotropic Gaussian velocities. Both corrections of the stresses vanish as ν → 0 and as α → 1.
-The excess of the force ratio is positive, vanishes as α → 1, and grows at jamming as a power of ν_J − ν. The powers of
-ε were chosen by cross-validation: ε corrects all flows with α < 1, ε⁶ the strongly dissipative ones. Friction is fitted
-instead of the shear stress, because τ and P have common noise that nearly cancels in τ/P.
+The theory is that of anisotropic Gaussian velocities. Both stress corrections vanish as ν → 0 and as α → 1. The excess
+of the force ratio, F − 1, is positive, vanishes as α → 1, and diverges at jamming as a power of ν_J − ν. The powers of
+ε were chosen by cross-validation: ε corrects all flows with α < 1, ε⁶ strongly dissipative ones. Friction is fitted
+rather than the shear stress, since τ and P share noise that nearly cancels in τ/P.
 
-The laws of the stresses are linear in their coefficients and fitted by linear least squares. The law of the force ratio
-F is not linear: F has Gaussian errors, but ln(F − 1) has not. L-BFGS minimises its squares.
+The stress laws are linear in their coefficients and fitted by linear least squares. The law of the force ratio is not:
+F has Gaussian errors, but ln(F − 1) does not. Its sum of squares is minimised by L-BFGS.
 """
 
 from __future__ import annotations
@@ -48,9 +48,8 @@ class Law:
     field         shape           meaning; all are dimensionless
     ============  ==============  =====================================================================
     coefficients  (terms,)        a, b or c of the formulas above
-    deviations    (terms, terms)  square root D of their covariance D Dᵀ; it keeps more digits
-    scatter       ()              standard deviation of the points about the law that their own errors
-                                  do not explain
+    deviations    (terms, terms)  square root D of their covariance D Dᵀ, for accuracy
+    scatter       ()              standard deviation of the points about the law, beyond their errors
     ============  ==============  =====================================================================
     """
 
@@ -95,7 +94,7 @@ class Closure:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Prediction:
-    """What a closure predicts; each field has the shape (*flows) of α and ν.
+    """Prediction of a closure; each field has the shape (*flows) of α and ν.
 
     ==============  ====  ====================================================================================
     field           unit  meaning
@@ -103,8 +102,8 @@ class Prediction:
     force_ratio     –     ⟨F⟩/⟨F_bc⟩
     pressure        mγ̇²   half the trace of the stress, contacts and kinetic
     shear_stress    mγ̇²   positive, contacts and kinetic
-    …_stderr        as …  standard errors of the prediction, compared with a measurement without noise: from
-                          the covariance of the coefficients and the scatter of the points about the law
+    …_stderr        as …  standard errors with respect to a noiseless measurement, from the covariance of the
+                          coefficients and the scatter of the points about the law
     extrapolated    –     true outside the fitted restitutions or packing fractions; the errors are unreliable
     ==============  ====  ====================================================================================
     """
@@ -119,14 +118,14 @@ class Prediction:
 
 
 def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> Prediction:
-    """Predict force ratio and stresses; it can be differentiated, and used in ``jit`` and ``vmap``.
+    """Predict force ratio and stresses; supports ``jit``, ``vmap`` and differentiation.
 
     ================  ==========  ==================================================================
     closure           Closure     as :func:`fit_closure` returns
     restitution       (*flows)    0 ≤ α < 1; as α → 1 the stresses are those of theory, which diverge
     packing_fraction  (*flows)    0 < ν ≤ 0.83, of a shape that broadcasts with that of α
     returns           Prediction  with ``extrapolated`` set outside the fitted ranges
-    raises            InputError  a number is outside its range; traced numbers are not checked
+    raises            InputError  a number is out of range; traced numbers are not checked
     ================  ==========  ==================================================================
     """
     require_closure(closure)
@@ -159,13 +158,13 @@ def prediction(closure: Closure, alpha: Array, nu: Array) -> Prediction:
 
 def stress_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Array:
     """Terms of the corrections of pressure and friction, (..., 6)."""
-    loss, crowding = 1 - alpha**2, -jnp.log1p(-nu / jamming_fraction)
+    energy_loss, crowding = 1 - alpha**2, -jnp.log1p(-nu / jamming_fraction)
     density = jnp.stack([nu, crowding, crowding**2], axis=-1)
-    return jnp.concatenate([loss[..., None] * density, loss[..., None] ** 6 * density], axis=-1)
+    return jnp.concatenate([energy_loss[..., None] * density, energy_loss[..., None] ** 6 * density], axis=-1)
 
 
 def excess_terms(alpha: Numbers, nu: Numbers, jamming_fraction: Numbers) -> Array:
-    """Terms of the logarithm of the force ratio's excess over one, (..., 5)."""
+    """Terms of the logarithm of the excess, force ratio − 1, (..., 5)."""
     crowding = -jnp.log1p(-nu / jamming_fraction)
     inelasticity = 1 - alpha
     terms = [jnp.ones_like(inelasticity), inelasticity, jnp.log(inelasticity), crowding, inelasticity * crowding]
@@ -196,33 +195,33 @@ def _outside(value: Array, span: Numbers) -> Array:
 
 def require_closure(closure: Closure) -> None:
     if not isinstance(closure, Closure):
-        raise InputError(f"closure must be a Closure, as fit_closure returns, not {short_repr(closure)}.")
+        raise InputError(f"closure must be a Closure from fit_closure, not {short_repr(closure)}.")
 
 
 def require_fraction(packing_fraction: Scalar) -> None:
-    words = f"above 0 and at most {MAX_PACKING_FRACTION}"
-    require("packing_fraction", packing_fraction, lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION), words)
+    accepted = f"above 0 and at most {MAX_PACKING_FRACTION}"
+    require("packing_fraction", packing_fraction, lambda x: (x > 0) & (x <= MAX_PACKING_FRACTION), accepted)
 
 
 def require_jamming(jamming_fraction: float) -> None:
-    words = f"a number above {MAX_PACKING_FRACTION} and at most 1"
-    require_number("jamming_fraction", jamming_fraction, lambda x: (x > MAX_PACKING_FRACTION) & (x <= 1), words)
+    accepted = f"a number above {MAX_PACKING_FRACTION} and at most 1"
+    require_number("jamming_fraction", jamming_fraction, lambda x: (x > MAX_PACKING_FRACTION) & (x <= 1), accepted)
 
 
 def broadcast(**numbers: Scalar | np.ndarray) -> list[Array]:
-    """Numbers as arrays of one floating-point type and one shape."""
+    """Numbers as arrays of a common floating-point type and shape."""
     shapes = {name: np.shape(x) for name, x in numbers.items()}
     try:
         shape = np.broadcast_shapes(*shapes.values())
     except ValueError:
-        words = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise InputError(f"the numbers must have shapes that broadcast, not {words}.") from None
+        given = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise InputError(f"the numbers must have shapes that broadcast, not {given}.") from None
     dtype = jnp.result_type(float, *numbers.values())
     return [jnp.broadcast_to(jnp.asarray(x, dtype), shape) for x in numbers.values()]
 
 
 def elementwise(function: Callable, *arrays: Array):
-    """Apply a function of scalars to every entry of arrays of one shape."""
+    """Apply a function of scalars to every entry of arrays of equal shape."""
     results = jax.vmap(function)(*(x.reshape(-1) for x in arrays))
     return jax.tree.map(lambda x: x.reshape(arrays[0].shape), results)
 

@@ -23,9 +23,7 @@ from jaxgran.sampling.timestep import JAMMING
 
 FEWEST_POINTS = 12  # of a map
 FEWEST_VALUES = 3  # of restitution, and of packing fraction, among the points
-_LEAST_ERROR = (
-    1e-4  # relative, of a measured value: blocks without clusters agree by chance, and their error is too small
-)
+_LEAST_ERROR = 1e-4  # relative: blocks without clusters may agree by chance, and their error is then too small
 _MAX_ROUNDS = 50  # of fit and scatter
 _SCATTER_TOLERANCE = 1e-5  # the rounds end when the scatter changes by less
 _MAX_ITERATIONS = 200  # of L-BFGS
@@ -35,8 +33,8 @@ _GRADIENT_TOLERANCE = 1e-4  # of L-BFGS, for coefficients in units of their stan
 def fit_closure(data: MapData, jamming_fraction: float = JAMMING) -> Closure:
     """Fit the closure to a ratio map.
 
-    The weights come from the standard errors of the points and from their scatter about the law. The scatter of each
-    law makes χ² equal to the number of degrees of freedom. It is zero where χ² is smaller without it.
+    Weights combine the standard errors of the points with a scatter about each law, such that χ² equals the number
+    of degrees of freedom, or zero if χ² is smaller without it.
 
     ================  ===============================  ==============================================================
     data              (packing_fraction, restitution)  `pressure`, `macroscopic_friction` and `force_ratio` with
@@ -127,7 +125,7 @@ def fit_points(points: Points, jamming_fraction: float) -> Closure:
 
 
 class _Solution(NamedTuple):
-    """Coefficients (terms,), prediction (points,) and its derivative by the coefficients (points, terms)."""
+    """Coefficients (terms,), prediction (points,) and its Jacobian (points, terms)."""
 
     coefficients: np.ndarray
     predicted: np.ndarray
@@ -135,7 +133,7 @@ class _Solution(NamedTuple):
 
 
 def _fit(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray, solve: Callable[..., _Solution]) -> Law:
-    """Fit with a scatter that makes χ² equal to the degrees of freedom, or without one where χ² is below them."""
+    """Fit with the scatter at which χ² equals the degrees of freedom, or none if χ² is below them."""
     freedom, scatter, previous, rounds = len(logs) - terms.shape[1], 0.0, np.inf, 0
     solution = solve(terms, logs, errors)
     while abs(scatter - previous) >= _SCATTER_TOLERANCE and rounds < _MAX_ROUNDS:
@@ -146,7 +144,7 @@ def _fit(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray, solve: Callabl
 
 
 def _scatter(residuals: np.ndarray, errors: np.ndarray, freedom: int) -> float:
-    """The scatter at which χ² is the number of degrees of freedom, or zero where χ² is below it."""
+    """The scatter at which χ² equals the number of degrees of freedom, or zero if χ² is below it."""
 
     def excess(scatter: float) -> float:
         return float(np.sum(residuals**2 / (errors**2 + scatter**2)) - freedom)
@@ -162,9 +160,9 @@ def _linear_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray
 
 
 def _excess_coefficients(terms: np.ndarray, logs: np.ndarray, errors: np.ndarray) -> _Solution:
-    """Least squares of ln F = ln(1 + exp(terms · c)), started at the linear fit of the logarithm of the excess F − 1.
+    """Least squares of ln F = ln(1 + exp(terms · c)), starting from the linear fit of ln(F − 1).
 
-    The iteration is over c in units of its standard errors. In these units the contours of χ² are nearly spheres.
+    The iteration is over c in units of its standard errors, in which the contours of χ² are nearly spherical.
     """
     excess = np.maximum(np.expm1(logs), errors)
     start = _linear_coefficients(terms, np.log(excess), errors * (1 + excess) / excess).coefficients

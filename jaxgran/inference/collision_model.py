@@ -1,9 +1,9 @@
-"""The model of one collision and its noise, fitted to many of them at a trial restitution.
+"""Model of one collision and its noise, fitted to many collisions at a trial restitution.
 
-A collision of two discs without friction turns their relative velocity u into u − (1 + α)(u·n) n. Its five unknowns are
-the separation at contact, whose direction is n, the time of contact, and u. What was seen are separations and relative
-velocities in some frames before and after, each with noise; the distance at contact is that of the diameters, with an
-error. The least χ² over the unknowns is found for all collisions at once, with its derivatives by α.
+A collision of two frictionless discs changes their relative velocity u into u − (1 + α)(u·n) n. Its five unknowns are
+the separation at contact, whose direction is n, the time of contact, and u. The observations are separations and
+relative velocities in some frames before and after, with noise, and the contact distance given by the diameters, with
+an error. χ² is minimised over the unknowns of all collisions at once, with its derivatives with respect to α.
 """
 
 from functools import cached_property
@@ -18,15 +18,15 @@ from jaxtyping import Array
 from jaxgran.inference.collisions import Candidates, Noise
 
 UNKNOWNS = 5  # of a collision
-_CHUNK = 256  # collisions that are fitted at once
-_STEPS, _MORE_STEPS = 15, 10  # from the guess, and from the best unknowns at a near restitution
+_CHUNK = 256  # collisions fitted at once
+_STEPS, _MORE_STEPS = 15, 10  # from the initial guess, and from the optimum at a nearby restitution
 
 
 class Fitted(NamedTuple):
-    """Collisions at one restitution; each is (collisions,).
+    """Fitted collisions at one restitution; each field is (collisions,), ``unknowns`` (collisions, 5).
 
-    misfit, gradient and curvature are χ², half its derivative by α, and half the second one, at the best unknowns. The
-    gap is the distance at contact less that of the diameters, with the variance that it has with these.
+    ``misfit``, ``gradient`` and ``curvature`` are the minimal χ² and half its first and second derivatives with respect
+    to α. ``gap`` is the fitted contact distance minus that of the diameters, with its variance.
     """
 
     unknowns: np.ndarray
@@ -40,46 +40,48 @@ class Fitted(NamedTuple):
 
 
 class Collisions:
-    """Candidates with their noise, and the best unknowns found so far, with which the next search begins."""
+    """Candidate collisions and their noise, padded to whole chunks."""
 
-    def __init__(self, seen: Candidates, noise: Noise):
-        self.seen = seen
-        known = seen.known & (seen.before | seen.after)
-        self.freedom = 2.0 * (known.sum(axis=1) + (seen.before | seen.after).sum(axis=1)) - UNKNOWNS
-        count, rows = len(seen.window), -(-len(seen.window) // _CHUNK) * _CHUNK
-        self.count, self.guess = count, _padded(seen.guess, rows)
+    def __init__(self, pairs: Candidates, noise: Noise):
+        self.pairs = pairs
+        observed = pairs.before | pairs.after
+        has_velocity = pairs.has_velocity & observed
+        self.freedom = 2.0 * (has_velocity.sum(axis=1) + observed.sum(axis=1)) - UNKNOWNS
+        count, rows = len(pairs.window), -(-len(pairs.window) // _CHUNK) * _CHUNK
+        self.count, self.guess = count, _padded(pairs.guess, rows)
         root = np.sqrt(2)
         self.data = tuple(
             _padded(x, rows)
             for x in (
-                seen.time,
-                seen.separation,
-                seen.velocity,
-                (seen.before | seen.after) / (root * noise.position),
-                known / (root * noise.velocity),
-                seen.after.astype(float),
-                seen.reach,
+                pairs.time,
+                pairs.separation,
+                pairs.velocity,
+                observed / (root * noise.position),
+                has_velocity / (root * noise.velocity),
+                pairs.after.astype(float),
+                pairs.reach,
                 np.full(count, noise.diameter),
             )
         )
 
     def fitted(self, restitution: float, unknowns: np.ndarray | None = None) -> Fitted:
-        """At a trial restitution, from the guess or from unknowns that are nearly the best."""
+        """Fit at a trial restitution, starting from the initial guess or from nearly optimal unknowns."""
         start = self.guess if unknowns is None else _padded(unknowns, len(self.guess))
         alpha, most = jnp.asarray(restitution), jnp.asarray(_STEPS if unknowns is None else _MORE_STEPS)
         chunks = [
             _best_unknowns(alpha, most, jnp.asarray(start[k * _CHUNK : (k + 1) * _CHUNK]), *data)
             for k, data in enumerate(self._chunks)
         ]
-        found = (np.concatenate(x)[: self.count] for x in zip(*chunks, strict=True))
-        best, misfit, products, gradient = found
+        best, misfit, products, gradient = (np.concatenate(x)[: self.count] for x in zip(*chunks, strict=True))
         inner, mixed = products[:, :UNKNOWNS, :UNKNOWNS], products[:, :UNKNOWNS, UNKNOWNS]
         covariance = np.linalg.pinv(inner, hermitian=True)
         curvature = products[:, UNKNOWNS, UNKNOWNS] - np.einsum("ci,cij,cj->c", mixed, covariance, mixed)
         contact, velocity = best[:, :2], best[:, 3:]
         distance = np.linalg.norm(contact, axis=1)
         approach = -np.sum(contact * velocity, axis=1) / distance
-        across = -(velocity + (approach / distance)[:, None] * contact) / distance[:, None]  # its derivative by contact
+        across = (
+            -(velocity + (approach / distance)[:, None] * contact) / distance[:, None]
+        )  # derivative with respect to contact
         slope = np.concatenate([across, np.zeros((len(best), 1)), -contact / distance[:, None]], axis=1)
         error = np.sqrt(np.maximum(np.einsum("ci,cij,cj->c", slope, covariance, slope), 0))
         towards = contact / distance[:, None]
@@ -93,25 +95,25 @@ class Collisions:
         return [tuple(jnp.asarray(x[k : k + _CHUNK]) for x in self.data) for k in ends]
 
     def part(self, chosen: np.ndarray) -> "Collisions":
-        """The chosen ones alone."""
+        """A subset of the collisions."""
         part = object.__new__(Collisions)
         count = int(chosen.sum())
         rows = -(-count // _CHUNK) * _CHUNK
-        part.seen, part.freedom, part.count = None, self.freedom[chosen], count
+        part.pairs, part.freedom, part.count = None, self.freedom[chosen], count
         part.guess, *data = (_padded(x[: self.count][chosen], rows) for x in (self.guess, *self.data))
         part.data = tuple(data)
         return part
 
 
 def _padded(x: np.ndarray, rows: int) -> np.ndarray:
-    """An array with its last row repeated up to a number of rows."""
+    """Pad an array to a number of rows by repeating its last row."""
     return np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])
 
 
 def _residuals(
     unknowns: Array, restitution: Array, time, separation, velocity, wx, wv, after, reach, diameter
 ) -> Array:
-    """What was seen of a collision less the model of it, over the noise."""
+    """Observations of a collision minus their model, over the noise."""
     contact, when, u = unknowns[:2], unknowns[2], unknowns[3:]
     distance = jnp.sqrt(contact @ contact)
     normal = contact / distance
@@ -129,9 +131,10 @@ def _residuals(
 
 @jax.jit
 def _best_unknowns(restitution: Array, steps: Array, start: Array, *data: Array):
-    """Least squares over the five unknowns of every collision, by Levenberg-Marquardt steps.
+    """Least squares over the five unknowns of every collision, by the Levenberg-Marquardt method.
 
-    Returns the unknowns, χ², and the products JᵀJ and Jᵀr; r are the residuals, J their derivatives by unknowns and α.
+    Returns the unknowns, χ², and the products JᵀJ and Jᵀr, with r the residuals and J their derivatives with respect to
+    the unknowns and α.
     """
 
     def one(start, *data):

@@ -1,15 +1,15 @@
-"""Binary collisions in tracks: pairs of discs that fly straight, strike each other once, and fly straight again.
+"""Binary collisions in tracks: pairs of discs that fly straight, collide once, and fly straight again.
 
-Between collisions a disc moves on a straight line in the laboratory. For each pair of near discs and each window from
-a frame to the next in which both are seen, the flights before and after the window are as long as straight lines
-describe them, within the noise. The pair is a candidate where the relative velocity changes in the window by more than
-its noise. The flight of the centre of mass has to be straight through all of it: where a third disc, or one that is not
-seen, has struck either one, it is not.
+Between collisions a disc moves on a straight line in the laboratory frame. For each pair of nearby discs and each
+window between successive frames that contain both, the flights before and after the window extend as far as straight
+lines describe them within the noise. The pair is a candidate if its relative velocity changes in the window by more
+than the noise. Its centre of mass must move straight throughout, which excludes collisions with a third disc, observed
+or not.
 
-Only this flight needs masses. Where they are not known, they grow with that power of the diameter for which the most
-flights are straight.
+Only this criterion needs masses. Unknown masses are taken as the power of the diameter for which most centres of mass
+move straight.
 
-Lengths are in mean diameters, and times in the time in which a disc moves by one.
+Lengths are in mean diameters, times in units of the time in which a disc moves by one diameter.
 """
 
 from typing import NamedTuple
@@ -21,23 +21,23 @@ from scipy.special import chdtri  # χ² of a probability to be exceeded; as in 
 
 from jaxgran.io.tracks import Tracks, displacements, nearest_image
 
-LONGEST = 8  # frames of a flight beside those of its window
-_RARE = 1e-3  # probability with which noise alone bends the flight of a centre of mass
-_BEND = 0.02  # probability with which noise alone ends a flight
-_LEAST_CHANGE = 3.0  # of the relative velocity of a candidate, over its error
-_POWERS = (2, 3, 0)  # of the diameter: discs, spheres, equal masses
-_FRAMES_TO_WEIGH = 100
-_REACH = 3.0  # steps of quick pairs between frames, within which a pair is near
+LONGEST = 8  # frames of a flight, besides those of its window
+_RARE = 1e-3  # significance level for a bent centre-of-mass flight
+_BEND = 0.02  # significance level for the end of a flight
+_LEAST_CHANGE = 3.0  # of the relative velocity of a candidate, in standard errors
+_POWERS = (2, 3, 0)  # mass as a power of the diameter: discs, spheres, equal masses
+_FRAMES_FOR_MASSES = 100
+_REACH = 3.0  # relative steps of fast pairs, within which a pair is near
 _QUICK = 0.9  # quantile of these steps
-_CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, over its error
-_ALONG = 0.95  # cosine of the angle between two changes of one contact
-_FEWEST_CHANGES = 20  # of which a share is taken
-_MOST_PAIRS = 20_000  # near pairs that are looked at in one go; each takes some kilobytes
+_CLEAR_CHANGE = 5.0  # of a velocity from frame to frame, in standard errors
+_ALONG = 0.95  # least cosine of the angle between two changes of one contact
+_FEWEST_CHANGES = 20  # for a meaningful share
+_MOST_PAIRS = 20_000  # near pairs per batch; each takes some kilobytes
 _BENT = np.append(np.inf, chdtri(np.arange(1, 8 * (LONGEST + 1) + 1), _BEND))  # χ² of a bend, by degrees of freedom
 
 
 class Noise(NamedTuple):
-    """Standard deviations of a component of an observed position and velocity, and of an observed diameter."""
+    """Standard deviations of a component of an observed position, of a velocity, and of an observed diameter."""
 
     position: float
     velocity: float
@@ -45,17 +45,17 @@ class Noise(NamedTuple):
 
 
 class Flights(NamedTuple):
-    """Tracks without jumps through the sides of the cell, in units of the fit.
+    """Unwrapped tracks, in the units of the fit.
 
     ==========  ===================  =====================================================================
     time        (frames,)            of each frame
-    positions   (frames, grains, 2)  on one straight line between collisions; NaN where not seen
-    velocities  (frames, grains, 2)  along that line; NaN where not known
-    places      (frames, grains, 2)  positions as they were seen, in the cell
+    positions   (frames, grains, 2)  on a straight line between collisions; NaN if missing
+    velocities  (frames, grains, 2)  along that line; NaN if unknown
+    places      (frames, grains, 2)  observed positions, in the cell
     cell        (frames, 3)          as in ``Tracks``
     shear_rate  ()                   γ̇
     diameters   (grains,)
-    masses      (grains,)            NaN where they are not known
+    masses      (grains,)            NaN if unknown
     ==========  ===================  =====================================================================
     """
 
@@ -70,22 +70,22 @@ class Flights(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Pairs that may have collided in a window, with what was seen of them before and after.
+    """Pairs that may have collided in a window, with the observations before and after.
 
     =================  ==================  ====================================================================
     field              shape               meaning
     =================  ==================  ====================================================================
     window             (pairs,)            frame before the collision
     grains             (pairs, 2)          the discs i and j
-    reach              (pairs,)            distance at contact, by the diameters
-    time               (pairs, frames)     of the frames around the window, from its beginning
+    reach              (pairs,)            contact distance from the diameters
+    time               (pairs, frames)     of the frames around the window, from its start
     separation         (pairs, frames, 2)  of disc i from the image of disc j
-    velocity           (pairs, frames, 2)  its rate of change, 0 where it is not known
-    known              (pairs, frames)     whether it is
+    velocity           (pairs, frames, 2)  its rate of change; 0 if unknown
+    has_velocity       (pairs, frames)     whether it is known
     before, after      (pairs, frames)     which frames belong to the flights
     duration           (pairs,)            of the window
     guess              (pairs, 5)          separation at contact (2), time of contact, velocity before (2)
-    drift              (pairs,)            χ² of the straight flight of the centre of mass
+    drift              (pairs,)            χ² of a straight flight of the centre of mass
     drift_freedom      (pairs,)            its degrees of freedom
     =================  ==================  ====================================================================
     """
@@ -96,7 +96,7 @@ class Candidates(NamedTuple):
     time: Float[np.ndarray, "pairs frames"]
     separation: Float[np.ndarray, "pairs frames 2"]
     velocity: Float[np.ndarray, "pairs frames 2"]
-    known: Bool[np.ndarray, "pairs frames"]
+    has_velocity: Bool[np.ndarray, "pairs frames"]
     before: Bool[np.ndarray, "pairs frames"]
     after: Bool[np.ndarray, "pairs frames"]
     duration: Float[np.ndarray, " pairs"]
@@ -106,7 +106,7 @@ class Candidates(NamedTuple):
 
 
 def flights_of(tracks: Tracks) -> tuple[Flights, float, float]:
-    """The flights of tracks, and the units of length and of time in which they are."""
+    """Unwrapped tracks in the units of the fit, and these units of length and time."""
     length = float(np.mean(tracks.diameters))
     moved = displacements(tracks)
     speeds = np.linalg.norm(moved, axis=-1) / np.diff(tracks.time)[:, None]
@@ -130,9 +130,9 @@ def flights_of(tracks: Tracks) -> tuple[Flights, float, float]:
 
 
 def _unwrapped(tracks: Tracks) -> np.ndarray:
-    """Positions that follow each disc through the sides of the cell, also past frames in which it is not seen.
+    """Positions that follow each disc through the sides of the cell, even across frames without it.
 
-    A disc that has left through the upper side is seen as an image, which the shear leaves behind: its rows slide.
+    A disc that left through the upper side is observed as an image in a row that slides relative to it.
     """
     positions = tracks.positions.copy()
     place, follows = positions[0].copy(), positions[0].copy()
@@ -142,15 +142,15 @@ def _unwrapped(tracks: Tracks) -> np.ndarray:
         step = nearest_image(now - place, tracks.cell[k])
         step[:, 0] += tracks.shear_rate * (follows - place)[:, 1] * (tracks.time[k] - last)
         follows_now = np.where(np.isfinite(place), follows + step, now)
-        seen = np.isfinite(now)
-        positions[k] = np.where(seen, follows_now, np.nan)
-        place, follows = np.where(seen, now, place), np.where(seen, follows_now, follows)
-        last = np.where(seen[:, 0], tracks.time[k], last)
+        present = np.isfinite(now)
+        positions[k] = np.where(present, follows_now, np.nan)
+        place, follows = np.where(present, now, place), np.where(present, follows_now, follows)
+        last = np.where(present[:, 0], tracks.time[k], last)
     return positions
 
 
 def measured_noise(flights: Flights) -> tuple[float, float]:
-    """Noise of positions and velocities, from the quarter of the discs that changes least from frame to frame."""
+    """Noise of positions and velocities, from the quarter of the discs whose motion changes least between frames."""
     x, v, during = flights.positions, flights.velocities, np.diff(flights.time)[:, None, None]
     if not np.isfinite(v).any():
         bend = np.diff(x[1:], axis=0) - np.diff(x[:-1], axis=0) * during[1:] / during[:-1]
@@ -171,59 +171,59 @@ def _least_spread(vectors: np.ndarray) -> float:
 
 
 def relative_step(flights: Flights, share: float = 0.5) -> float:
-    """How far near discs move apart or together between frames, in diameters: a quantile over discs and frames."""
+    """Relative displacement of neighbouring discs between frames, in diameters: a quantile over discs and frames."""
     steps = []
     for k in range(len(flights.time) - 1):
-        seen = np.flatnonzero(np.isfinite(flights.places[k : k + 2, :, 0]).all(axis=0))
-        if len(seen) > 1:
-            _, neighbours = KDTree(flights.places[k, seen]).query(flights.places[k, seen], k=2)
+        present = np.flatnonzero(np.isfinite(flights.places[k : k + 2, :, 0]).all(axis=0))
+        if len(present) > 1:
+            _, neighbours = KDTree(flights.places[k, present]).query(flights.places[k, present], k=2)
             nearest = np.asarray(neighbours)[:, 1]
-            moved = (flights.positions[k + 1] - flights.positions[k])[seen]
+            moved = (flights.positions[k + 1] - flights.positions[k])[present]
             steps.append(np.linalg.norm(moved - moved[nearest], axis=-1))
     return float(np.quantile(np.concatenate(steps), share)) if steps else np.nan
 
 
-def lasting(flights: Flights, noise: Noise) -> float:
-    """The share of changes of velocity that go on along one line in the next frame: of contacts that outlast a frame.
+def lasting_share(flights: Flights, noise: Noise) -> float:
+    """Share of velocity changes that continue along the same line in the next frame: contacts that outlast a frame.
 
-    Collisions of hard discs in clusters follow each other as quickly, but along many lines.
+    Collisions of hard discs in clusters succeed each other as quickly, but along different lines.
     """
     if np.isfinite(flights.velocities).any():
         change, clear, lag = np.diff(flights.velocities, axis=0), _CLEAR_CHANGE * np.sqrt(2) * noise.velocity, 1
-    else:  # a change between two frames bends the track at both
+    else:  # a change between two frames bends the track at both of them
         x = flights.positions
         change, clear, lag = x[2:] - 2 * x[1:-1] + x[:-2], _CLEAR_CHANGE * np.sqrt(6) * noise.position, 2
     size = np.linalg.norm(change, axis=-1)
     first, then = size[:-lag], size[lag:]
     along = np.sum(change[:-lag] * change[lag:], axis=-1) > _ALONG * first * then
-    seen = np.isfinite(then) & (first > clear)
-    return float(np.mean((along & (then > clear))[seen])) if np.count_nonzero(seen) >= _FEWEST_CHANGES else 0.0
+    counted = np.isfinite(then) & (first > clear)
+    return float(np.mean((along & (then > clear))[counted])) if np.count_nonzero(counted) >= _FEWEST_CHANGES else 0.0
 
 
 def candidates(flights: Flights, noise: Noise, struck: np.ndarray | None = None) -> Candidates | None:
-    """All pairs that may have collided, of all windows; None where there are none.
+    """All pairs that may have collided, in all windows; None if there are none.
 
     Args:
-      flights: of all discs, with masses.
-      noise: of what was seen.
-      struck: (frames - 1, grains), in which windows a disc is known to collide: no flight goes past them.
+      flights: unwrapped tracks of all discs, with masses.
+      noise: of the observations.
+      struck: (frames - 1, grains), windows in which a disc is known to collide, which end its flights.
     """
     margin = _REACH * relative_step(flights, _QUICK) + 0.1
-    found, near, pairs, last = [], [], 0, len(flights.time) - 2
+    parts, near, pairs, last = [], [], 0, len(flights.time) - 2
     for k in range(last + 1):
         i, j, apart = _near(flights, k, margin)
         near.append((np.full(len(i), k), i, j, apart))
         pairs += len(i)
         if pairs > _MOST_PAIRS or k == last:
             part = _of_windows(flights, noise, struck, *(np.concatenate(x) for x in zip(*near, strict=True)))
-            found += [] if part is None else [part]
+            parts += [] if part is None else [part]
             near, pairs = [], 0
-    return Candidates(*(np.concatenate(x) for x in zip(*found, strict=True))) if found else None
+    return Candidates(*(np.concatenate(x) for x in zip(*parts, strict=True))) if parts else None
 
 
-def weighed(flights: Flights, noise: Noise) -> Flights:
-    """The flights with masses, by how many collisions in some of the frames leave the centre of mass on its way."""
-    part = slice(0, _FRAMES_TO_WEIGH)
+def with_masses(flights: Flights, noise: Noise) -> Flights:
+    """The flights with masses, which if unknown are those for which most centres of mass move straight."""
+    part = slice(0, _FRAMES_FOR_MASSES)
     if np.isfinite(flights.masses).all():
         return flights
     few = flights._replace(
@@ -233,25 +233,25 @@ def weighed(flights: Flights, noise: Noise) -> Flights:
     best, most = flights, -1
     for power in powers:
         masses = flights.diameters**power
-        seen = candidates(few._replace(masses=masses), noise) if len(powers) > 1 else None
-        straight = 0 if seen is None else int(np.sum(straight_drift(seen)))
+        pairs = candidates(few._replace(masses=masses), noise) if len(powers) > 1 else None
+        straight = 0 if pairs is None else int(np.sum(straight_drift(pairs)))
         if straight > most:
             best, most = flights._replace(masses=masses), straight
     return best
 
 
-def straight_drift(seen: Candidates) -> Bool[np.ndarray, " pairs"]:
-    """Whether the centre of mass of each candidate flies straight, within the noise."""
-    return seen.drift < chdtri(np.maximum(seen.drift_freedom, 1), _RARE)
+def straight_drift(pairs: Candidates) -> Bool[np.ndarray, " pairs"]:
+    """Whether the centre of mass of each candidate moves straight, within the noise."""
+    return pairs.drift < chdtri(np.maximum(pairs.drift_freedom, 1), _RARE)
 
 
 def _near(flights: Flights, k: int, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs that are near in frame k, i < j, with the separation of i from the image of j."""
-    seen = np.flatnonzero(np.isfinite(flights.places[k, :, 0]))
-    if len(seen) < 2:
+    """Pairs i < j that are near in frame k, and the separation of i from the image of j."""
+    present = np.flatnonzero(np.isfinite(flights.places[k, :, 0]))
+    if len(present) < 2:
         return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
-    reach, places, cell = np.max(flights.diameters[seen]) + margin, flights.places[k, seen], flights.cell[k]
-    images, owner = places, np.arange(len(seen))
+    reach, places, cell = np.max(flights.diameters[present]) + margin, flights.places[k, present], flights.cell[k]
+    images, owner = places, np.arange(len(present))
     if np.isfinite(cell[0]):
         width, height, offset = cell
         places = _wrapped(places, cell)
@@ -261,11 +261,11 @@ def _near(flights: Flights, k: int, margin: float) -> tuple[np.ndarray, np.ndarr
         images, owner = images[inside], owner[inside]
     tree = KDTree(images)
     near = tree.query_ball_point(places, reach, return_sorted=False)
-    i = np.repeat(np.arange(len(seen)), [len(x) for x in near])
+    i = np.repeat(np.arange(len(present)), [len(x) for x in near])
     j_image = np.concatenate([np.asarray(x, int) for x in near])
     apart, j = places[i] - images[j_image], owner[j_image]
     first = i < j
-    i, j, apart = seen[i[first]], seen[j[first]], apart[first]
+    i, j, apart = present[i[first]], present[j[first]], apart[first]
     close = np.linalg.norm(apart, axis=1) < (flights.diameters[i] + flights.diameters[j]) / 2 + margin
     return i[close], j[close], apart[close]
 
@@ -286,12 +286,12 @@ def _of_windows(
     j: np.ndarray,
     apart: np.ndarray,
 ) -> Candidates | None:
-    """The candidates among pairs of windows k, (pairs,), whose discs i and j are ``apart`` at its beginning."""
+    """The candidates among pairs (pairs,) of discs i and j, whose separation is ``apart`` at the start of window k."""
     around = k[:, None] + np.arange(-LONGEST, 2 + LONGEST)
     exists = (around >= 0) & (around < len(flights.time))
     frames = np.clip(around, 0, len(flights.time) - 1)
     time = np.where(exists, flights.time[frames] - flights.time[k, None], 0.0)
-    # The image of j lies a lattice vector from its track; the image slides by the shear of its height
+    # The image of j lies a lattice vector from its track, and slides with the mean flow at its height
     shift = apart - (flights.positions[k, i] - flights.positions[k, j])
     slide = flights.shear_rate * np.stack([shift[:, 1], np.zeros(len(i))], axis=-1)
     of_i, of_j = (flights.positions[frames, grain[:, None]] for grain in (i, j))
@@ -300,27 +300,21 @@ def _of_windows(
     v_image = v_j - slide[:, None]
     share = (flights.masses[i] / (flights.masses[i] + flights.masses[j]))[:, None, None]
     spread = np.sqrt(share**2 + (1 - share) ** 2)
-    pair = _Seen(time, of_i - image, v_i - v_image, exists)
-    centre = _Seen(
+    pair = _Observed(time, of_i - image, v_i - v_image, exists)
+    centre = _Observed(
         time, (share * of_i + (1 - share) * image) / spread, (share * v_i + (1 - share) * v_image) / spread, exists
     )
     of_pair = Noise(np.sqrt(2) * noise.position, np.sqrt(2) * noise.velocity, 0.0)
 
     sides, lines = [], []
     for outwards in (np.arange(LONGEST, -1, -1), np.arange(LONGEST + 1, 2 * LONGEST + 2)):
-        relative, common = (_lines(seen, outwards, of) for seen, of in ((pair, of_pair), (centre, noise)))
-        together = relative.misfit + common.misfit
-        added = np.diff(together, axis=1, prepend=0)
-        freedom = 4 * (1 + pair.known[:, outwards].astype(int))
-        total = np.cumsum(freedom * pair.seen[:, outwards], axis=1) - 8
-        likely = (added < _BENT[freedom]) & (together < _BENT[np.maximum(total, 1)])
-        straight = np.cumprod(~relative.settled | likely, axis=1).astype(bool)
-        if struck is not None:  # in the window before each further frame, outwards
+        relative, straight = _straight_part(pair, centre, outwards, of_pair, noise)
+        if struck is not None:  # in the window before each further frame outwards
             ends = np.minimum(np.minimum(frames[:, outwards[1:]], frames[:, outwards[:-1]]), len(struck) - 1)
             passed = struck[ends, i[:, None]] | struck[ends, j[:, None]]
             straight[:, 1:] &= np.cumsum(passed, axis=1) == 0
-        belongs = np.zeros(pair.seen.shape, bool)
-        belongs[:, outwards] = straight & pair.seen[:, outwards]
+        belongs = np.zeros(pair.present.shape, bool)
+        belongs[:, outwards] = straight & pair.present[:, outwards]
         last = straight.sum(axis=1) - 1
         sides.append(belongs)
         lines.append(
@@ -333,15 +327,15 @@ def _of_windows(
         clear = first & second & (size > _LEAST_CHANGE**2 * (var_u + var_w))
         contact = -np.sum((b - a) * change, axis=-1) / size
         until = time[np.arange(len(i)), np.argmax(after, axis=1)]
-        late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # by which noise may move it out of the window
+        late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # noise may shift it out of the window by as much
         clear &= (contact > -late) & (contact < until + late)
         contact = np.clip(contact, 0, until)
     if not clear.any():
         return None
     place = ((a + u * contact[:, None]) + (b + w * contact[:, None])) / 2
     both = before | after
-    drift = _lines(_Seen(time, centre.positions, centre.velocities, exists, both), np.arange(time.shape[1]), noise)
-    freedom = 2.0 * (both * (1 + pair.known)).sum(axis=1) - 4
+    drift = _lines(_Observed(time, centre.positions, centre.velocities, exists, both), np.arange(time.shape[1]), noise)
+    freedom = 2.0 * (both * (1 + pair.has_velocity)).sum(axis=1) - 4
     guess = np.concatenate([place, contact[:, None], u], axis=1)
     return Candidates(
         *(x[clear] for x in (
@@ -350,8 +344,8 @@ def _of_windows(
             (flights.diameters[i] + flights.diameters[j]) / 2,
             time,
             np.where(both[..., None], pair.positions, 0),
-            np.where((both & pair.known)[..., None], pair.velocities, 0),
-            pair.known,
+            np.where((both & pair.has_velocity)[..., None], pair.velocities, 0),
+            pair.has_velocity,
             before,
             after,
             until,
@@ -362,18 +356,31 @@ def _of_windows(
     )  # fmt: skip
 
 
-class _Seen:
-    """Positions (pairs, frames, 2) and velocities of points at times (pairs, frames), and where they are seen."""
+def _straight_part(
+    pair: "_Observed", centre: "_Observed", outwards: np.ndarray, of_pair: Noise, noise: Noise
+) -> tuple["_Lines", np.ndarray]:
+    """Lines of the relative motion, and up to which frame (pairs, frames) both motions are straight."""
+    relative, common = _lines(pair, outwards, of_pair), _lines(centre, outwards, noise)
+    together = relative.misfit + common.misfit
+    added = np.diff(together, axis=1, prepend=0)
+    freedom = 4 * (1 + pair.has_velocity[:, outwards].astype(int))
+    total = np.cumsum(freedom * pair.present[:, outwards], axis=1) - 8
+    likely = (added < _BENT[freedom]) & (together < _BENT[np.maximum(total, 1)])
+    return relative, np.cumprod(~relative.settled | likely, axis=1).astype(bool)
+
+
+class _Observed:
+    """Positions (pairs, frames, 2) and velocities of points at times (pairs, frames), and where they exist."""
 
     def __init__(self, time, positions, velocities, exists, chosen=None):
         self.time, self.positions, self.velocities = time, positions, velocities
-        self.seen = exists & np.isfinite(positions[..., 0])
-        self.seen = self.seen if chosen is None else self.seen & chosen
-        self.known = self.seen & np.isfinite(velocities[..., 0])
+        self.present = exists & np.isfinite(positions[..., 0])
+        self.present = self.present if chosen is None else self.present & chosen
+        self.has_velocity = self.present & np.isfinite(velocities[..., 0])
 
 
 class _Lines(NamedTuple):
-    """Straight lines through the first one, two, … of some frames: (pairs, frames) and (pairs, frames, 2)."""
+    """Straight lines through the first one, two, … of the frames: (pairs, frames) and (pairs, frames, 2)."""
 
     settled: np.ndarray  # whether these frames determine a line
     start: np.ndarray  # position at time zero
@@ -382,16 +389,16 @@ class _Lines(NamedTuple):
     misfit: np.ndarray  # χ²
 
 
-def _lines(seen: _Seen, order: np.ndarray, noise: Noise) -> _Lines:
-    """Weighted least squares, by sums over frames that are added in this order."""
-    t = seen.time[:, order]
-    wx = seen.seen[:, order] / noise.position**2
-    wv = seen.known[:, order] / noise.velocity**2
-    x = np.where(seen.seen[:, order, None], seen.positions[:, order], 0)
-    v = np.where(seen.known[:, order, None], seen.velocities[:, order], 0)
-    # From a rough line, so that the sums of squares keep their digits
-    first = x[np.arange(len(x)), np.argmax(seen.seen[:, order], axis=1)][:, None]
-    x = np.where(seen.seen[:, order, None], x - first, 0)
+def _lines(points: _Observed, order: np.ndarray, noise: Noise) -> _Lines:
+    """Weighted least squares, by cumulative sums over the frames in the given order."""
+    t = points.time[:, order]
+    wx = points.present[:, order] / noise.position**2
+    wv = points.has_velocity[:, order] / noise.velocity**2
+    x = np.where(points.present[:, order, None], points.positions[:, order], 0)
+    v = np.where(points.has_velocity[:, order, None], points.velocities[:, order], 0)
+    # Relative to the first position, so that sums of squares keep their digits
+    first = x[np.arange(len(x)), np.argmax(points.present[:, order], axis=1)][:, None]
+    x = np.where(points.present[:, order, None], x - first, 0)
     s0, s1, s2 = (np.cumsum(y, axis=1) for y in (wx, wx * t, wx * t**2 + wv))
     p = np.cumsum(wx[..., None] * x, axis=1)
     q = np.cumsum((wx * t)[..., None] * x + wv[..., None] * v, axis=1)

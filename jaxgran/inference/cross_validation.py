@@ -1,4 +1,4 @@
-"""Cross-validation of a closure: each point of a map is left out in turn, and predicted by the fit to the others."""
+"""Leave-one-out cross-validation of a closure: each point of a map is predicted by the fit to the others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jaxgran.sampling.timestep import JAMMING
 
 
 def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Dataset:
-    """Predict every point of a map by the closure fitted to all other points.
+    """Predict every point of a map by the closure fitted to all others.
 
     ================  ===============================  ==============================================================
     data              (packing_fraction, restitution)  as for :func:`fit_closure`, and `shear_stress` with `_stderr`
@@ -36,7 +36,7 @@ def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Datase
     variable            meaning; NAME is pressure, shear_stress or force_ratio
     ==================  =============================================================================================
     NAME_predicted      prediction, in units of m = σ = γ̇ = 1
-    NAME_error          predicted over measured, less one
+    NAME_error          predicted over measured, minus one
     NAME_noise          relative standard error of the measured point
     NAME_stderr         relative standard error expected of prediction and point together
     restitution_found   restitution from the stresses of the point, by the closure fitted without it

@@ -1,7 +1,7 @@
-"""Laws of dense flow: friction and packing fraction as power laws of the inertial number I, fitted to a map.
+"""Rheology of dense flow: friction and packing fraction as power laws of the inertial number I, fitted to a map.
 
-For frictionless grains μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c. At the onset of flow a packing of frictionless grains
-still has the macroscopic friction μ₀, because of the anisotropy of its contacts.
+For frictionless grains μ(I) = μ₀ + a I^b and ν(I) = ν_c − k I^c. The macroscopic friction μ₀ at the onset of flow is
+finite because of the anisotropy of the contacts.
 
 Source: GDR MiDi, Eur. Phys. J. E 14, 341 (2004); for frictionless grains P.-E. Peyneau and J.-N. Roux, Phys. Rev. E 78,
 011307 (2008), who find μ₀ ≈ 0.10 and exponents near 0.4 for spheres.
@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy  # its parts are loaded when they are used: that for fits takes longer than a figure
+import scipy  # loads its submodules on first use; scipy.optimize takes longer than a figure
 import xarray as xr
 
 from jaxgran.maps.schema import MapData, finest, require_map
@@ -29,7 +29,7 @@ NEEDED = ("inertial_number", "inertial_number_stderr", "macroscopic_friction", "
 CORRELATION = "diagnostics/friction_error_correlation"
 """Variable of the correlation of the errors of friction and inertial number."""
 
-_EXPONENTS = (0.05, 4.0)  # smallest and largest of a fit; an exponent at either end is not determined
+_EXPONENTS = (0.05, 4.0)  # bounds of a fit; an exponent at a bound is not determined
 _MAX_ROUNDS = 30  # of the effective variance
 
 
@@ -62,7 +62,7 @@ class PowerLaw:
 
     @property
     def determined(self) -> bool:
-        """Whether the exponent is larger than its standard error; if not, the parameters are meaningless."""
+        """Whether the exponent exceeds its standard error; if not, the parameters are meaningless."""
         return bool(self.standard_errors[2] < self.parameters[2])
 
     def __call__(self, inertial_number: np.ndarray) -> np.ndarray:
@@ -200,7 +200,7 @@ def _fit(
             parameters, covariance = scipy.optimize.curve_fit(
                 law, x / scale, y, previous, deviation, absolute_sigma=True, bounds=(low, high), jac=slopes
             )
-        except RuntimeError:  # no convergence, because the points do not determine the exponent
+        except RuntimeError:  # no convergence: the points do not determine the exponent
             converged = False
             break
         if np.allclose(parameters, previous, rtol=1e-6):

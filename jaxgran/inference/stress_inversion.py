@@ -1,4 +1,4 @@
-"""The restitution of grains from the stresses of their flow, through a closure."""
+"""The restitution of grains from the stresses of their flow, by inverting a closure."""
 
 from __future__ import annotations
 
@@ -24,22 +24,21 @@ from jaxgran.theory.steady_shear import Scalar
 
 _GRID = 33  # restitutions at which the laws are evaluated
 _FINER = 16  # steps of the interpolation between two of them
-_REFINEMENTS = 10  # Gauss–Newton steps from the best restitution of the grid
+_REFINEMENTS = 10  # Gauss–Newton steps from the best point of the grid
 
 
 class RestitutionEstimate(NamedTuple):
-    """A restitution found from stresses.
+    """A restitution inferred from stresses.
 
     ===========  ===============================================================================================
     field        meaning; each has the shape (*flows)
     ===========  ===============================================================================================
     restitution  α, within the range of the closure
-    stderr       root mean square distance of α from the estimate, over the range, weighted by the likelihood
-                 exp(−χ²/2); for one sharp minimum it is the usual standard error, and it remains valid for a flat
-                 minimum or for two
+    stderr       root mean square deviation from the estimate over the range of α, weighted by the likelihood
+                 exp(−χ²/2); the usual standard error for one sharp minimum, valid also for flat or double minima
     chi_squared  of pressure and friction about the closure, with one degree of freedom inside the range
-    determined   whether the standard error is smaller than that of a guess, the range over √12; if not, the
-                 stresses hardly depend on the restitution there, as in dense flow with α < 0.6
+    determined   whether the standard error is below that of a uniform guess, the range over √12; if not, the
+                 stresses hardly depend on the restitution, as in dense flow with α < 0.6
     ===========  ===============================================================================================
     """
 
@@ -60,9 +59,9 @@ def restitution_from_stresses(
 ) -> RestitutionEstimate:
     """Estimate the restitution of a flow from its stresses alone.
 
-    α minimises the squared differences of the logarithms of pressure and friction, within the range of the closure. The
-    weights are the inverse of the covariance of the measurement plus that of the closure. The best α of a grid is
-    refined by Gauss–Newton steps.
+    α minimises the squared differences of the logarithms of pressure and friction within the range of the closure,
+    weighted by the inverse of the covariance of measurement plus closure. The best α of a grid is refined by
+    Gauss–Newton steps.
 
     ===================  ===================  =====================================================================
     closure              Closure              as :func:`fit_closure` returns
@@ -71,10 +70,10 @@ def restitution_from_stresses(
     shear_stress         (*flows)             the same, positive
     pressure_stderr      (*flows)             standard error, in the same units
     shear_stress_stderr  (*flows)             standard error, in the same units
-    correlation          (*flows)             of the two errors, −1 to 1; it is near 0.95 where both are averages of
-                                              one run, and then their quotient, the friction, is known far better
-    returns              RestitutionEstimate  of the common shape to which all arguments broadcast
-    raises               InputError           a number is outside its range
+    correlation          (*flows)             of the two errors, −1 to 1; about 0.95 for averages of one run, whose
+                                              quotient, the friction, is then far more precise
+    returns              RestitutionEstimate  of the broadcast shape of all arguments
+    raises               InputError           a number is out of range
     ===================  ===================  =====================================================================
     """
     require_closure(closure)

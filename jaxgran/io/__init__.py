@@ -1,4 +1,4 @@
-"""Files: trajectories, and files that are written whole or not at all.
+"""Files: trajectories (GSD), tracks of discs, arrays with a checksum.
 
 It imports `dynamics` and the folders below it, but neither `sampling` nor `analysis`. Begin with `trajectory`.
 """

@@ -1,9 +1,8 @@
-"""Places for files, and arrays on disc with a checksum, whole or not at all (``files``).
+"""Checks of output paths, and named arrays in HDF5 files with a checksum.
 
-Arrays are stored as HDF5, followed by the SHA-256 checksum of the HDF5 content. Other readers ignore the checksum. The
-content is assembled and read in memory. So a full disc raises an ``OSError`` with its number, and the HDF5 library,
-which does not always survive a damaged file, never reads one. Dimensions have no names: writing names would take ten
-times as long as everything else.
+The SHA-256 checksum follows the HDF5 content, and other readers ignore it. Content is assembled and parsed in memory:
+a full disk then raises an ``OSError`` with its errno, and the HDF5 library, which may crash on a damaged file, never
+sees one. Dimensions are not named, since naming them takes ten times as long as everything else.
 """
 
 import hashlib
@@ -14,22 +13,22 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import netCDF4  # noqa: F401 before h5py: where both bring the same HDF5, netCDF4 fails after it
+import netCDF4  # noqa: F401 must precede h5py: if both bundle the same HDF5, netCDF4 fails when loaded second
 import numpy as np
 
 from jaxgran.files import atomic_write
 from jaxgran.model.checks import InputError, short_repr
 
 _DIGEST = hashlib.sha256().digest_size  # bytes
-_LONGEST_NAME = 200  # bytes; file systems accept 255, and the temporary files beside a file have longer names
+_LONGEST_NAME = 200  # bytes; file systems accept 255, and temporary files have longer names
 
 
 class CorruptFile(Exception):
-    """A file cannot be read, or its content is not what was written."""
+    """A file cannot be read, or its checksum does not match its content."""
 
 
 def require_place(path: Path, option: str, ending: str) -> None:
-    """Raise an InputError that says what is accepted, unless a file with this ending can be written to ``path``."""
+    """Raise an InputError unless a file with this suffix can be written to ``path``."""
     if path.suffix != ending:
         raise InputError(
             f"{option} must be a file name that ends in {ending}, not {short_repr(str(path))}.", field=option
@@ -58,8 +57,8 @@ def require_place(path: Path, option: str, ending: str) -> None:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[str, object]) -> None:
-    """Write named arrays, and a JSON-compatible description of them, as an HDF5 file with a checksum."""
-    import h5py  # here, as workers without a checkpoint do not need it
+    """Write named arrays and a JSON-compatible description as an HDF5 file with a checksum."""
+    import h5py  # not at the top: workers without a checkpoint do not need it
 
     memory = io.BytesIO()
     with h5py.File(memory, "w") as file:
@@ -73,7 +72,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """The arrays and the description that ``write_arrays`` wrote; raises ``CorruptFile`` for any other content."""
+    """Read the arrays and the description written by ``write_arrays``; CorruptFile for any other content."""
     import h5py
 
     try:
@@ -82,10 +81,10 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error
     content = file_bytes[:-_DIGEST]
     if hashlib.sha256(content).digest() != file_bytes[-_DIGEST:]:
-        raise CorruptFile(f"{path.name} is not what was written")
+        raise CorruptFile(f"{path.name} does not match its checksum")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
             return arrays, json.loads(str(file.attrs["about"]))
-    except (OSError, KeyError, ValueError) as error:  # the checksum is right, but the file was not written here
+    except (OSError, KeyError, ValueError) as error:  # the checksum is right, but write_arrays did not write the file
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error

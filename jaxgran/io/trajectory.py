@@ -1,8 +1,7 @@
-"""Trajectories: the frames of a flow in a GSD file, for OVITO, freud and HOOMD-blue, and for reading back.
+"""Trajectories in GSD files, for OVITO, freud and HOOMD-blue, and for reading back.
 
-The box of GSD is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the sheared cell. The
-chunks of the GSD schema have single precision. The exact numbers are stored in further chunks, so a state is read back
-bit for bit.
+The GSD box is centred at the origin and spanned by (L, 0) and (tilt·L, L), the lattice of the sheared cell. Chunks of
+the GSD schema have single precision; further chunks store exact values, so a state is read back bit for bit.
 
 =============================  ==============  ======  =================================================================
 chunk                          shape           unit    meaning
@@ -13,7 +12,7 @@ particles/position             (grains, 3)     σ       centres, in the box arou
 particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; in the
                                                        laboratory c + γ̇ y x̂, up to the velocity of the origin
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
-bonds/group                    (bonds, 2)      –       pairs of grains that push each other in the next step
+bonds/group                    (bonds, 2)      –       pairs of grains in loaded contact in the next step
 log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
@@ -48,7 +47,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
 
-_SCHEMA_VERSION = [1, 4]  # gsd 5 would write 2.0, which programs with an older gsd reject
+_SCHEMA_VERSION = [1, 4]  # gsd 5 writes 2.0 by default, which older versions of gsd reject
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
 _NEEDED = {"position": "positions", "velocity": "velocities"}
 _EXACT = "log/particles/exact_"
@@ -58,13 +57,13 @@ _READ = (
     *(f"{_EXACT}{name}" for name in ("position", "velocity", "radius", "mass")),
     *(f"log/jaxgran/{name}" for name in ("side", "tilt", *_NUMBERS)),
 )
-Chunks = dict[str, Any]  # the arrays of a frame by name
+Chunks = dict[str, Any]  # arrays of a frame by name
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Trajectory:
-    """The states of a flow at the frames of a file, in the precision of the file, and the parameters of the flow.
+    """States and parameters of a flow, read from the frames of a file in its precision.
 
     ================  =========  =====  ============================================================
     field             shape      unit   meaning
@@ -78,8 +77,8 @@ class Trajectory:
     packing_fraction  ()         –      ν
     ================  =========  =====  ============================================================
 
-    All are NumPy arrays. They keep double precision even if JAX uses single precision. Strain, time step, shear rate
-    and restitution are NaN where the file of another program does not contain them.
+    All are NumPy arrays, in double precision even if JAX uses single precision. Strain, time step, shear rate and
+    restitution are NaN if the file, written by another program, does not contain them.
     """
 
     state: State
@@ -92,35 +91,25 @@ class Trajectory:
 
 
 def check_trajectory(path: Path) -> None:
-    """Raise a ValueError in one sentence if a trajectory cannot be written to ``path``."""
+    """Raise an InputError unless a trajectory can be written to ``path``."""
     require_place(path, "trajectory", ".gsd")
-    if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library opens no other names
+    if os.fsencode(path).decode(errors="ignore") != str(path):  # the GSD library needs UTF-8 names
         raise InputError(f"trajectory must be a file name in UTF-8, not {short_repr(str(path))}.")
 
 
-def start_trajectory(path: Path, seen: Snapshot) -> None:
-    """Write the first frame of a trajectory; an existing file is replaced."""
-    with atomic_write(path) as temporary:
-        _write(temporary, "x", seen, 0)
-
-
-def append_frame(path: Path, seen: Snapshot, step: int) -> None:
-    """Add a frame to a trajectory that ``start_trajectory`` started.
+def write_frame(path: Path, frame: Snapshot, step: int) -> None:
+    """Append a frame to a trajectory; step 0 starts a new file, replacing an old one.
 
     Args:
-      path: GSD file.
-      seen: one snapshot of the flow.
+      path: GSD file, complete after every frame.
+      frame: one snapshot of the flow.
       step: time steps since the first frame.
     """
-    _write(path, "r+", seen, step)
-
-
-def write_frame(path: Path, seen: Snapshot, step: int) -> None:
-    """Write a frame to a trajectory; step 0 starts a new file. The file is complete after every frame."""
-    if step == 0:
-        start_trajectory(path, seen)
+    if step:
+        _write(path, "r+", frame, step)
     else:
-        append_frame(path, seen, step)
+        with atomic_write(path) as temporary:
+            _write(temporary, "x", frame, 0)
 
 
 def write_trajectory(
@@ -131,26 +120,25 @@ def write_trajectory(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write states of a flow as a GSD file, with the contact forces at each, for other programs and to be read back.
+    """Write states of a flow and their contact forces as a GSD file.
 
     Args:
       path: GSD file, with the ending ``.gsd``.
-      flow: parameters of all states. The contact forces are those of its next time step.
+      flow: parameters of the flow; contact forces are those of the time step after each state.
       states: states with a leading (frames,) axis, such as ``state`` of the series of ``snapshot_series``.
-      strain: strain at each frame, shape (frames,), increasing. The file has the whole number of time steps since the
-        first frame.
+      strain: strain at each frame, shape (frames,), increasing; stored as a number of time steps since the first.
       overwrite: whether to replace an existing file.
 
     Raises:
-      InputError: (a ValueError) the file exists or cannot be written, the states do not have a leading axis or are not
-        of the flow, or the strain does not increase by at least one time step from frame to frame.
+      InputError: (a ValueError) the file exists or cannot be written, the states have no leading axis or do not fit
+        the flow, or the strain does not increase by at least one time step from frame to frame.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
     path = Path(path)
     check_trajectory(path)
     if path.exists() and not overwrite:
-        raise InputError(f"path must be another file, or overwrite be True: {short_repr(str(path))} exists.")
+        raise InputError(f"path must be a new file, or overwrite must be True: {short_repr(str(path))} exists.")
     if not isinstance(states, State) or np.ndim(states.side) != 1 or np.size(states.side) == 0:
         raise InputError("states must have one leading axis of frames: stack them, or take those of snapshot_series.")
     strains = np.asarray(strain, np.float64)
@@ -162,33 +150,33 @@ def write_trajectory(
     frames = [jax.tree.map(lambda x, k=k: x[k], states) for k in range(len(steps))]
     for state in frames:
         require_state(flow, state)
-    seen = jax.jit(snapshot)
+    snapshot_of = jax.jit(snapshot)
     with atomic_write(path) as temporary:
         for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
-            _write(temporary, "r+" if k else "x", seen(flow, state), step)
+            _write(temporary, "r+" if k else "x", snapshot_of(flow, state), step)
 
 
 def _library() -> tuple[Any, Any]:
-    """The file layer and the HOOMD schema of the GSD library, imported at the first use of a trajectory."""
+    """The file layer and the HOOMD schema of the GSD library, imported on first use."""
     return import_module("gsd.fl"), import_module("gsd.hoomd")
 
 
-def _write(path: Path, mode: str, seen: Snapshot, step: int) -> None:
+def _write(path: Path, mode: str, frame: Snapshot, step: int) -> None:
     fl, hoomd = _library()
     with fl.open(
         str(path), mode, application="jaxgran", schema="hoomd", schema_version=_SCHEMA_VERSION
-    ) as file:  # closed after every frame, so that nothing waits in memory
-        hoomd.HOOMDTrajectory(file).append(_frame(seen, step))
+    ) as file:  # closing it after every frame flushes it
+        hoomd.HOOMDTrajectory(file).append(_gsd_frame(frame, step))
 
 
-def _frame(seen: Snapshot, step: int):
+def _gsd_frame(snapshot: Snapshot, step: int):
     """A snapshot as a frame of the GSD library."""
     _, hoomd = _library()
-    state = jax.tree.map(np.asarray, seen.state)
+    state = jax.tree.map(np.asarray, snapshot.state)
     side, tilt = state.side.item(), state.tilt.item()
-    impulses = np.asarray(seen.impulses)
+    impulses = np.asarray(snapshot.impulses)
     loaded = np.flatnonzero(impulses > 0)
-    timestep, shear_rate = np.asarray(seen.timestep).item(), np.asarray(seen.shear_rate).item()
+    timestep, shear_rate = np.asarray(snapshot.timestep).item(), np.asarray(snapshot.shear_rate).item()
     frame = hoomd.Frame()
     frame.configuration.step = step
     frame.configuration.dimensions = 2
@@ -201,7 +189,9 @@ def _frame(seen: Snapshot, step: int):
     frame.bonds.N = len(loaded)
     frame.bonds.types = ["contact"]
     frame.bonds.typeid = np.zeros(len(loaded), np.uint32)
-    frame.bonds.group = np.stack([np.asarray(seen.contacts.i)[loaded], np.asarray(seen.contacts.j)[loaded]], axis=-1)
+    frame.bonds.group = np.stack(
+        [np.asarray(snapshot.contacts.i)[loaded], np.asarray(snapshot.contacts.j)[loaded]], axis=-1
+    )
     constants = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
     grain_log = {"exact_position": state.positions, "exact_velocity": state.velocities, **constants}
     flow_log = {
@@ -210,7 +200,7 @@ def _frame(seen: Snapshot, step: int):
         "strain": step * timestep * shear_rate,
         "timestep": timestep,
         "shear_rate": shear_rate,
-        "restitution": np.asarray(seen.restitution, np.float64),
+        "restitution": np.asarray(snapshot.restitution, np.float64),
     }
     frame.log = {
         "bonds/force": np.asarray(impulses[loaded] / timestep, np.float64),
@@ -225,10 +215,10 @@ def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grai
 
 
 def read_trajectory(path: str | os.PathLike) -> Trajectory:
-    """The trajectory in a GSD file; a file that jaxgran wrote is read back bit for bit.
+    """Read a trajectory from a GSD file; one written by jaxgran is read back bit for bit.
 
-    A file of another program must hold a square two-dimensional cell, sheared or not, with positions and velocities.
-    The velocities are taken as peculiar. Diameters and masses are one if the file does not contain them.
+    A file of another program must have a square two-dimensional cell, sheared or not, with positions and velocities,
+    which are taken as peculiar. Missing diameters and masses are set to one.
 
     Args:
       path: GSD file.
@@ -237,7 +227,7 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       The states of all frames and the parameters of the flow.
 
     Raises:
-      ValueError: there is no such file, or it is not such a trajectory; the message says why.
+      InputError: (a ValueError) the file does not exist or is not such a trajectory; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
@@ -246,29 +236,29 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
         raise InputError(f"there is no file {name}.")
     try:
         frames = list(_frames(os.fspath(path)))
-    except InputError as lack:
-        raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {lack}.") from None
+    except InputError as reason:
+        raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {reason}.") from None
     except Exception as error:  # a damaged file may raise any exception
-        why = short_repr(str(error)).strip("'\"").rstrip(".")
-        raise InputError(f"{name} is not a GSD file that can be read: {why}.") from None
+        reason = short_repr(str(error)).strip("'\"").rstrip(".")
+        raise InputError(f"{name} is not a readable GSD file: {reason}.") from None
     steps, numbers, states = zip(*frames, strict=True)
     state = jax.tree.map(lambda *x: np.stack(x), *states)
     areas = np.sum(np.pi * state.grains.radii[0] ** 2, dtype=np.float64)
     return Trajectory(
         state,
         np.array(steps),
-        np.array([one["strain"] for one in numbers]),
+        np.array([frame["strain"] for frame in numbers]),
         *(np.array(numbers[0][name]) for name in _NUMBERS[1:]),
         packing_fraction=areas / np.asarray(state.side[0], np.float64) ** 2,
     )
 
 
 def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
-    """Step, parameters and state of every frame; an InputError in a few words if something is missing."""
+    """Step, parameters and state of every frame; an InputError with a reason if something is missing."""
     fl, _ = _library()
     with fl.open(path, "r") as file:
         if file.schema != "hoomd":
-            raise InputError(f"its schema is {short_repr(file.schema)}, and must be hoomd")
+            raise InputError(f"its schema must be hoomd, not {short_repr(file.schema)}")
         if file.nframes == 0:
             raise InputError("it has no frames")
         first = _chunks(file, 0, {})
@@ -277,34 +267,33 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
             first.setdefault("particles/velocity", at_rest)
         for k in range(file.nframes):
             frame = _chunks(file, k, first)
-            lack = _lack(frame, first)
-            if lack:
-                raise InputError(f"in frame {k} {lack}")
+            if reason := _why_invalid(frame, first):
+                raise InputError(f"in frame {k} {reason}")
             numbers = {name: float(frame.get(f"log/jaxgran/{name}", [np.nan])[0]) for name in _NUMBERS}
             yield int(frame.get("configuration/step", [0])[0]), numbers, _state(frame)
 
 
 def _chunks(file: Any, frame: int, first: Chunks) -> Chunks:
-    """The chunks of a frame; chunks that the frame does not contain are those of the first frame."""
+    """The chunks of a frame; missing ones default to those of the first frame."""
     chunks = {name: file.read_chunk(frame=frame, name=name) for name in _READ if file.chunk_exists(frame, name)}
     return {**first, **chunks}
 
 
-def _lack(frame: Chunks, first: Chunks) -> str:
-    """What a frame lacks to be a State, in words; empty if it lacks nothing."""
+def _why_invalid(frame: Chunks, first: Chunks) -> str:
+    """The reason why a frame cannot become a State; "" if it can."""
     grains, box = _grains(frame), frame.get("configuration/box", np.ones(6))
-    known = {name: x for name, x in frame.items() if name.startswith("particles/") and name != "particles/N"}
+    arrays = {name: x for name, x in frame.items() if name.startswith("particles/") and name != "particles/N"}
     conditions = (
         (grains > 0, "there are no grains"),
         (grains == _grains(first), "the number of grains differs from that of the first frame"),
         (frame.get("configuration/dimensions", [3])[0] == 2, "the cell has three dimensions"),
         (box[0] == box[1] and box[0] > 0, "the cell is not a square"),
-        *((f"particles/{name}" in frame, f"there are no {words}") for name, words in _NEEDED.items()),
-        (all(len(x) == grains for x in known.values()), "some array does not have one entry for each grain"),
-        (all(np.isfinite(x).all() for x in (box, *known.values())), "some number is not finite"),
+        *((f"particles/{name}" in frame, f"there are no {meaning}") for name, meaning in _NEEDED.items()),
+        (all(len(x) == grains for x in arrays.values()), "some array does not have one entry for each grain"),
+        (all(np.isfinite(x).all() for x in (box, *arrays.values())), "some number is not finite"),
         *((np.all(frame.get(f"particles/{x}", 1) > 0), f"some {x} is not positive") for x in ("diameter", "mass")),
     )
-    return next((words for holds, words in conditions if not holds), "")
+    return next((reason for holds, reason in conditions if not holds), "")
 
 
 def _grains(frame: Chunks) -> int:
@@ -313,7 +302,7 @@ def _grains(frame: Chunks) -> int:
 
 
 def _state(frame: Chunks) -> State:
-    """The state of a frame: from the exact chunks if they are there, else from the chunks of the GSD schema."""
+    """The state of a frame, from the exact chunks if present, else from those of the GSD schema."""
     grains = _grains(frame)
     if f"{_EXACT}position" in frame:
         radii, masses, positions, velocities = (

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
@@ -28,7 +29,6 @@ from jaxgran.maps.pool import WorkerDied, run_tasks, send
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
-from jaxgran.persistent_jit import persistent_jit
 from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper, Report, advance_batch, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch

@@ -18,6 +18,7 @@ from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.advance import advance, register_numba
 from jaxgran.dynamics.engine import Engine, Jax, Numerics
 from jaxgran.dynamics.interruption import waited
@@ -25,7 +26,6 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.persistent_jit import persistent_jit
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
 # Advances each replica by its number of steps, and a wrapper that adds reports or records and leaves the states alone.

@@ -30,9 +30,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
-from jaxgran.persistent_jit import persistent_jit
 from jaxgran.sampling.sample import Sample
 from jaxgran.statistics import Estimates, standard_errors
 from jaxgran.theory.enskog import momentum_transfer

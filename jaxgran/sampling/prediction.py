@@ -8,9 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
-from jaxgran.persistent_jit import persistent_jit
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 from jaxgran.theory.steady_shear import SteadyShear
 

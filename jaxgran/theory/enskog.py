@@ -1,6 +1,6 @@
-"""Enskog's rate of momentum transfer at a given temperature tensor: the stress that collisions would carry.
+"""Enskog's collisional stress at a given temperature tensor, for instance a measured one.
 
-It predicts no temperature, so a measured one can be put in. Units: ``steady_shear``.
+Units: ``steady_shear``.
 """
 
 from functools import partial
@@ -15,7 +15,7 @@ from jaxgran.theory.steady_shear import Scalar, as_floats
 
 
 class MomentumTransfer(NamedTuple):
-    """What the collisions of a flow transfer by unit area and time; both symmetric, (2, 2).
+    """Momentum transferred by collisions per unit area and time; both are symmetric.
 
     ============  =======  ==============================================================================
     stress        m/t²     Σ d n ⊗ n p over the collisions, the collisional stress
@@ -46,19 +46,19 @@ def momentum_transfer(
     packing_fraction  –         0 < ν < 1
     shear_rate        1/t       γ̇ ≥ 0
     polydispersity    σ         0 ≤ Δ < 1: diameters uniform in σ ± Δ
-    size_classes      –         number of Gauss-Legendre points that represent the
-                                law of diameters; static, a change recompiles
+    size_classes      –         number of Gauss-Legendre points of the size
+                                distribution; static, a change recompiles
     returns                     MomentumTransfer
     ================  ========  =======================================================
 
-    The approach speed w of a pair along its normal n is Gaussian, with the mean −γ̇ d n_x n_y and the variance
-    n·T·n (1/m_i + 1/m_j). A collision transfers the impulse p = (1 + α) μ w. So the stress is
+    The approach speed w of a pair along its normal n is Gaussian, with mean −γ̇ d n_x n_y and variance
+    n·T·n (1/m_i + 1/m_j). A collision transfers the impulse p = (1 + α) μ w, so the stress is
     ½ Σ_ij n_i n_j χ_ij d_ij² (1 + α) μ_ij ∮ dn n ⊗ n ⟨w²⟩, averaged over w > 0.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988).
 
     Examples:
-      Without shear, the pressure of collisions is (1 + α) ν χ times that of the motion, n T.
+      Without shear the collisional pressure is (1 + α) ν χ times the kinetic one, n T.
 
       >>> still = momentum_transfer(jnp.eye(2), 0.8, 0.5, shear_rate=0.0, polydispersity=0.0)
       >>> round(float(still.stress[0, 0] / (4 / jnp.pi * 0.5)), 4), round(1.8 * 0.5 * 3.125, 4)
@@ -75,7 +75,7 @@ def momentum_transfer(
         -rate * distances[:, :, None] * (normals[0] * normals[1])[None, None, :],
         jnp.sqrt(spread[:, :, None] * along[None, None, :]),
     )  # each (classes, classes, angles)
-    arc = 2 * jnp.pi / ANGLES  # the two halves of the circle give equal integrals
+    arc = 2 * jnp.pi / ANGLES  # both halves of the circle contribute equally
     pairs = mixture.number_densities[:, None] * mixture.encounters / 2  # half: each pair is summed twice
     transfer = arc * pairs * (1 + alpha) * mixture.reduced_masses * distances
     return MomentumTransfer(

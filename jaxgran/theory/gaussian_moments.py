@@ -1,8 +1,8 @@
-"""Kinetic theory by the moments of an anisotropic Gaussian, for any size distribution.
+"""Kinetic theory with anisotropic Gaussian velocities, for any size distribution.
 
-Each size class has its own temperature tensor. Collisions between classes balance the work of the shear, at any
-restitution and beyond linear order in the shear rate. The theory neglects correlations between the velocities of
-neighbours. So it fails near jamming, and in dense flow at small restitution. Units: ``steady_shear``.
+Each size class has its own temperature tensor, in which collisions balance the work of the shear at any restitution and
+beyond linear order in the shear rate. The theory neglects correlations between the velocities of neighbours, so it
+fails near jamming and in dense flow at small restitution. Units: ``steady_shear``.
 """
 
 from functools import partial
@@ -28,7 +28,7 @@ def gaussian_moments(
     polydispersity: Scalar = 0.26,
     size_classes: int = 4,
 ) -> SteadyShear:
-    """Steady shear of polydisperse discs with Gaussian velocities, and one temperature tensor for each size class.
+    """Steady shear of polydisperse discs with Gaussian velocities and a temperature tensor for each size class.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -37,15 +37,14 @@ def gaussian_moments(
     packing_fraction  –     0 < ν < 1
     shear_rate        1/t   γ̇ > 0
     polydispersity    σ     0 ≤ Δ < 1: diameters uniform in σ ± Δ
-    size_classes      –     number of Gauss-Legendre points that represent the
-                            law of diameters; static, a change recompiles
-    returns                 SteadyShear, not finite at α = 1, where nothing
-                            balances the shear
+    size_classes      –     number of Gauss-Legendre points of the size
+                            distribution; static, a change recompiles
+    returns                 SteadyShear; not finite at α = 1, where nothing
+                            balances the work of the shear
     ================  ====  =======================================================
 
-    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0. Q is the collision integral of
-    Enskog, including the shear across the contact. The balance is solved by Newton's method. Its derivatives follow
-    from the implicit function theorem.
+    In each class the second moments balance: −γ̇(δ_ax T_yb + δ_bx T_ay) + Q_ab = 0, with Q Enskog's collision integral
+    including the shear across the contact. It is solved by Newton's method and differentiated implicitly.
 
     Source: J. T. Jenkins and M. W. Richman, J. Fluid Mech. 192, 313 (1988); J. F. Lutsko, Phys. Rev. E 70, 061101
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
@@ -93,7 +92,7 @@ def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, g
     start = jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])[:, None] * jnp.ones_like(mixture.diameters)[None, :]
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_linear_solve)
 
-    # solved at unit shear rate: with no other time scale, every temperature and stress is proportional to γ̇²
+    # Solved at unit shear rate: there is no other time scale, so temperatures and stresses scale as γ̇²
     temperatures = _temperatures(solution)
     collisions = _collisions(temperatures, alpha, mixture)
     xx, yy, xy = jnp.sum(mixture.number_densities[None, :] * temperatures, axis=1) + collisions.stress
@@ -108,7 +107,7 @@ def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, g
 
 
 class _Collisions(NamedTuple):
-    """Effects of the collisions at unit shear rate; components in the order xx, yy, xy.
+    """Effects of collisions at unit shear rate; components in the order xx, yy, xy.
 
     ===========  ============  =====  =================================================
     source       (3, classes)  mσ²γ̇³  rate of change of the temperature tensor of a class
@@ -127,15 +126,15 @@ class _Collisions(NamedTuple):
 def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: Mixture) -> _Collisions:
     """Enskog collision integrals of Gaussian velocities.
 
-    Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with the mean
-    −γ̇ d_ij n_x n_y and the variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w. So
+    Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with mean
+    −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w, so
     the temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩.
-    The average is over w > 0. There ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
+    The average is over w > 0, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
     """
     angle = (jnp.arange(ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / ANGLES)
     nx, ny = jnp.cos(angle)[None, :], jnp.sin(angle)[None, :]
     normals = jnp.stack([nx * nx, ny * ny, nx * ny])  # (3, 1, angles)
-    arc = 2 * jnp.pi / ANGLES  # the two halves of the circle give equal integrals
+    arc = 2 * jnp.pi / ANGLES  # both halves of the circle contribute equally
 
     txx, tyy, txy = temperatures[:, :, None]
     push_x, push_y = txx * nx + txy * ny, txy * nx + tyy * ny  # T·n, (classes, angles)
@@ -182,8 +181,7 @@ def _temperatures(unknowns: Float[Array, "3 classes"]) -> Float[Array, "3 classe
 def _newton(function, start):
     """Root of `function` by Newton's method with a bounded step.
 
-    It ends after the first step below the square root of the rounding unit: convergence is quadratic, so the remaining
-    error is rounding. It also ends on a step that is not a number.
+    It stops after the first step below the square root of machine epsilon, as convergence is quadratic, or at a NaN.
     """
     tolerance = jnp.finfo(start.dtype).eps ** 0.5
 
@@ -218,7 +216,7 @@ def _dense_linear_solve(linear, target):
 def _eliminated(matrix: Float[Array, "n n"], side: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solution of a linear system by Gauss-Jordan elimination with partial pivoting.
 
-    For a dozen unknowns it replaces LAPACK, which JAX would load from SciPy in half a second.
+    For a dozen unknowns; LAPACK would be loaded from SciPy, which takes half a second.
     """
     places = jnp.arange(side.size)
 

@@ -1,4 +1,4 @@
-"""Mixtures of grains by a few classes of diameter, and the moments of approaching pairs with Gaussian velocities."""
+"""Mixtures of a few size classes, and the moments of approaching pairs with Gaussian velocities."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ ANGLES = 32  # contact directions on the half circle; the integrand is smooth an
 
 
 class Mixture(NamedTuple):
-    """A law of diameters represented by a few classes.
+    """A size distribution represented by a few classes.
 
     ================  ==================  ====  ==================================================================
     diameters         (classes,)          σ     diameters of the grains
@@ -37,14 +37,14 @@ class Mixture(NamedTuple):
 
 
 def uniform_mixture(nu: Float[Array, ""], width: Float[Array, ""], size_classes: int) -> Mixture:
-    """The uniform law of diameters in σ ± width."""
+    """Diameters distributed uniformly in σ ± width."""
     nodes, weights = np.polynomial.legendre.leggauss(size_classes)
     diameters = 1 + width * jnp.asarray(nodes, nu.dtype)
     return mixture_of(nu, diameters, diameters**2, jnp.asarray(weights / 2, nu.dtype))
 
 
 def mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions: Array) -> Mixture:
-    """Classes of grains from their diameters, masses and number fractions, (classes,) each.
+    """A mixture of classes with given diameters, masses and number fractions, each (classes,).
 
     Contact values: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
@@ -56,7 +56,7 @@ def mixture_of(nu: Float[Array, ""], diameters: Array, masses: Array, fractions:
 
 
 def half_range_moments(mean: Array, deviation: Array) -> tuple[Array, Array, Array]:
-    """First, second and third moment of a Gaussian over its positive values."""
+    """First, second and third moment of a Gaussian, restricted to positive values."""
     z = mean / deviation
     above = jax.lax.erfc(-z / jnp.sqrt(2.0).astype(z.dtype)) / 2
     bell = jnp.exp(-(z**2) / 2) / np.sqrt(2 * np.pi).item()

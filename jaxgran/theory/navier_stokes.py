@@ -1,7 +1,7 @@
-"""Kinetic theories of one grain size at Navier-Stokes order.
+"""Kinetic theories of monodisperse discs to Navier-Stokes order.
 
 The theory of Jenkins and Richman is for nearly elastic grains, that of Garzó and Dufty for any restitution. Both
-neglect correlations between the velocities of neighbours. So both fail near jamming, and in dense flow at small
+neglect correlations between the velocities of neighbours, so they fail near jamming and in dense flow at small
 restitution. Units: ``steady_shear``.
 """
 
@@ -11,7 +11,7 @@ from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_
 
 
 def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
-    """Steady shear of nearly elastic discs of one size.
+    """Steady shear of nearly elastic, monodisperse discs.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -22,28 +22,28 @@ def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: S
     returns                 SteadyShear
     ================  ====  =======================================================
 
-    At α = 1 nothing balances the shear, and the temperature is infinite.
+    At α = 1 nothing balances the work of the shear, and the temperature is infinite.
 
     Source: J. T. Jenkins and M. W. Richman, Phys. Fluids 28, 3485 (1985).
     """
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
     chi = contact_value(nu)
     density = 4 / jnp.pi * nu
-    # T follows from the balance of energy: viscosity √T γ̇² = loss T^{3/2}
+    # Energy balance for T: viscosity √T γ̇² = cooling T^{3/2}
     viscosity = 4 / jnp.pi * (jnp.sqrt(jnp.pi) / 8) * (1 / chi + 2 * nu + (1 + 8 / jnp.pi) * nu**2 * chi)
-    loss = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
-    temperature = viscosity / loss * rate**2
+    cooling = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
+    temperature = viscosity / cooling * rate**2
     return SteadyShear(
         granular_temperature=temperature,
         pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
         shear_stress=viscosity * jnp.sqrt(temperature) * rate,
         collision_rate=maxwellian_collision_rate(density, chi, temperature) / rate,
-        dissipation=loss * temperature**1.5,
+        dissipation=cooling * temperature**1.5,
     )
 
 
 def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
-    """Steady shear of inelastic discs of one size, to first order in the velocity gradient.
+    """Steady shear of inelastic, monodisperse discs, to first order in the velocity gradient.
 
     ================  ====  =======================================================
     name              unit  meaning
@@ -54,15 +54,15 @@ def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scala
     returns                 SteadyShear
     ================  ====  =======================================================
 
-    At α = 1 nothing balances the shear, and the temperature is infinite. In steady shear the restitution fixes the size
-    of the gradient, so the gradient is not small at small restitution. There, in dilute flow, the temperature of this
-    expansion in the gradient is several times too high.
+    At α = 1 nothing balances the work of the shear, and the temperature is infinite. In steady shear the restitution
+    fixes the velocity gradient, which is not small at small restitution: in dilute flow this expansion then gives a
+    temperature several times too high.
 
     Source: V. Garzó and J. W. Dufty, Phys. Rev. E 59, 5895 (1999); in two dimensions J. F. Lutsko, Phys. Rev. E 72,
     021306 (2005).
 
     Examples:
-      Bagnold's scaling: 1/γ̇ is the only time scale, so stresses are proportional to γ̇².
+      Bagnold scaling: 1/γ̇ is the only time scale, so stresses scale as γ̇².
 
       >>> slow, fast = garzo_dufty(0.9, 0.4), garzo_dufty(0.9, 0.4, shear_rate=2.0)
       >>> round(float(fast.pressure / slow.pressure), 6)

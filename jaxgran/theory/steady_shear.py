@@ -1,8 +1,7 @@
-"""SteadyShear: what every theory here predicts, and the quantities that the theories share.
+"""SteadyShear, the prediction of every theory here, and what the theories share.
 
-Lengths are in mean diameters, masses in the mass of a grain of mean diameter. A grain of diameter d has the mass d²,
-unless its mass is given. All functions can be differentiated. They treat one flow; `jax.vmap` adds a leading
-`(replicas,)`.
+Lengths are in mean diameters, masses in the mass of a grain of mean diameter. A grain of diameter d has mass d² unless
+its mass is given. All functions are differentiable and treat one flow; `jax.vmap` adds a leading `(replicas,)`.
 """
 
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ Scalar = float | int | Real[Array, ""]
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SteadyShear:
-    """What a theory predicts for steady simple shear.
+    """Prediction of a theory for steady simple shear.
 
     ====================  =======  ===========================================================================
     field                 unit     meaning
@@ -26,12 +25,12 @@ class SteadyShear:
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
     collision_rate        –        collisions per grain and unit strain; each grain counts all its collisions
-    dissipation           m/t³     energy lost per unit area and time; in steady shear it equals the power of the
-                                   shear, shear_stress × shear_rate
+    dissipation           m/t³     energy lost per unit area and time; equals the power of the shear,
+                                   shear_stress × shear_rate
     ====================  =======  ===========================================================================
 
-    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the given shear rate.
-    At the default shear rate of 1, all numbers are in units of m = σ = γ̇ = 1.
+    All are scalars, with a leading ``(replicas,)`` under ``vmap``. The unit of time t is that of the shear rate; at the
+    default γ̇ = 1, all numbers are in units of m = σ = γ̇ = 1.
     """
 
     granular_temperature: Float[Array, "*replicas"]
@@ -62,7 +61,7 @@ def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:
 
 
 def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) -> Array:
-    """Collisions per grain and time of discs of one size with Maxwellian velocities.
+    """Collisions per grain and time of monodisperse discs with Maxwellian velocities.
 
     ===========  ========  ==========================
     density      1/σ²      grains per unit area
@@ -75,6 +74,6 @@ def maxwellian_collision_rate(density: Array, chi: Array, temperature: Array) ->
 
 
 def as_floats(*values: Scalar) -> list[Float[Array, ""]]:
-    """The values as arrays of one common floating-point type."""
+    """The values as arrays of a common floating-point type."""
     dtype = jnp.result_type(float, *values)
     return [jnp.asarray(value, dtype) for value in values]

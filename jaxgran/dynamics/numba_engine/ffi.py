@@ -21,7 +21,7 @@ from threading import Lock
 import jax
 from llvmlite import binding as llvm
 
-from jaxgran.caches import cache_folder, users_folder
+from jaxgran.cache.folder import cache_folder, users_folder
 from jaxgran.files import file_lock, read_cached, write_cached
 from jaxgran.model.checks import InputError
 

@@ -1,8 +1,8 @@
-"""Compiled programs that are kept on disk, so that a process need not trace and compile them again.
+"""``jit`` with compiled programs on disk, so that a new process need neither trace nor compile them.
 
-JAX keeps what XLA has compiled. But to find it there, every process traces and lowers the program, which takes seconds.
-Here the key is known before: the sources of this package, the versions, the flags, and the shapes of the arguments.
-Programs are kept where JAX keeps its own, and only for a single processor device.
+JAX caches compiled programs too, but to look one up it must first trace and lower the function, which takes seconds.
+Here the key needs no tracing: the sources of this package, versions, flags, and the shapes of the arguments. Programs
+are stored inside JAX's cache folder, and only for a single CPU device.
 """
 
 import hashlib
@@ -25,20 +25,20 @@ from jax.experimental.serialize_executable import deserialize_and_load, serializ
 from jaxgran.environment import processor_features
 from jaxgran.files import file_lock, read_cached, write_cached
 
-_MOST_KEPT = 64  # programs of up to 4 MB
+_MOST_PROGRAMS = 64  # of up to 4 MB each
 _PACKAGES = ("jax", "jaxlib", "numpy")
-_CALLED = re.compile(r"stablehlo\.custom_call @(\w+)")
-_SHORTEST_COMPILATION = "jax_persistent_cache_min_compile_time_secs"  # of programs that JAX keeps
-_SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX loads when it lowers a program
+_CUSTOM_CALL = re.compile(r"stablehlo\.custom_call @(\w+)")
+_MIN_COMPILE_TIME = "jax_persistent_cache_min_compile_time_secs"
+_SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX loads only on lowering
 
 
 def persistent_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
-    """``jax.jit`` of a function, with its compiled programs kept on disk where JAX has a folder for its cache.
+    """``jax.jit`` of a function, with its compiled programs cached on disk if JAX has a cache folder.
 
     Args:
-      function: a function of pytrees of arrays, without static arguments. The flags of JAX are read when it is first
-        called for some shapes.
-      register: called before a program that calls the numba engine is loaded.
+      function: a function of pytrees of arrays, without static arguments. JAX's flags are read at the first call with
+        arguments of given shapes.
+      register: called before loading a program that calls the numba engine.
     """
     jitted = jax.jit(function)
     programs: dict[Any, Callable] = {}
@@ -52,18 +52,18 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
         key = (structure, tuple(map(jax.typeof, leaves)))
         if key not in programs:
             path = folder / f"{_digest(function, key)}.program"
-            found = _loaded(path, register)
-            if found is None:
+            program = _load(path, register)
+            if program is None:
                 with file_lock(path):
-                    found = _loaded(path, register) or _compiled(jitted, arguments, path)
-            programs[key] = found
+                    program = _load(path, register) or _compile(jitted, arguments, path)
+            programs[key] = program
         return programs[key](*arguments)
 
     return call
 
 
 def _folder() -> Path | None:
-    """Where programs are kept; None if they are not."""
+    """The folder of cached programs; None if programs are not cached."""
     folder = jax.config.values["jax_compilation_cache_dir"]
     single = folder and jax.default_backend() == "cpu" and jax.device_count() == 1
     return Path(folder) / "programs" if single else None
@@ -77,33 +77,33 @@ def _has_foreign_class(structure: Any) -> bool:
 
 
 def _flags() -> str:
-    """The flags of JAX, which a program may depend on."""
+    """All flags of JAX, since a program may depend on any of them."""
     return repr(sorted((name, repr(x)) for name, x in jax.config.values.items() if "cache" not in name))
 
 
 @cache
 def _origin() -> str:
-    """What all programs depend on: the sources of this package, the versions, the processor and the flags of XLA."""
+    """What every program depends on: sources of this package, versions, processor, XLA flags."""
     digest = hashlib.sha256()
-    folder = Path(__file__).parent
+    folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
-    words = [f"{name} {version(name)}" for name in _PACKAGES]
-    words += [processor_features(), os.environ.get("XLA_FLAGS", "")]
-    return digest.hexdigest() + "\n".join(words)
+    lines = [f"{name} {version(name)}" for name in _PACKAGES]
+    lines += [processor_features(), os.environ.get("XLA_FLAGS", "")]
+    return digest.hexdigest() + "\n".join(lines)
 
 
 def _digest(function: Callable, key: tuple) -> str:
-    words = f"{_origin()}\n{_flags()}\n{function.__module__}.{function.__qualname__}\n{key}"
-    return hashlib.sha256(words.encode()).hexdigest()[:32]
+    text = f"{_origin()}\n{_flags()}\n{function.__module__}.{function.__qualname__}\n{key}"
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def _loaded(path: Path, register: Callable[[], None]) -> Callable | None:
-    """A kept program; None if there is none, or if it cannot be loaded."""
+def _load(path: Path, register: Callable[[], None]) -> Callable | None:
+    """A cached program; None if there is none or it cannot be loaded."""
     content = read_cached(path)
     if content is None:
         return None
-    with suppress(Exception):  # whatever is wrong with it, it can be compiled again
+    with suppress(Exception):  # whatever is wrong with the file, the function can be compiled again
         numba, *parts = pickle.loads(content)
         if numba:
             register()
@@ -111,39 +111,39 @@ def _loaded(path: Path, register: Callable[[], None]) -> Callable | None:
     return None
 
 
-def _compiled(jitted: Any, arguments: tuple, path: Path) -> Callable:
-    """The program for these arguments, kept if possible."""
+def _compile(jitted: Any, arguments: tuple, path: Path) -> Callable:
+    """Compile for these arguments, and cache the program if possible."""
     lowered = jitted.lower(*arguments)
-    called = set(_CALLED.findall(lowered.as_text()))
+    called = set(_CUSTOM_CALL.findall(lowered.as_text()))
     if not called <= set(_SAFE_CALLS):
         return lowered.compile()
-    with _not_kept_by_jax() as found_by_jax:
+    with _jax_cache_read_only() as cache_hits:
         program = lowered.compile()
-    if not found_by_jax:  # such a program cannot be written again: XLA leaves out part of it
+    if not cache_hits:  # a program from JAX's cache cannot be serialised again: XLA omits part of it
         try:
-            write_cached(path, pickle.dumps((bool(called), *serialize(program))), _MOST_KEPT)
+            write_cached(path, pickle.dumps((bool(called), *serialize(program))), _MOST_PROGRAMS)
         except OSError as error:
             warnings.warn(
-                f"compiled programs are not kept: {str(path.parent)!r} cannot be written ({error.strerror}).",
+                f"compiled programs are not cached: {str(path.parent)!r} cannot be written ({error.strerror}).",
                 stacklevel=3,
             )
     return program
 
 
 @contextmanager
-def _not_kept_by_jax() -> Iterator[list[str]]:
-    """JAX does not write into its own cache; the list receives an entry if it has found the program there."""
+def _jax_cache_read_only() -> Iterator[list[str]]:
+    """Keep JAX from writing to its own cache; the list receives an entry for each program found there."""
     hits: list[str] = []
 
     def listen(event: str, **_: Any) -> None:
         if event == "/jax/compilation_cache/cache_hits":
             hits.append(event)
 
-    before = jax.config.values[_SHORTEST_COMPILATION]
+    before = jax.config.values[_MIN_COMPILE_TIME]
     monitoring.register_event_listener(listen)
-    jax.config.update(_SHORTEST_COMPILATION, float("inf"))
+    jax.config.update(_MIN_COMPILE_TIME, float("inf"))
     try:
         yield hits
     finally:
-        jax.config.update(_SHORTEST_COMPILATION, before)
+        jax.config.update(_MIN_COMPILE_TIME, before)
         monitoring.unregister_event_listener(listen)

@@ -1,0 +1,86 @@
+"""The folder of the compilation cache: in the user's cache folder, or a temporary one if that is not writable."""
+
+import os
+import stat
+import tempfile
+import warnings
+from pathlib import Path
+
+from platformdirs import user_cache_path
+
+from jaxgran.environment import processor_kind
+
+_SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
+
+
+def enable_cache() -> Path | None:
+    """Cache compiled programs on disk, so that later processes need not compile them again.
+
+    Call it first, best before JAX is imported; the command line does so itself. The cache is in the user's cache
+    folder, which ``XDG_CACHE_HOME`` may set and ``jaxgran info`` prints. Each kind of processor has its own folder
+    there, since several machines may share a home folder. If the folder is not writable, a temporary one is used and
+    a warning names it.
+
+    Returns:
+      The cache folder of this processor; None if no folder is writable.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs a long, harmless error when it loads a cached program
+    import jax
+
+    if message := fallback_message():
+        warnings.warn(message, stacklevel=2)
+    folder = cache_folder()
+    programs = None if folder is None else folder / processor_kind()
+    jax.config.update("jax_compilation_cache_dir", None if programs is None else str(programs))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
+    return programs
+
+
+def fallback_message() -> str:
+    """One sentence that says why the user's cache folder is not used and what is used instead; "" if it is used."""
+    folder = cache_folder()
+    if folder == users_folder():
+        return ""
+    instead = "every run compiles anew" if folder is None else f"compiled programs are kept in {str(folder)!r}"
+    return (
+        f"the cache folder {str(users_folder())!r} cannot be written ({why_unwritable(users_folder())}), so {instead}; "
+        "XDG_CACHE_HOME may name another."
+    )
+
+
+def users_folder() -> Path:
+    """The folder of this package in the user's cache folder; it need not exist."""
+    return user_cache_path("jaxgran")
+
+
+def cache_folder() -> Path | None:
+    """The user's folder, else the temporary one; None if neither is writable."""
+    return _temporary_folder() if why_unwritable(users_folder()) else users_folder()
+
+
+def why_unwritable(folder: Path) -> str:
+    """The reason why no file can be written to a folder, which is created if missing; "" if it is writable."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return ""
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _temporary_folder() -> Path | None:
+    """This user's folder in the temporary directory, the same in every process; None if it is not safe to use.
+
+    Cached programs are executed later, so no other user may be able to write there.
+    """
+    if not hasattr(os, "getuid"):  # a system without owners of folders
+        return None
+    try:
+        folder = Path(tempfile.gettempdir()) / f"jaxgran-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    shared = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not shared
+    return folder if private and not why_unwritable(folder) else None
