@@ -170,8 +170,8 @@ MISTAKES = (
     Mistake(
         "unit of a time step",
         "jaxgran/maps/dataset.py",
-        '"units": "1 / shear rate",',
-        '"units": "1",',
+        '"long_name": "time step of the sample", "units": "1 / shear rate"}',
+        '"long_name": "time step of the sample", "units": "1"}',
         "an attribute has the unit of its variable",
         ("test_dataset.py", "test_ratio_map.py", "test_engine.py"),
     ),

@@ -97,8 +97,9 @@ def network(made: Strip, velocities: np.ndarray) -> Contacts:
 
 
 @partial(jax.jit, static_argnames="discs")
-def _solved(contacts: Contacts, discs: int, solver: jg.ProjectedMethod) -> Solution:
-    return solve(contacts, discs, 0.0, solver, jnp.bool_(True))
+def _solved(contacts: Contacts, discs: int, solver: jg.ProjectedMethod, tolerance: float) -> Solution:
+    """The solution to a tolerance that may be above the range of flows, as a traced number is not checked."""
+    return solve(contacts, discs, 0.0, replace(solver, tolerance=tolerance), jnp.bool_(True))
 
 
 class Pushed(NamedTuple):
@@ -133,7 +134,7 @@ def pushed(made: Strip, method: str, tolerance: float, steps: int) -> Pushed:
         if method == SWEEPS:
             solution = gauss_seidel(contacts, discs, tolerance, MOST_ITERATIONS, 0.0)
         else:
-            solution = _solved(contacts, discs, replace(METHODS[method], tolerance=tolerance))
+            solution = _solved(contacts, discs, METHODS[method], tolerance)
         status = Status(int(solution.status))
         if status != Status.ok:
             raise RuntimeError(f"{method} has failed at a tolerance of {tolerance:g}: {status.name}.")

@@ -18,7 +18,6 @@ batches.batch_size = lambda *_: 2
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
-modules["dask"] = None  # as for a user without a cluster: xarray would load it, which takes half a second
 advance_batch = replicas.advance_batch
 FAULT = os.environ.get("FAULT", "")
 

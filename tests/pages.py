@@ -15,6 +15,7 @@ import pytest
 import xarray as xr
 from synthetic import random_instant, random_replica, random_tally, snapshot_of
 
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
@@ -58,10 +59,10 @@ def made_up_film(frames: int = 5) -> Film:
     frame = jax.tree.map(lambda x: x[0], seen)
     state: Any = SimpleNamespace(side=np.array([5.0]))
     recorder: Any = SimpleNamespace(recording=lambda drive: drive)
-    drive = film.recording(recorder)(lambda flow, state, steps: (state, random_tally(rng, 1)))
+    drive = film.recording(recorder)(lambda flow, numerics, state, steps: (state, random_tally(rng, 1)))
     for step in steps:
         if step:
-            drive(flow, state, np.array([1]))
+            drive(flow, DEFAULT_NUMERICS, state, np.array([1]))
         film.frames.keep(frame, 10 * step)
     return film
 

@@ -287,7 +287,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "sample of a batch": (lambda: jg.sample(BATCH, SEEN.state, 1.0), "one ShearFlow, and this is a batch"),
     "sample of a batch of states": (lambda: jg.sample(flow(), SEVERAL.state, 1.0), f"one State of {GRAINS} grains"),
     "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
-    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "one of a series is"),
+    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "take one of a series by"),
     "fields at a point": (lambda: jg.fields_at(SEEN, np.zeros(2), jg.lucy(1.0)), r"\(points, 2\) of finite numbers"),
     "width beyond the cell": (lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)), "positive and at most 3.25"),
     "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),
@@ -513,6 +513,8 @@ ALIKE = {
     "solver_parameters": '{"tolerance": 1e-4, "max_steps": 5000}',
     "engine_requested": "auto",
     "equilibrate": "until steady",
+    "snapshots": 0,
+    "first_seed": 0,
 }
 
 

@@ -30,7 +30,7 @@ from command_line import (
     made_up_replicas,
     write_few_variables,
 )
-from drawn import leave_out_layout, write_without_drawing
+from drawn import write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
 from made_up_maps import known_closure, made_up_map
@@ -41,13 +41,14 @@ from synthetic import one_sentence, random_replica
 from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
 from jaxgran.cli.tables import print_table
+from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
-from jaxgran.maps.schema import shear_stress_ratio
+from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
@@ -138,7 +139,7 @@ MISTAKES = {  # one for each kind of option, check and file
     "map --error 0.02 --strain 5": "--strain and --error exclude each other",
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --engine fortran": "--engine must be auto, numba, jax or pallas, not 'fortran'",
-    "map --engine pallas": "engine must be auto or jax on a CPU, not pallas",
+    "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --workers 0": "--workers must be a whole number of at least 1",
     "map --output map.txt": "--output must be a file name that ends in .nc",
@@ -228,17 +229,6 @@ def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> No
     assert not files(tmp_path)
 
 
-@pytest.mark.slow
-def test_a_mistake_is_one_sentence_with_and_without_cached_programs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    for _ in range(2):
-        assert_one_sentence(in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09"))
-        assert any((tmp_path / "cache" / "jaxgran").iterdir())
-    assert files(tmp_path) == {"cache"}
-
-
 # What the commands do
 
 
@@ -257,13 +247,13 @@ def test_map_writes_a_dataset_and_its_figures(small_map, small_data) -> None:
     np.testing.assert_array_equal(data.restitution, [0.5, 0.9])
     np.testing.assert_array_equal(data.packing_fraction, [0.5, 0.6])
     assert np.all(data.force_ratio >= 0.99)
-    assert np.all(data.equilibration_strain_by_seed == 0.5)
+    assert np.all(data["seeds/equilibration_strain"] == 0.5)
     assert data.attrs["command"] == f"jaxgran {SMALL_MAP}"
     assert data.attrs["replica_steps_per_second"] > 0
 
 
 @pytest.fixture(scope="module")
-def small_data(small_map) -> xr.Dataset:
+def small_data(small_map) -> xr.DataTree:
     return read_dataset(small_map[0] / "small.nc")
 
 
@@ -286,13 +276,14 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
 def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     small_data, no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, data = tmp_path / "other.nc", small_data[["force_ratio", "force_ratio_stderr", "pressure", "status"]]
+    other, data = tmp_path / "other.nc", small_data.copy()
     write_few_variables(monkeypatch, "pressure")
-    write_dataset(data.assign_attrs(version_jax="0.1.0"), other)
+    data.attrs["version_jax"] = "0.1.0"
+    write_dataset(data, other)
     outcome = jaxgran(tmp_path, "map", "--from-map", "other.nc", "--workers", "1", "--output", "again.nc")
     again = read_dataset(tmp_path / "again.nc")
-    assert again[list(data)].equals(data)
-    assert f"version jax 0.1.0 there, {data.attrs['version_jax']} here" in outcome.err.splitlines()[0]
+    assert again.force_ratio.equals(data.force_ratio) and again.pressure.equals(data.pressure)
+    assert f"version jax 0.1.0 there, {again.attrs['version_jax']} here" in outcome.err.splitlines()[0]
     assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
 
 
@@ -313,7 +304,6 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     folder, _ = small_map
     for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
         monkeypatch.setattr(map_figures, draw, ratio_curves)
-    leave_out_layout(monkeypatch)
     words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
     assert jaxgran(folder, *words).status == 0
     assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
@@ -357,24 +347,22 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert places == sorted(places)
     assert "recording frames split the run" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
-    data = data.isel(restitution=0, packing_fraction=0)
+    data = flattened(data).isel(restitution=0, packing_fraction=0)
     averages, budget = outcome.out.split("Relative error, 95 %")
     for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "max_overlap"):
         (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
-        assert with_error(float(data[name]), float(data[f"{name}_stderr"])) in row
+        assert with_error(*(float(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))) in row
     (row,) = (line for line in outcome.out.splitlines() if line.strip().startswith("shear-stress ratio  "))
     value, error = (float(data[name][0, 1]) for name in ("stress_ratio", "stress_ratio_stderr"))
     assert with_error(value, error) in row
     (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
-    parts = [
-        1.96 * data.pressure_stderr,
-        *(data[f"pressure_error_{part}"] for part in ("timestep", "size", "tolerance")),
-    ]
-    shown = [f"{100 * float(part / data.pressure):.2g}" for part in (*parts, data.pressure_error)]
+    sources = ("sampling", "timestep", "size", "tolerance", "total")
+    shown = [f"{100 * float(data.pressure_ci95.sel(error_source=one) / data.pressure):.2g}" for one in sources]
     assert [word for word in row.split()[1:] if word != "%"] == shown
     (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
-    samples = data.strain_by_seed.sum().item() / data.pressure_correlation_strain.item()
-    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data.theory_pressure):.3g}"]
+    correlated = data["diagnostics/correlation_strain"].sel(observable="pressure")
+    samples = data["seeds/strain"].sum().item() / correlated.item()
+    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data['theory/pressure']):.3g}"]
 
 
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
@@ -384,7 +372,7 @@ def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     assert data.attrs["error"] == 0.1
     for name in ("force_ratio", "pressure", "shear_stress"):
         assert np.all(data[f"{name}_stderr"] <= sampling_error(0.1) * data[name])
-    assert data.strain_by_seed.item() >= LEAST_SAMPLE
+    assert data["seeds/strain"].item() >= LEAST_SAMPLE
     assert "relative errors: 0.1 requested" in outcome.err
 
 
@@ -406,7 +394,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("command", "platform"),
-    [("info", "cuda"), ("map", "cuda"), pytest.param("fit text.gsd", "banana", marks=pytest.mark.slow)],
+    [("info", "cuda"), ("map", "cuda")],
 )
 def test_a_platform_that_is_not_there_is_one_sentence(command: str, platform: str, folder: Path, monkeypatch) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", platform)
@@ -476,14 +464,13 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
 
 def test_fit_that_fails_has_a_status_of_its_own(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_, **__) -> NoReturn:
-        raise RuntimeError("the restitution did not converge.")
+        raise RuntimeError("the restitution did not settle.")
 
     monkeypatch.setattr(restitution, "fit_restitution", fails)
     outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
-    assert outcome == (3, "", "jaxgran: the restitution did not converge.\n")
+    assert outcome == (3, "", "jaxgran: the restitution did not settle.\n")
 
 
-@pytest.mark.slow
 def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--frame-strain", "0.02")
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
@@ -494,7 +481,7 @@ def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.out) == (3, "")
-    assert outcome.err.startswith("jaxgran: the restitution did not converge, and was 0.")
+    assert "did not converge" in outcome.err
     assert one_sentence(outcome.err.rstrip("\n"))
 
 
@@ -503,21 +490,11 @@ def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("known") / "known.nc"
     data = made_up_map()
     flags = {"flag_values": [0], "flag_meanings": "ok"}
-    write_dataset(data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags)), path)
+    data = data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags))
+    write_dataset(xr.DataTree(data), path)
     return path
 
 
-@pytest.mark.slow
-def test_fit_tells_how_well_a_law_describes_a_map(known_map: Path, tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path, "fit", str(known_map))
-    assert (outcome.status, outcome.err) == (0, "")
-    for name in ("pressure", "shear stress", "force ratio"):
-        (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
-        assert row.count("%") == 3
-        assert 0 < float(row[len(name.split())]) < 20
-
-
-@pytest.mark.slow
 def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
     point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
     stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")
@@ -606,7 +583,6 @@ def test_examples_of_map_and_plot_do_what_they_say(tmp_path: Path, monkeypatch: 
         path.touch()
         return path
 
-    leave_out_layout(monkeypatch)
     write_few_variables(monkeypatch)
     monkeypatch.setattr(ratio_map_module, "replicas", every)
     monkeypatch.setattr("jaxgran.plotting.map_figures.write", sketched)
@@ -722,7 +698,7 @@ def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
         "grains": "auto",
     }
     assert "grains_by_point" not in map_module.combined(chosen, {"grains": 256})
-    assert map_module.combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"}
+    assert map_module.combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"} | {"strain"}
     assert map_module.combined({"strain": 4.0, "seeds": 4}, {"error": 0.1, "grains": 400}) == {
         **dict.fromkeys(("timestep", "tolerance"), "auto"),
         "error": 0.1,
@@ -756,7 +732,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     )
     assert jaxgran(tmp_path, *flow, *words).status == 0
     (one,) = asked
-    assert (one.seeds, one.first_seed, one.tolerance, one.solver, one.activation) == (2, 7, 1e-6, "jacobi", "touching")
+    assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
     outcome = jaxgran(tmp_path, *flow, "--seeds", "2", "--movie", "flow.gif")
     assert_one_sentence(outcome)
     assert "leave out --seeds" in outcome.err
@@ -793,7 +769,7 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
 def last_point_overlaps_deeply(monkeypatch: pytest.MonkeyPatch, points: int) -> None:
     """A map has made-up replicas, of which the last has a bad status, and its figures are not drawn."""
     write_without_drawing(monkeypatch)
-    write_few_variables(monkeypatch, "pressure_large_system", "pressure_large_system_error")
+    write_few_variables(monkeypatch, "large_system/pressure")
     statuses = {(point, 0): Status.deep_overlap if point == points - 1 else Status.ok for point in range(points)}
     monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(statuses))
 
@@ -838,8 +814,8 @@ def test_several_numbers_of_grains_have_a_table_each_estimates_and_a_figure(
     titles = [f"Force ratio at {n} grains, dt = {dt:g} / shear rate" for n in (64, 128) for dt in (1e-3, 1e-4)]
     titles += [f"Large systems at dt = {dt:g} / shear rate" for dt in (1e-3, 1e-4)]
     assert [out.index(title) for title in titles] == sorted(out.index(title) for title in titles)
-    errors = data.pressure_large_system_error.values.flat
-    for value, error in zip(data.pressure_large_system.values.flat, errors, strict=True):
+    errors = data["large_system/pressure_ci95"].values.flat
+    for value, error in zip(data["large_system/pressure"].values.flat, errors, strict=True):
         assert with_error(value, error) in out
     assert (choices_of(data)["grains"], choices_of(data)["timestep"]) == ((64, 128), (1e-3, 1e-4))
 

@@ -18,7 +18,7 @@ import jaxgran
 ROOT = Path(jaxgran.__file__).parents[1]
 PAPER = ROOT / "docs" / "paper"
 DOCS = ROOT / "docs"
-PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
+PAGES = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if PAPER not in path.parents)
 SOURCES = sorted((ROOT / "jaxgran").rglob("*.py"))
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -49,10 +49,10 @@ def test_tests_that_pages_name_are_there() -> None:
     assert named and named <= set(re.findall(r"^def (test_\w+)", there, re.MULTILINE))
 
 
-# Names of other programs, endings of files, and names that branches under way add
-FOREIGN = """NO_MKDOCS_2_WARNING MapParameters ProjectedMethod RunParameters as css csv data_columns dev diagnostics
-    dirty equilibration_strain error_source h5 hdf5 import install-completion js lammpstrj lees_edwards lint-imports
-    mp4 nc ncdump no-caption pyplot pyright pytest_cache select show-completion src tcp tsv txt vjp"""
+# Names of other programs and of examples, and endings of files
+FOREIGN = """HeavyBall NO_MKDOCS_2_WARNING as css csv data_columns dev dirty h5 hdf5 import install-completion js
+    lammpstrj lees_edwards lint-imports mp4 nc ncdump no-caption pure_callback pyplot pyright pytest_cache select
+    show-completion src tcp tsv txt vjp"""
 PLACEHOLDERS = "ADDRESS COMMAND DT FACTOR FILE FOLDER LIST NAME NUMBER PRESET RULE STRAIN STRESS TAU TOL"
 COMMANDS = "pip uv ruff pytest mkdocs chromium-driver sp-repo-review cut fix pair_style damping flip"
 FOLDERS = ("", "jaxgran", "tests", "benchmarks", "docs", "notebooks", "benchmarks/results")

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
+from jaxgran.contact.projected_methods import Jacobi
+from jaxgran.dynamics.engine import Numba, Pallas
 from jaxgran.maps.parameters import MapParameters
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError
@@ -68,14 +70,12 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"error": 1.0}, "between 1e-3 and 0.5"),
     ({"error": float("nan")}, "between 1e-3 and 0.5"),
     ({"equilibrate": -1.0}, "at least 0"),
-    ({"tolerance": 0.0}, "between 1e-12 and 0.1"),
-    ({"tolerance": 1.0}, "between 1e-12 and 0.1"),
-    ({"solver": "gauss"}, "nesterov, barzilai-borwein, jacobi, jacobi-count or jacobi-diagonal"),
+    ({"solver": "gauss"}, "a ProjectedMethod, such as"),
     ({"activation": "always"}, "midpoint or touching"),
     ({"snapshots": 1}, "True or False"),
-    ({"engine": "fortran"}, "auto, numba, jax or pallas"),
-    ({"engine": "pallas"}, "auto or jax on a CPU, not pallas: it is made for NVIDIA GPUs"),
-    ({"engine": "numba", "solver": "jacobi"}, "auto or jax with the solver jacobi, not numba"),
+    ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\), jg.Pallas\(\) or None"),
+    ({"engine": Pallas()}, "on a CPU, not pallas: it is made for NVIDIA GPUs"),
+    ({"engine": Numba(), "solver": Jacobi()}, "with the solver jacobi, not numba"),
 ]
 
 
@@ -95,11 +95,11 @@ def test_lists_may_fall_as_well_as_rise() -> None:
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
     settings = MapSettings(**{**GOOD, "restitution": (0.7,), "packing_fraction": (0.5, 0.6)})
-    settings = replace(settings, activation="touching", engine="jax")
+    settings = replace(settings, activation="touching")
     points = [(flow.packing_fraction, flow.restitution) for flow in settings.flows()]
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
-        assert (flow.grains, flow.timestep, flow.activation, flow.engine) == (64, 1e-3, "touching", "jax")
+        assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
 
 
 def test_numbers_of_numpy_are_accepted() -> None:
@@ -136,7 +136,7 @@ def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
     given = {**GOOD, "restitution": (0.1, 0.9), "strain": None, "timestep": "auto", "tolerance": "auto"}
     found = [chosen(**given, error=error) for error in (0.1, 0.01, 0.001)]
-    timesteps, tolerances = zip(*((settings.timestep, settings.tolerance) for settings, _ in found), strict=True)
+    timesteps, tolerances = zip(*((settings.timestep, settings.solver.tolerance) for settings, _ in found), strict=True)
     assert list(timesteps) == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
     assert list(tolerances) == sorted(set(tolerances), reverse=True)
     assert all("restitution 0.9 and packing fraction 0.6" in sentence for _, sentence in found)
@@ -160,6 +160,14 @@ def test_numbers_of_grains_may_be_given_by_point() -> None:
     for wrong in ([64], 64, [64, 8], [64, 128.5]):
         with pytest.raises(InputError, match="grains"):
             chosen(**{**GOOD, "grains_by_point": wrong})
+
+
+def test_a_given_tolerance_is_that_of_the_solver() -> None:
+    settings, _ = chosen(**{**GOOD, "solver": Jacobi(relaxation=1.5), "tolerance": 1e-3})
+    assert settings.solver == Jacobi(tolerance=1e-3, relaxation=1.5)
+    for value in (0.0, 1.0, "small"):
+        with pytest.raises(InputError, match="tolerance must be between"):
+            chosen(**{**GOOD, "tolerance": value})
 
 
 def test_time_steps_may_fall_as_well_as_rise() -> None:

@@ -169,5 +169,5 @@ def test_what_computes_in_python_says_so(name: str, transformed: Callable, state
 
 
 def test_prepare_within_jit_says_so_whatever_it_is_given() -> None:
-    with pytest.raises(InputError, match=r"^prepare is not transformed by jax.jit.*: give it a batch of keys"):
+    with pytest.raises(InputError, match=r"^prepare cannot be transformed by jax.jit.*: give it a batch of keys"):
         jax.jit(lambda: jg.prepare(FLOW, KEY))()

@@ -93,7 +93,7 @@ def _reading(
         shear_rate = 1.0 if shear_rate is None else shear_rate
         require_number("shear_rate", shear_rate, lambda x: x > 0, "positive beside a strain")
         frame_time = frame_strain / shear_rate
-    return {"interval": frame_time, "shear_rate": shear_rate, "every": stride, **others}
+    return {"interval": frame_time, "shear_rate": shear_rate, "stride": stride, **others}
 
 
 def _fit_tracks(file: Path, observed: dict, noise: dict) -> None:

@@ -38,6 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
@@ -119,6 +120,7 @@ def write_trajectory(
     strain: Sequence[float] | np.ndarray,
     *,
     overwrite: bool = False,
+    solver: ProjectedMethod = DEFAULT_SOLVER,
 ) -> None:
     """Write states of a flow and their contact forces as a GSD file.
 
@@ -128,6 +130,7 @@ def write_trajectory(
       states: states with a leading (frames,) axis, such as ``state`` of the series of ``snapshot_series``.
       strain: strain at each frame, shape (frames,), increasing; stored as a number of time steps since the first.
       overwrite: whether to replace an existing file.
+      solver: solves the contacts of the time step after each state.
 
     Raises:
       InputError: (a ValueError) the file exists or cannot be written, the states have no leading axis or do not fit
@@ -150,10 +153,11 @@ def write_trajectory(
     frames = [jax.tree.map(lambda x, k=k: x[k], states) for k in range(len(steps))]
     for state in frames:
         require_state(flow, state)
+    require_solver(solver)
     snapshot_of = jax.jit(snapshot)
     with atomic_write(path) as temporary:
         for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
-            _write(temporary, "r+" if k else "x", snapshot_of(flow, state), step)
+            _write(temporary, "r+" if k else "x", snapshot_of(flow, state, solver), step)
 
 
 def _library() -> tuple[Any, Any]:

@@ -58,7 +58,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
       BadPoints: (a UserWarning) points have a bad status, or their samples are short; the message names them.
 
     Examples:
-      >>> data = ratio_map([0.9], [0.5], grains=16, seeds=1, strain=0.4, equilibrate=0.0)  # doctest: +SKIP
+      >>> data = ratio_map([0.9], [0.5], grains=16, seeds=1, strain=0.4, equilibrate=0.0)
       >>> data.force_ratio.dims
       ('packing_fraction', 'restitution')
     """
@@ -78,13 +78,8 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     checkpoint, complete = None if output is None else Checkpoint(output, settings, run.resume), False
     try:
         if checkpoint is not None and run.resume:
-            if (
-                earlier is not None
-                and finished
-                and not difference
-                and not checkpoint.done
-                and not checkpoint.journals()
-            ):
+            started = checkpoint.done or checkpoint.journals()
+            if earlier is not None and finished and not difference and not started:
                 complete = True
                 _tell(run, f"{output} is finished and is read from its file.")
                 return earlier
