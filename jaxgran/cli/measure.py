@@ -17,6 +17,7 @@ from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say
 from jaxgran.environment import usable_cores
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import options
+from jaxgran.model.checks import refused
 
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 
@@ -60,8 +61,11 @@ def _numerics(parameters: Mapping[str, Any]) -> dict[str, Any]:
     from jaxgran.dynamics.engine import engine_named
 
     given = dict(parameters)
-    if isinstance(given.get("solver"), str):
-        given["solver"] = SOLVERS[given["solver"]]()
+    solver = given.get("solver")
+    if isinstance(solver, str):
+        if solver not in SOLVERS:  # of a file, which has the name of a user's class and not the class
+            raise refused("solver", solver, f"must be {', '.join(SOLVERS)}, or a class that is passed to ratio_map")
+        given["solver"] = SOLVERS[solver]()
     if isinstance(given.get("engine"), str):
         given["engine"] = engine_named(given["engine"])
     return given
