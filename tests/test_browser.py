@@ -275,9 +275,9 @@ def test_copied_are_the_table_and_a_command_that_runs(
         4 * float(page_map()["seeds/strain"].sel(here(map_page)).mean()), rel=0.01
     )
     measured = Mock(side_effect=SystemExit(0))
-    monkeypatch.setattr("jaxgran.cli.map.run_map", measured)
+    monkeypatch.setattr("jaxgran.maps.ratio_map.ratio_map", measured)
     assert jaxgran(tmp_path, *command[1:]).status == 0
-    settings, point = chosen_settings(RunParameters(**measured.call_args[0][0]))[0], here(map_page)
+    settings, point = chosen_settings(RunParameters(**measured.call_args.kwargs))[0], here(map_page)
     (flow,) = settings.flows()
     assert {name: getattr(flow, name) for name in point} == point
     assert (settings.grains, settings.seeds, settings.activation) == (64, 2, "midpoint")

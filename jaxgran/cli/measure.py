@@ -46,7 +46,7 @@ def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outco
     before, interrupted = _stamp(output), False
     with warnings.catch_warnings():
         warnings.showwarning = lambda warning, *_, **__: say(f"{warning}")
-        warnings.simplefilter("always", UserWarning)
+        warnings.simplefilter("always", UserWarning, append=True)  # after the filters of a command
         warnings.simplefilter("ignore", BadPoints)  # ``finish`` prints these
         try:
             data = ratio_map(**given)
