@@ -49,11 +49,9 @@ def wave_temperature(state: State) -> Float[Array, ""]:
     It is the mean of |Σ m c exp(ik·r)|² / Σ m over four wave vectors k and both components of c. Uncorrelated
     velocities of granular temperature T give T on average, which is equipartition.
     """
-    waves, (x, y) = jnp.asarray(WAVES, state.positions.dtype), _in_cell(state).T
-    phases = 2 * jnp.pi * (waves[:, :1] * x + waves[:, 1:] * y)
+    phases = 2 * jnp.pi * jnp.einsum("wa,ga->wg", jnp.asarray(WAVES, state.positions.dtype), _in_cell(state))
     momenta = state.grains.masses[:, None] * state.velocities
-    # Sums, not matrix products, whose last bits depend on the number of replicas in a batch.
-    amplitudes = [jnp.sum(wave(phases)[:, :, None] * momenta, axis=1) for wave in (jnp.cos, jnp.sin)]
+    amplitudes = [jnp.einsum("wg,ga->wa", wave(phases), momenta) for wave in (jnp.cos, jnp.sin)]
     return sum(jnp.mean(part**2) for part in amplitudes) / jnp.sum(state.grains.masses)
 
 
