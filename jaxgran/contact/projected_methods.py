@@ -73,16 +73,16 @@ class ProjectedMethod:
       InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
 
     Examples:
-      Polyak's heavy ball, p + β (p − p_before) with τ = 1:
+      Momentum of a constant share β, y = p + β (p − p_before), with τ = 1:
 
       >>> @dataclass(frozen=True)
-      ... class HeavyBall(ProjectedMethod):
+      ... class ConstantMomentum(ProjectedMethod):
       ...     momentum: float = 0.5
       ...
       ...     def propose(self, now):
       ...         return now.point + self.momentum * (now.point - now.previous), 1.0
-      >>> HeavyBall(tolerance=1e-6)
-      HeavyBall(tolerance=1e-06, max_steps=5000, momentum=0.5)
+      >>> ConstantMomentum(tolerance=1e-6)
+      ConstantMomentum(tolerance=1e-06, max_steps=5000, momentum=0.5)
     """
 
     tolerance: float | Float[Array, ""] = 1e-4
