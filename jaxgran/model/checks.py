@@ -1,6 +1,6 @@
 """Checks of user input: an InputError says in one sentence what is accepted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from reprlib import Repr
 from typing import Any
 
@@ -114,12 +114,6 @@ def require_flag(name: str, value: Any) -> None:
     """Raise an InputError unless the value is True or False."""
     if not isinstance(value, bool):
         raise refused(name, value, "must be True or False")
-
-
-def require_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise an InputError unless the value is one of several words."""
-    if not isinstance(value, str) or value not in choices:
-        raise refused(name, value, f"must be {', '.join(choices[:-1])} or {choices[-1]}")
 
 
 def require_untraced(name: str, instead: str, *values: Any) -> None:
