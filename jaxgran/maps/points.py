@@ -7,14 +7,13 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
-
-TENSOR_AXES = ("axis_a", "axis_b")
 
 
 class PointGrid(NamedTuple):

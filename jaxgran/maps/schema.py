@@ -78,7 +78,7 @@ FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
 """Dimensions of a map that has several numbers of grains or time steps, and which of them has the smallest errors."""
 
 _AXES = ("packing_fraction", "restitution")
-_TENSOR_AXES = {"axis_a", "axis_b"}
+TENSOR_AXES = ("axis_a", "axis_b")
 
 
 def require_map(data: Any, *names: str) -> xr.Dataset:
@@ -123,7 +123,7 @@ def what_lacks(data: Any, *names: str) -> str:
     for name in (*names, *(("status",) if "status" in data else ())):
         variable = data[name]
         further = set(variable.dims) - {*_AXES, *FINEST}
-        on_axes = set(_AXES) <= set(variable.dims) and further in (set(), _TENSOR_AXES, {"error_source"})
+        on_axes = set(_AXES) <= set(variable.dims) and further in (set(), {*TENSOR_AXES}, {"error_source"})
         if variable.dtype.kind not in "iuf" or not on_axes:
             return f"its {name} is not a number at every packing_fraction and restitution"
     if "status" in data and "force_ratio" in names:  # figures of the force ratio show the status

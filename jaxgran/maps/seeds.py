@@ -5,8 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.points import TENSOR_AXES, PointGrid, tensor_shape
+from jaxgran.maps.points import PointGrid, tensor_shape
 from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES, TENSORS

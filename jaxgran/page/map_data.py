@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.parameters import options
-from jaxgran.maps.schema import FINEST, MapData, require_map
+from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
@@ -27,7 +27,6 @@ _AXES = {
     "restitution": "restitution α",
 }
 _PLANE = ("packing_fraction", "restitution")
-_TENSOR_AXES = ("axis_a", "axis_b")
 _COMPANIONS = ("_stderr", "_ci95")
 _GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
 _LEFT_OUT = ("status", "point_grains")
@@ -106,7 +105,7 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
     belongs |= name.startswith("theory/") and name.removeprefix("theory/") in data
     apart = name in _LEFT_OUT or name.startswith("snapshots/") or "flag_values" in variable.attrs
-    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *_TENSOR_AXES}) and not (belongs or apart)
+    return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES}) and not (belongs or apart)
 
 
 def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> Iterator[dict[str, Any]]:
@@ -145,9 +144,9 @@ def _labels(names: list[str]) -> dict[str, str]:
 
 def _components(variable: xr.DataArray) -> dict[str, dict[str, int]]:
     """The components of a tensor by their name, or of a scalar: itself."""
-    if not set(_TENSOR_AXES) <= set(variable.dims):
+    if not set(TENSOR_AXES) <= set(variable.dims):
         return {"": {}}
-    sizes = [variable.sizes[axis] for axis in _TENSOR_AXES]
+    sizes = [variable.sizes[axis] for axis in TENSOR_AXES]
     return {f"_{'xyz'[a]}{'xyz'[b]}": {"axis_a": a, "axis_b": b} for a, b in np.ndindex(*sizes) if max(a, b) < 3}
 
 
