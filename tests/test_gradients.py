@@ -17,7 +17,6 @@ from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics import collision as collision_module
 from jaxgran.dynamics.jax_engine import advance_by_jax, count_events
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
@@ -157,13 +156,6 @@ def exact_advance(flow, *arguments):
     return advance_by_jax(flow, EXACT, *arguments)
 
 
-def differentiable(*arguments):
-    """The advance with one size of the contact buffer in place of five: each is compiled with its derivatives."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collision_module, "contact_capacities", lambda grains: (3 * grains,))
-        return exact_advance(*arguments)
-
-
 def changed(flow: ShearFlow, state: State, values: dict) -> tuple[ShearFlow, State]:
     """The flow and the state with these parameters."""
     flow = replace(flow, **{name: values[name] for name in NAMES[:3]})
@@ -210,7 +202,7 @@ def backward(tilting, score_of, events_of):
     @jax.jit
     def compiled(values: dict, steps):
         def score(values: dict):
-            after, tally = differentiable(*changed(*tilting, values), steps, True, events)
+            after, tally = exact_advance(*changed(*tilting, values), steps, True, events)
             return score_of(after), tally
 
         return jax.value_and_grad(score, has_aux=True)(values)
@@ -231,7 +223,7 @@ def forward(tilting, score_of):
     """``forward(values, along)``: the derivative of the score along a direction, in forward mode."""
 
     def score(values: dict):
-        return score_of(differentiable(*changed(*tilting, values), jnp.int32(STEPS))[0])
+        return score_of(exact_advance(*changed(*tilting, values), jnp.int32(STEPS))[0])
 
     return jax.jit(lambda values, along: jax.jvp(score, (values,), (along,))[1])
 
@@ -275,7 +267,7 @@ def collision(gap, scene, dt: float, moving_contacts: bool):
     state = scene([[3.0, 0.0], [4.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]])
     state = replace(state, positions=state.positions.at[1, 0].add(gap))
     flow = ShearFlow(GRAINS, 0.5, 0.02, dt)
-    end, _ = differentiable(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
+    end, _ = exact_advance(flow, state, jnp.int32(round(0.5 / dt)), True, None, moving_contacts)
     return end.positions[0, 0]
 
 

@@ -15,7 +15,6 @@ from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
 from jaxgran.contact.delassus import spectral_bound
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, JacobiCount, JacobiDiagonal, Nesterov
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics import collision
 from jaxgran.model.status import Status
 
 BOUNDED = [Nesterov, BarzilaiBorwein, Jacobi, JacobiCount]
@@ -30,7 +29,6 @@ def networks():
         patch.setattr(module, "FLOWS", (module.FLOWS[0], *module.FLOWS[2:]))
         sheared = module.sheared
         patch.setattr(module, "sheared", lambda *flow: sheared(*flow[:3], strain=0.5))
-        patch.setattr(collision, "contact_capacities", lambda grains: (3 * grains,))
         return collection(quick=True)
 
 

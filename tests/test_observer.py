@@ -10,7 +10,7 @@ from flows import GRAINS
 from synthetic import one_sentence
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
-from jaxgran.dynamics import collision, observed_advance
+from jaxgran.dynamics import observed_advance
 from jaxgran.dynamics.engine import Jax, Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
@@ -105,9 +105,7 @@ def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monke
     assert own["temperature"] == pytest.approx(float(jnp.sum(observed[1].observed_sums["temperature"])), rel=1e-3)
 
 
-def test_engine_jax_observes_the_same(flowing, run, monkeypatch) -> None:
-    """With two sizes of the contact buffer, which are compiled sooner than six."""
-    monkeypatch.setattr(collision, "contact_capacities", lambda grains: (1, 3 * grains))
+def test_engine_jax_observes_the_same(flowing, run) -> None:
     numerics, state, steps = Numerics(engine=Jax()), flowing(0.7), jnp.int32(200)
     end, tally, own = jax.jit(lambda state: advance_observed(FLOW, numerics, state, steps, all_of_step))(state)
     plain_end, plain_tally = run(FLOW, state, 200, solver=BarzilaiBorwein())

@@ -24,7 +24,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
@@ -37,18 +37,6 @@ def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grai
     """Total impulse Hᵀp on every grain."""
     along = contacts.normals * impulses[:, None]
     return _gathered(contacts, along, -along, grains)
-
-
-def in_clusters(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Bool[Array, " contacts"]:
-    """Which contacts carry an impulse in a cluster of three or more grains: one of their grains feels another one.
-
-    Where neither does, the total impulse of both grains is that of the contact to the bit. This costs no search and no
-    scatter of its own, since whoever applies the impulses needs the totals anyway.
-    """
-    total = grain_impulses(contacts, impulses, grains)
-    along = contacts.normals * impulses[:, None]
-    others = jnp.any((total[contacts.i] != along) | (total[contacts.j] != -along), axis=-1)
-    return (impulses > 0) & others
 
 
 @singledispatch

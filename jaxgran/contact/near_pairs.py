@@ -117,6 +117,18 @@ def present(lists: PairLists, side: Array) -> tuple[Float[Array, "grains 2"], Fl
     return wrap(jnp.stack([x, y], axis=-1), side, remapped), remapped
 
 
+def no_lists(positions: Float[Array, "grains 2"], tilt: Array) -> PairLists:
+    """Lists of no pairs, which ``refresh`` replaces at its first call."""
+
+    def empty(pairs_per_grain: int) -> PairList:
+        slots, dtype = _capacity(pairs_per_grain, len(positions)), positions.dtype
+        none, far = jnp.zeros(slots, jnp.int32), jnp.broadcast_to(jnp.asarray([1e6, 0], dtype), (slots, 2))
+        return PairList(none, none, far, jnp.zeros(slots, dtype), jnp.asarray(-jnp.inf, dtype), jnp.bool_(False))
+
+    at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(tilt))
+    return PairLists(empty(OUTER_PAIRS_PER_GRAIN), empty(NEAR_PAIRS_PER_GRAIN), at_rest, at_rest, positions, tilt)
+
+
 def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairLists:
     """Both lists, built from the positions; the frame starts here."""
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
@@ -139,16 +151,15 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
     left = jax.lax.stop_gradient(left)
     search = stale & ~(left >= nominal)
 
-    def searched(_):
+    def searched() -> tuple:
         positions, tilt = present(lists, side)
-        return where_active(search, pair_lists(positions, grains, side, tilt), filtered(_))
+        new = _outer_pairs(positions, grains, side, tilt), at_rest, positions, tilt
+        return where_active(search, new, kept)
 
-    def filtered(_):
-        near = _near_pairs(lists.outer, lists.frame, left, grains, side)
-        new = PairLists(lists.outer, near, lists.frame, lists.frame, lists.positions, lists.tilt)
-        return where_active(stale, new, lists)
-
-    return jax.lax.cond(any_replica(search), searched, filtered, None)
+    kept = lists.outer, lists.frame, lists.positions, lists.tilt
+    outer, frame, positions, tilt = jax.lax.cond(any_replica(search), searched, lambda: kept)
+    near = _near_pairs(outer, frame, jnp.where(search, outer.skin, left), grains, side)
+    return where_active(stale, PairLists(outer, near, frame, frame, positions, tilt), lists)
 
 
 def first_true(mask: Bool[Array, " m"], size: int) -> Int[Array, " size"]:
@@ -175,9 +186,6 @@ def bit_words(mask: Bool[Array, " m"]) -> UInt32[Array, " words"]:
 def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Array, " size"]:
     """Positions of the first ``size`` set bits, padded with ``length``."""
     count = words.size
-    if size == 1:
-        lowest = jax.lax.population_count((words & -words) - jnp.uint32(1)).astype(jnp.int32)
-        return jnp.min(jnp.where(words > 0, jnp.arange(count, dtype=jnp.int32) * _WORD + lowest, length))[None]
     set_in_word = jax.lax.population_count(words).astype(jnp.int32)
     wanted = jnp.arange(size, dtype=jnp.int32)
     if count <= _FEW_WORDS:
@@ -214,7 +222,7 @@ def _capacity(pairs_per_grain: int, count: int) -> int:
 def _select(gaps: Float[Array, " m"], largest_skin: Array, capacity: int):
     """Indices of the pairs with a gap within the largest skin that the buffer allows, that skin, and overflow."""
     skins = largest_skin * jnp.asarray(_SKIN_SHARES, gaps.dtype)
-    counts = jnp.stack([jnp.sum(gaps <= skin, dtype=jnp.int32) for skin in skins])
+    counts = jnp.sum(gaps[None, :] <= skins[:, None], axis=1, dtype=jnp.int32)
     fits = counts <= capacity
     skin = skins[jnp.argmax(fits)]
     index = first_true(gaps <= skin, capacity)

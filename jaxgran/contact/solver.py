@@ -30,7 +30,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import Operator, delassus_product, diagonal
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
-from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
@@ -78,8 +77,6 @@ def solve(
     Impulses and response have derivatives with respect to the network, see the module; all else has none.
     """
     b, own = contacts.approach, diagonal(contacts, grains)
-    if b.size == 1 and isinstance(contacts, Contacts):
-        return _single_contact(b, own, active)
     bound = solver.bound(contacts, grains)
     scale = jnp.sqrt(dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
     target = residual_target(scale, solver.tolerance, shear_rate, jnp.finfo(b.dtype).eps)
@@ -166,13 +163,6 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
         iterations=none,
         status=none,
     )
-
-
-def _single_contact(b: Float[Array, "1"], own: Float[Array, "1"], active: Array) -> Solution:
-    """The exact solution of a network of one contact, for which the iteration would need one product."""
-    impulses = jnp.where(active, jnp.maximum(0, -b / own), 0)
-    status = jnp.where(jnp.isnan(impulses[0]), Status.nonfinite, Status.ok).astype(jnp.int32)
-    return Solution(impulses, own * impulses, jnp.zeros((), b.dtype), active.astype(jnp.int32), status)
 
 
 class _Progress(NamedTuple):

@@ -1,13 +1,15 @@
 """The contacts of one time step: their impulses, what these do to the grains, and what they add to the sums."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgran.contact.delassus import grain_impulses, in_clusters
+from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, contact_network, first_contact_time, is_contact
@@ -16,7 +18,7 @@ from jaxgran.contact.solver import solve
 from jaxgran.dynamics.flight import PairMotion, pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
-from jaxgran.model.control_flow import in_batch, largest_replica, where_active
+from jaxgran.model.control_flow import switch_replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -28,21 +30,23 @@ Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: 
 class AdvanceOptions(NamedTuple):
     """How the engine ``Jax`` advances a flow.
 
-    solver: solves the contacts. buffers: how many of the contact buffers are compiled, the largest ones; None for all
-    of them. moving_contacts: whether derivatives include that a contact moves in time. observe: a function of the
-    user's, or None. All but the numbers of the solver are static.
+    solver: solves the contacts. capacities: sizes of the contact buffers that are compiled, smallest first.
+    moving_contacts: whether derivatives include that a contact moves in time. observe: a function of the user's, or
+    None. All but the numbers of the solver are static.
     """
 
     solver: ProjectedMethod
-    buffers: int | None = None
+    capacities: tuple[int, ...]
     moving_contacts: bool = False
     observe: Observe | None = None
 
 
 def contact_capacities(grains: int) -> tuple[int, ...]:
-    """Sizes of the contact buffers, smallest first. Contacts of discs form a planar graph: at most 3 N of them."""
-    top = 3 * grains
-    return tuple(sorted({1, *(max(4, top // share) for share in (96, 24, 6, 3, 1))}))
+    """Sizes of the contact buffers, smallest first: for dilute, dense and near-jammed flows, and for any packing.
+
+    The contacts of discs form a planar graph, so there are at most 3 N of them.
+    """
+    return tuple(sorted({max(4, grains // 12), grains // 2, 3 * grains // 2, 3 * grains}))
 
 
 def contacts_now(flow: ShearFlow, state: State) -> Contacts:
@@ -53,6 +57,28 @@ def contacts_now(flow: ShearFlow, state: State) -> Contacts:
     contact, _ = is_contact(separations, velocities, lists.near.reach, flow.activation_fraction * flow.timestep)
     index = set_bits(bit_words(contact), contact_capacities(state.grains.radii.size)[-1], contact.size)
     return contact_network(index, lists.near, separations, velocities, state.grains)
+
+
+class Touching(NamedTuple):
+    """The contacts of one step among the near pairs, (pairs,) each; normals and approach are zero elsewhere."""
+
+    contact: Array
+    nx: Array
+    ny: Array
+    distance: Array
+    approach: Array
+    inverse_mass_i: Array
+    inverse_mass_j: Array
+
+
+class Solved(NamedTuple):
+    """What the solve of a network gives: impulses of the near pairs and of the grains, and how it went."""
+
+    impulses: Float[Array, " pairs"]
+    momenta: Float[Array, "grains 2"]
+    iterations: Array
+    residual: Array
+    status: Array
 
 
 def collide(
@@ -72,47 +98,160 @@ def collide(
       meets: whether this replica has a step to solve; others of its batch stay as they are.
 
     The last result is a displacement of the grains. Its value is zero; its derivative is that of contacts that move
-    in time (see ``plain``). None where this derivative is not asked for.
+    in time (see ``jax_engine``). None where this derivative is not asked for.
     """
     look_ahead = flow.activation_fraction * flow.timestep
     contact, approaching = is_contact(pairs.separations(), pairs.velocities(), near.reach, look_ahead)
-    words = bit_words(contact)
-    count = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
     meets = meets & jnp.any(bit_words(approaching) > 0)
-    # A single contact has a closed form, whose last bits differ. In a batch it is left out, so that the result of a
-    # replica does not depend on the others.
-    first = 1 if in_batch() else 0
-    capacities = contact_capacities(grains.radii.size)[first:]
-    capacities = capacities if options.buffers is None else capacities[-options.buffers :]
-    separations, delays, zero_shift = pairs.separations(), None, None
+    contact = contact & meets
+    x, y, delays = pairs.x, pairs.y, None
     if options.moving_contacts:
         delays = _delays(pairs, near.reach, approaching, flow.timestep)
         apart = jnp.where(_alone(near, contact, grains), delays, 0)
-        separations, zero_shift = separations + apart[:, None] * pairs.velocities(), jnp.zeros_like(velocities)
-    buffer = jnp.sum(count > jnp.asarray(capacities[:-1], jnp.int32), dtype=jnp.int32) + 1
-    buffer = largest_replica(jnp.where(meets, buffer, 0))  # 0: nothing to solve
+        x, y = x + apart * pairs.ux, y + apart * pairs.uy
+    distance = jnp.sqrt(x * x + y * y)
+    nx, ny = (jnp.where(contact, component / distance, 0) for component in (x, y))
+    inverse_masses = 1 / grains.masses
+    touching = Touching(
+        contact, nx, ny, distance, nx * pairs.ux + ny * pairs.uy, inverse_masses[near.i], inverse_masses[near.j]
+    )
+    solved = _solved(flow, near, touching, grains.radii.size, meets, options)
+    kicks = solved.momenta * inverse_masses[:, None]
+    felt_x, felt_y = (kicks[:, a][near.i] - kicks[:, a][near.j] for a in (0, 1))
+    binary = _binary_impulses(touching, 1 + flow.restitution)
+    half_change = (nx * felt_x + ny * felt_y) / 2
+    sums = _with_contacts(sums, near, touching, solved, binary, half_change, 1 + flow.restitution, meets)
+    if observe_now is not None:
+        network, index = _network(near, touching, contact_capacities(grains.radii.size)[-1])
+        impulses = jnp.where(network.used, solved.impulses[index], 0)
+        user_sums = with_contacts(sums.user_sums, observe_now, network, impulses)
+        sums = sums._replace(user_sums=jax.tree.map(partial(jnp.where, meets), user_sums, sums.user_sums))
+    shift = None
+    if delays is not None:
+        delayed = jnp.minimum(solved.impulses, binary) * jnp.where(contact, delays, 0)
+        along = jnp.stack([nx * delayed, ny * delayed], axis=-1)
+        shift = -jnp.zeros_like(velocities).at[near.i].add(along).at[near.j].add(-along) * inverse_masses[:, None]
+    return velocities + kicks, pairs._replace(ux=pairs.ux + felt_x, uy=pairs.uy + felt_y), sums, shift
+
+
+def _network(near: PairList, touching: Touching, capacity: int) -> tuple[Contacts, Array]:
+    """The contacts in a buffer, and the number of the pair of each slot; unused slots have that of the first pair."""
+    index = set_bits(bit_words(touching.contact), capacity, touching.contact.size)
+    used = index < touching.contact.size
+    index = jnp.where(used, index, 0)
+
+    def picked(values: Array) -> Array:
+        return jnp.where(used, values[index], 0)
+
+    network = Contacts(
+        i=near.i[index],
+        j=near.j[index],
+        normals=jnp.stack([picked(touching.nx), picked(touching.ny)], axis=-1),
+        distances=touching.distance[index],
+        approach=picked(touching.approach),
+        inverse_mass_i=picked(touching.inverse_mass_i),
+        inverse_mass_j=picked(touching.inverse_mass_j),
+        used=used,
+    )
+    return network, index
+
+
+def _solved(
+    flow: ShearFlow, near: PairList, touching: Touching, grains: int, meets: Array, options: AdvanceOptions
+) -> Solved:
+    """The impulses of one step, by a program for the smallest buffer that holds its contacts."""
+    slots, dtype = touching.contact.size, touching.approach.dtype
+    contacts = jnp.sum(lax.population_count(bit_words(touching.contact)).astype(jnp.int32), dtype=jnp.int32)
+    zero, none = jnp.zeros((), dtype), jnp.int32(0)
+    nothing = Solved(jnp.zeros(slots, dtype), jnp.zeros((grains, 2), dtype), none, zero, none)
+
+    def single(_: Array) -> Solved:
+        """The closed form of a single contact, for which the iteration would need one product."""
+        at = jnp.argmax(touching.contact)
+        response = touching.inverse_mass_i[at] + touching.inverse_mass_j[at]
+        impulse = (1 + flow.restitution) * jnp.maximum(0, -touching.approach[at] / response)
+        along = impulse * jnp.stack([touching.nx[at], touching.ny[at]])
+        grain = jnp.arange(grains, dtype=near.i.dtype)[:, None]
+        momenta = jnp.where(grain == near.i[at], along, jnp.where(grain == near.j[at], -along, 0))
+        status = jnp.where(jnp.isnan(impulse), Status.nonfinite, Status.ok).astype(jnp.int32)
+        return Solved(jnp.where(touching.contact, impulse, 0), momenta, jnp.int32(1), zero, status)
 
     def with_capacity(capacity: int):
-        def collided():
-            index = set_bits(words, capacity, contact.size)
-            network = contact_network(index, near, separations, pairs.velocities(), grains)
-            impulses, new = _impulses(flow, options.solver, network, count > capacity, sums, grains, meets)
-            if observe_now is not None:
-                new = new._replace(user_sums=with_contacts(sums.user_sums, observe_now, network, impulses))
-            change = _velocity_changes(network, impulses, grains)
-            (xi, yi), (xj, yj) = change(near.i), change(near.j)
-            kicked = pairs._replace(ux=pairs.ux + xi - xj, uy=pairs.uy + yi - yj)
-            moved = velocities + jnp.stack(change(jnp.arange(grains.radii.size, dtype=near.i.dtype)), axis=-1)
-            shift = None
-            if delays is not None:
-                own_approach = jnp.minimum(impulses, _binary_impulses(network, 1 + flow.restitution))
-                delayed = own_approach * jnp.where(network.used, delays[jnp.where(network.used, index, 0)], 0)
-                shift = -grain_impulses(network, delayed, grains.radii.size) / grains.masses[:, None]
-            return where_active(meets, (moved, kicked, new, shift), (velocities, pairs, sums, zero_shift))
+        def solved(active: Array) -> Solved:
+            network, index = _network(near, touching, capacity)
+            solution = solve(network, grains, flow.shear_rate, options.solver, active)
+            impulses = (1 + flow.restitution) * solution.impulses
+            placed = nothing.impulses.at[jnp.where(network.used, index, slots)].set(impulses, mode="drop")
+            status = jnp.maximum(jnp.where(contacts > capacity, Status.capacity, Status.ok), solution.status)
+            momenta = grain_impulses(network, impulses, grains)
+            return Solved(placed, momenta, solution.iterations, solution.residual, status.astype(jnp.int32))
 
-        return collided
+        return solved
 
-    return lax.switch(buffer, [lambda: (velocities, pairs, sums, zero_shift), *map(with_capacity, capacities)])
+    programs = [single, *map(with_capacity, options.capacities)]
+    program = jnp.sum(contacts > jnp.asarray([0, 1, *options.capacities[:-1]], jnp.int32), dtype=jnp.int32)
+    return switch_replica(jnp.where(meets, program, 0), nothing, programs)
+
+
+def _binary_impulses(touching: Touching, one_plus_alpha: Array | float) -> Float[Array, " pairs"]:
+    """The impulses if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻)."""
+    response = touching.inverse_mass_i + touching.inverse_mass_j
+    return one_plus_alpha / response * jnp.maximum(0, -touching.approach)
+
+
+def _with_contacts(
+    sums: RunningSums,
+    near: PairList,
+    touching: Touching,
+    solved: Solved,
+    binary: Array,
+    half_change: Array,
+    one_plus_alpha: Array | float,
+    meets: Array,
+) -> RunningSums:
+    """The sums with what the contacts of one step contribute."""
+    nx, ny, impulses, dtype = touching.nx, touching.ny, solved.impulses, touching.nx.dtype
+    overlap = jnp.where(touching.contact, jnp.maximum(near.reach - touching.distance, 0), 0)
+    loaded = impulses > 0
+    # Where neither grain of a contact feels another one, the momentum of both is the contact's to the bit.
+    px, py, (x, y) = nx * impulses, ny * impulses, solved.momenta.T
+    clustered = loaded & ((x[near.i] != px) | (y[near.i] != py) | (x[near.j] != -px) | (y[near.j] != -py))
+    flags = (flag.astype(dtype) for flag in (touching.contact, loaded, touching.approach < 0))
+    terms = contact_terms(
+        nx,
+        ny,
+        touching.distance,
+        overlap,
+        touching.approach,
+        half_change,
+        one_plus_alpha,
+        impulses,
+        binary,
+        jnp.where(clustered, impulses, 0),
+        *flags,
+    )
+    solve_counts = [meets, solved.iterations, solved.status != Status.ok]
+    above = jnp.append(jnp.ones(1, bool), solved.residual > jnp.asarray(RESIDUAL_EDGES[1:-1], dtype)) & meets
+    by_residual = above & ~jnp.append(above[1:], False)
+    return sums._replace(
+        contact=sums.contact + jnp.stack(_sums_of(terms)),
+        solve=sums.solve
+        + jnp.concatenate([jnp.stack([x.astype(dtype) for x in solve_counts]), by_residual.astype(dtype)]),
+        largest=jnp.maximum(sums.largest, jnp.stack([jnp.max(overlap), solved.residual])),
+        status=jnp.maximum(sums.status, solved.status),
+    )
+
+
+@jax.custom_jvp
+def _sums_of(terms: tuple[Array, ...]) -> list[Array]:
+    """The sum of each vector, in one pass over all of them: a reduction of each takes XLA two to four times as long."""
+    zeros = [jnp.zeros((), term.dtype) for term in terms]
+    return lax.reduce(list(terms), zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,))
+
+
+@_sums_of.defjvp
+def _sums_of_jvp(primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
+    return _sums_of(*primals), [jnp.sum(tangent) for tangent in tangents[0]]
 
 
 def _delays(pairs: PairMotion, reach: Array, approaching: Array, timestep: float | Array) -> Float[Array, " pairs"]:
@@ -133,12 +272,6 @@ def _alone(near: PairList, contact: Array, grains: Grains) -> Array:
     return contact & (degree[near.i] == 1) & (degree[near.j] == 1)
 
 
-def _binary_impulses(network: Contacts, one_plus_alpha: Array | float) -> Float[Array, " contacts"]:
-    """The impulses if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻)."""
-    reduced_mass = 1 / jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, jnp.inf)
-    return one_plus_alpha * reduced_mass * jnp.maximum(0, -network.approach)
-
-
 def shifted(
     shift: Array, shear_rate: float | Array, lists: PairLists, velocities: Array, pairs: PairMotion
 ) -> tuple[Frame, Array, PairMotion]:
@@ -149,72 +282,3 @@ def shifted(
     apart = shift[near.i] - shift[near.j]
     pairs = pairs._replace(x=pairs.x + apart[:, 0], y=pairs.y + apart[:, 1])
     return Frame(moved, frame.strain), velocities - shear_rate * jnp.stack([y, jnp.zeros_like(y)], axis=-1), pairs
-
-
-def _velocity_changes(network: Contacts, impulses: Array, grains: Grains):
-    """A function that gives the changes of velocity, x and y, of the grains with the given numbers."""
-    if impulses.size == 1:
-        along = network.normals * impulses[:, None]
-        of_i, of_j = along * network.inverse_mass_i[:, None], -along * network.inverse_mass_j[:, None]
-
-        def change(grain: Array) -> tuple[Array, ...]:
-            is_i, is_j = grain == network.i, grain == network.j
-            return tuple(jnp.where(is_i, of_i[:, a], jnp.where(is_j, of_j[:, a], 0)) for a in (0, 1))
-    else:
-        table = grain_impulses(network, impulses, grains.radii.size) / grains.masses[:, None]
-
-        def change(grain: Array) -> tuple[Array, ...]:
-            return table[:, 0][grain], table[:, 1][grain]
-
-    return change
-
-
-def _impulses(
-    flow: ShearFlow,
-    solver: ProjectedMethod,
-    network: Contacts,
-    overflow: Array,
-    sums: RunningSums,
-    grains: Grains,
-    meets: Array,
-) -> tuple[Array, RunningSums]:
-    """Impulses of a network, and the sums with its contribution."""
-    count = grains.radii.size
-    solution = solve(network, count, flow.shear_rate, solver, meets)
-    one_plus_alpha = 1 + flow.restitution
-    impulses = one_plus_alpha * solution.impulses
-    approach, (nx, ny), distance = network.approach, network.normals.T, network.distances
-    reach = grains.radii[network.i] + grains.radii[network.j]
-    overlap = jnp.where(network.used, jnp.maximum(reach - distance, 0), 0)
-    deepest = jnp.max(overlap)
-    loaded = impulses > 0
-    clustered = in_clusters(network, impulses, count) if impulses.size > 1 else jnp.zeros_like(loaded)
-    flags = (flag.astype(nx.dtype) for flag in (network.used, loaded, network.used & (approach < 0)))
-    terms = contact_terms(
-        nx,
-        ny,
-        distance,
-        overlap,
-        approach,
-        one_plus_alpha / 2 * solution.response,
-        one_plus_alpha,
-        impulses,
-        _binary_impulses(network, one_plus_alpha),
-        jnp.where(clustered, impulses, 0),
-        *flags,
-    )
-    status = jnp.where(overflow, Status.capacity, Status.ok)
-    status = jnp.maximum(status, solution.status).astype(jnp.int32)
-    unconverged = solution.status != Status.ok
-    counts = jnp.stack(
-        [jnp.asarray(x, nx.dtype) for x in (jnp.ones_like(one_plus_alpha), solution.iterations, unconverged)]
-    )
-    edges = jnp.asarray(RESIDUAL_EDGES[1:-1], nx.dtype)
-    above = jnp.concatenate([jnp.ones(1, bool), solution.residual > edges])
-    by_residual = above & ~jnp.append(above[1:], False)
-    return impulses, sums._replace(
-        contact=sums.contact + jnp.sum(jnp.stack(terms), axis=1),
-        solve=sums.solve + jnp.concatenate([counts, by_residual.astype(nx.dtype)]),
-        largest=jnp.maximum(sums.largest, jnp.stack([deepest, solution.residual])),
-        status=jnp.maximum(sums.status, status),
-    )

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import Frame, PairLists, refresh, separations_now
 from jaxgran.contact.network import first_contact_time
 from jaxgran.dynamics.tally import RunningSums
 from jaxgran.model.cell import relative_velocity
-from jaxgran.model.control_flow import any_replica, where_active
+from jaxgran.model.control_flow import where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 
@@ -34,11 +34,12 @@ class PairMotion(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What the time loop of the engine ``Jax`` carries."""
+    """What the loop over events of the engine ``Jax`` carries."""
 
     lists: PairLists
     pairs: PairMotion
     slack: Array  # what is left of the skin of the near list
+    loss: Array  # bound on how fast any gap closes
     velocities: Array
     step: Array  # steps flown
     solved: Array  # whether the contacts of the present step have been dealt with
@@ -52,36 +53,34 @@ def pairs_now(lists: PairLists, velocities: Array, shear_rate: float | Array) ->
     return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
 
 
-def fresh_lists(
-    now: Carry, flow: ShearFlow, grains: Grains, side: Array, go: Array
-) -> tuple[PairLists, PairMotion, Array, Array]:
-    """Lists that stay valid for at least one more step, their pairs, the slack, and a bound on its loss per time.
+def closing_speed(flow: ShearFlow, grains: Grains, velocities: Array, skin: Array) -> Float[Array, ""]:
+    """Bound on how fast the gap of a pair outside of the near list closes, in σγ̇.
 
     A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from the shear, where
     r ≤ d + skin until a pair from outside the list touches. Within a flight |c| grows by a factor 1 + γ̇ t at most.
     """
-    velocities = lax.stop_gradient(now.velocities)  # the choice of pairs has no derivative
-    cx, cy = velocities[:, 0], velocities[:, 1]
+    cx, cy = lax.stop_gradient(velocities).T  # the choice of pairs has no derivative
     longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
     speed = jnp.sqrt(largest(cx * cx + cy * cy)) * (1 + longest)
-    diameter = 2 * jnp.max(lax.stop_gradient(grains.radii))
+    return 2 * speed + flow.shear_rate * (2 * jnp.max(lax.stop_gradient(grains.radii)) + skin) / 2
 
-    def loss(skin: Array) -> Array:
-        return 2 * speed + flow.shear_rate * (diameter + skin) / 2
 
-    stale = go & ~(now.slack >= loss(now.lists.near.skin) * flow.timestep)
+def is_stale(now: Carry, flow: ShearFlow) -> Bool[Array, ""]:
+    """Whether the near list may miss a contact of the next step."""
+    return ~(now.slack >= now.loss * flow.timestep)
 
-    def fresh():
-        lists = refresh(now.lists, grains, side, stale)
-        new = (
-            lists,
-            pairs_now(lists, now.velocities, flow.shear_rate),
-            lax.stop_gradient(lists.near.skin),
-        )
-        return where_active(stale, new, (now.lists, now.pairs, now.slack))
 
-    lists, pairs, slack = lax.cond(any_replica(stale), fresh, lambda: (now.lists, now.pairs, now.slack))
-    return lists, pairs, slack, loss(lists.near.skin)
+def with_new_lists(now: Carry, flow: ShearFlow, grains: Grains, side: Array, stale: Array) -> Carry:
+    """The carry with a new near list, and a new outer one where that is used up; others of a batch keep theirs."""
+    lists = refresh(now.lists, grains, side, stale)
+    skin = lax.stop_gradient(lists.near.skin)
+    new = now._replace(
+        lists=lists,
+        pairs=pairs_now(lists, now.velocities, flow.shear_rate),
+        slack=skin,
+        loss=closing_speed(flow, grains, now.velocities, skin),
+    )
+    return where_active(stale, new, now)
 
 
 def steps_to_contact(pairs: PairMotion, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:

@@ -15,18 +15,28 @@ grains. Where a grain strikes a cluster, only the impulse that its own approach 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.contact.near_pairs import PairLists, pair_lists, present
+from jaxgran.contact.near_pairs import PairLists, no_lists, present
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_capacities, shifted
-from jaxgran.dynamics.flight import LONGEST_FLIGHT, Carry, add_flight, fly, fresh_lists, pairs_now, steps_to_contact
+from jaxgran.dynamics.flight import (
+    LONGEST_FLIGHT,
+    Carry,
+    add_flight,
+    closing_speed,
+    fly,
+    is_stale,
+    pairs_now,
+    steps_to_contact,
+    with_new_lists,
+)
 from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.dynamics.velocity_scales import local_temperature, wave_temperature
@@ -43,7 +53,6 @@ NEEDS_EVENTS = (
     "derivatives in reverse mode (jax.grad, jax.vjp) need the length of the loop: take advance(flow, state, steps, "
     "events=int(count_events(flow, state, steps))), or forward mode (jax.jvp, jax.jacfwd), which needs nothing."
 )
-_FEW_BUFFERS = 3  # contact buffers where derivatives are compiled too, which takes long
 
 
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
@@ -66,15 +75,17 @@ def advance_by_jax(
 
     Arguments, derivatives and results are those of ``dynamics.advance``.
     """
-    buffers = None if events is None and not moving_contacts else _FEW_BUFFERS
-    options = AdvanceOptions(solver, buffers, moving_contacts)
-    start, body, unfinished = _event_loop(flow, state, steps, free_flight, options)
+    capacities = contact_capacities(flow.grains)
+    if events is not None or moving_contacts:  # derivatives of each size would be compiled
+        capacities = capacities[-1:]
+    options = AdvanceOptions(solver, capacities, moving_contacts)
+    loop = _event_loop(flow, state, steps, free_flight, options)
     if events is None:
-        end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
+        end = loop.end()
     else:
         require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
-        end = _scanned(start, body, unfinished, events)
-    return _ended(state, end, unfinished)
+        end = loop.scanned(events)
+    return _ended(state, end, loop.unfinished)
 
 
 def observe_by_jax(
@@ -82,9 +93,10 @@ def observe_by_jax(
 ) -> tuple[State, Tally, Any]:
     """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
     flow, solver, state = forward_only((flow, solver, state), NEEDS_EVENTS)
-    start, body, unfinished = _event_loop(flow, state, steps, True, AdvanceOptions(solver, observe=observe))
-    end = lax.while_loop(lambda now: any_replica(unfinished(now)), body, start)
-    return *_ended(state, end, unfinished), end.sums.user_sums.sums
+    options = AdvanceOptions(solver, contact_capacities(flow.grains), observe=observe)
+    loop = _event_loop(flow, state, steps, True, options)
+    end = loop.end()
+    return *_ended(state, end, loop.unfinished), end.sums.user_sums.sums
 
 
 def _ended(state: State, end: Carry, unfinished: Callable) -> tuple[State, Tally]:
@@ -124,9 +136,52 @@ def count_events(
     require_solver(solver)
     words = "count_events returns a whole number, which has no derivative."
     flow, solver, state = forward_only((flow, solver, state), words)
-    start, body, unfinished = _event_loop(flow, state, steps, free_flight, AdvanceOptions(solver))
-    counted = jnp.int32(0), start
-    return lax.while_loop(lambda at: any_replica(unfinished(at[1])), lambda at: (at[0] + 1, body(at[1])), counted)[0]
+    options = AdvanceOptions(solver, contact_capacities(flow.grains)[-1:])  # as in the loop of fixed length
+    return _event_loop(flow, state, steps, free_flight, options).length()
+
+
+class EventLoop(NamedTuple):
+    """The loop over events, in parts: see its methods for how they are put together."""
+
+    start: Carry
+    event: Callable[[Carry], Carry]
+    listed: Callable[[Carry], Carry]  # with a new list of near pairs
+    unfinished: Callable[[Carry], Array]
+    stale: Callable[[Carry], Array]  # whether the list has to be made anew
+
+    def until_stale(self, now: Carry) -> Carry:
+        """A new list, and the events until one replica of the batch needs the next; at least one event."""
+
+        def goes_on(at: tuple[Array, Carry]) -> Array:
+            begins, now = at
+            return any_replica(self.unfinished(now)) & (begins | ~any_replica(self.stale(now)))
+
+        start = jnp.bool_(True), self.listed(now)
+        return lax.while_loop(goes_on, lambda at: (jnp.bool_(False), self.event(at[1])), start)[1]
+
+    def end(self) -> Carry:
+        """The end of as many events as there are: a loop over lists round one over events."""
+        return lax.while_loop(lambda now: any_replica(self.unfinished(now)), self.until_stale, self.start)
+
+    def next(self, now: Carry) -> Carry:
+        """The next event, with a new list where that is needed."""
+        return self.event(lax.cond(any_replica(self.stale(now)), self.listed, lambda now: now, now))
+
+    def scanned(self, events: int) -> Carry:
+        """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else again."""
+
+        def one(now: Carry, _: None) -> tuple[Carry, None]:
+            return lax.cond(any_replica(self.unfinished(now)), self.next, lambda now: now, now), None
+
+        return lax.scan(jax.checkpoint(one), self.start, length=events)[0]
+
+    def length(self) -> Int[Array, ""]:
+        """How many events there are."""
+
+        def going(at: tuple[Array, Carry]) -> Array:
+            return any_replica(self.unfinished(at[1]))
+
+        return lax.while_loop(going, lambda at: (at[0] + 1, self.next(at[1])), (jnp.int32(0), self.start))[0]
 
 
 def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, options: AdvanceOptions):
@@ -144,10 +199,9 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     def unfinished(now: Carry):
         return (now.step < steps) & (now.sums.status < Status.nonfinite)
 
-    def body(now: Carry) -> Carry:
+    def event(now: Carry) -> Carry:
         go = unfinished(now)
-        lists, pairs, slack, loss = fresh_lists(now, flow, grains, side, go)
-
+        lists, pairs, slack, loss = now.lists, now.pairs, now.slack, now.loss
         least = now.solved.astype(jnp.int32)
         jump = steps_to_contact(pairs, lists.near.reach, flow, least)
         jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, jnp.divide(LONGEST_FLIGHT, shear_rate)) / dt))
@@ -178,9 +232,16 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         )
         status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
         sums = sums._replace(status=jnp.maximum(sums.status, status))
-        return where_active(go, Carry(lists, pairs, slack, velocities, step, meets, sums), now)
+        loss = closing_speed(flow, grains, velocities, lists.near.skin)
+        return where_active(go, Carry(lists, pairs, slack, loss, velocities, step, meets, sums), now)
 
-    lists = pair_lists(state.positions, grains, side, state.tilt)
+    def stale(now: Carry) -> Array:
+        return unfinished(now) & is_stale(now, flow)
+
+    def listed(now: Carry) -> Carry:
+        return with_new_lists(now, flow, grains, side, stale(now))
+
+    lists = no_lists(state.positions, state.tilt)
     pairs = pairs_now(lists, state.velocities, shear_rate)
     sums = empty_sums(state.positions.dtype)
     sums = sums._replace(status=status_if_finite(state.positions, state.velocities))
@@ -189,8 +250,9 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         sums = sums._replace(
             user_sums=nothing_observed(observe_now, contact_capacities(flow.grains)[-1], state.positions.dtype)
         )
-    start = Carry(lists, pairs, lists.near.skin, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
-    return start, body, unfinished
+    loss = jnp.full_like(side, jnp.inf)  # there is no list yet
+    start = Carry(lists, pairs, lists.near.skin, loss, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
+    return EventLoop(start, event, listed, unfinished, stale)
 
 
 def _observed_at(
@@ -205,12 +267,3 @@ def _observed_at(
     """What is observed of one time step with the given contacts and impulses p."""
     positions, tilt = present(lists, side)
     return observe(State(grains, positions, velocities, side, tilt), contacts, p)
-
-
-def _scanned(start: Carry, body: Callable, unfinished: Callable, events: int) -> Carry:
-    """The end of a loop of fixed length, of which reverse mode keeps what is carried and computes all else again."""
-
-    def one(now: Carry, _: None) -> tuple[Carry, None]:
-        return lax.cond(any_replica(unfinished(now)), body, lambda now: now, now), None
-
-    return lax.scan(jax.checkpoint(one), start, length=events)[0]

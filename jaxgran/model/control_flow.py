@@ -5,6 +5,8 @@ named axis ``"replica"``, the predicate is one scalar for the whole batch, and o
 batch, and under ``lax.map``, there is no such axis: the functions below then return their argument unchanged.
 """
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TypeVar
 
 import jax
@@ -29,11 +31,6 @@ def any_replica(predicate: jax.Array) -> jax.Array:
     return lax.pmax(predicate.astype(jnp.int32), AXIS) > 0 if in_batch() else predicate
 
 
-def largest_replica(value: jax.Array) -> jax.Array:
-    """The largest value over the replicas of the batch; the value itself outside a batch."""
-    return lax.pmax(value, AXIS) if in_batch() else value
-
-
 def where_active(active: jax.Array, new: T, old: T) -> T:
     """``new`` in active replicas and ``old`` in finished ones.
 
@@ -42,3 +39,19 @@ def where_active(active: jax.Array, new: T, old: T) -> T:
     if not in_batch():
         return new
     return jax.tree.map(lambda a, b: jnp.where(active, a, b), new, old)
+
+
+def switch_replica(branch: jax.Array, default: T, branches: Sequence[Callable[[jax.Array], T]]) -> T:
+    """The result of the branch of the given number, counted from one, or ``default`` for 0.
+
+    A branch is given whether this replica takes it. A batch computes each branch that one of its replicas takes, and no
+    other, so that the result of a replica does not depend on the batch.
+    """
+    if not in_batch():
+        taken = jnp.bool_(True)
+        return lax.switch(branch, [lambda: default, *(partial(take, taken) for take in branches)])
+    result = default
+    for number, take in enumerate(branches, 1):
+        mine = branch == number
+        result = lax.cond(any_replica(mine), lambda: where_active(mine, take(mine), result), lambda: result)  # noqa: B023
+    return result
