@@ -185,9 +185,11 @@ def _forget() -> None:
 
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
+    """And says that the engine is experimental."""
     flow, state = of(0.6), flowing(0.6)
-    for requested in (None, Pallas()):
-        assert select_engine(flow, Numerics(engine=requested), state) == Pallas()
+    with pytest.warns(UserWarning, match="pallas, which is experimental"):
+        assert select_engine(flow, Numerics(engine=Pallas()), state) == Pallas()
+    assert select_engine(flow, Numerics(), state) == Pallas()
     large = replace(flow, grains=MOST_GRAINS + 1)
     refused = {"the solver nesterov": (flow, Nesterov()), "more than 1024 grains": (large, BarzilaiBorwein())}
     for words, (other, solver) in refused.items():

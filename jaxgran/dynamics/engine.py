@@ -4,9 +4,11 @@
 engine     for                                    needs
 =========  =====================================  ==========================================================
 Numba      processors                             float64, the default solver, no ``vmap`` with a named axis
-Pallas     NVIDIA GPUs                            at most 1024 grains, the default solver
+Pallas     NVIDIA GPUs; experimental              at most 1024 grains, the default solver
 Jax        everything else, and as the reference  nothing: every backend, precision, solver and derivative
 =========  =====================================  ==========================================================
+
+``Pallas`` has run in Pallas' interpreter only, not yet on a device; where it is taken, a warning says so.
 
 All engines solve the same steps to the same tolerance, and differ in speed and rounding. Derivatives and steps without
 free flight run in the engine ``Jax`` only, and ``observe`` in it and in ``Numba``. Where no engine is given, that of
@@ -36,6 +38,10 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
+_EXPERIMENTAL = (
+    "flows take the engine pallas, which is experimental: it has passed its tests in an interpreter and a trial on "
+    "this device, and nothing has been measured with it. The engine jax is the reference."
+)
 _SINGLE_PRECISION = (
     "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
     'begin with jax.config.update("jax_enable_x64", True).'
@@ -77,7 +83,10 @@ class Numba:
 
 @dataclass(frozen=True)
 class Pallas:
-    """The engine for NVIDIA GPUs, one kernel for all steps: up to 1024 grains and the solver ``BarzilaiBorwein`` only.
+    """Experimental engine for NVIDIA GPUs, one kernel for all steps: up to 1024 grains, ``BarzilaiBorwein`` only.
+
+    It has run in an interpreter only, not on a device. The compiler it needs, Pallas' Triton backend, is deprecated
+    since JAX 0.11.
 
     Examples:
       >>> Pallas()
@@ -154,6 +163,8 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     if why is None and isinstance(engine, Pallas):
         why = _why_no_kernel(requested is None, flow, state, device)
     if why is None:
+        if isinstance(engine, Pallas):
+            _warn_once(_EXPERIMENTAL)
         return engine
     if requested is None:
         other = option or not _is_default(numerics.solver) or in_batch()
