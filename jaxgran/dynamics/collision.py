@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
+T = TypeVar("T")
 Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: the state, its contacts, their impulses
 
 
@@ -62,6 +63,9 @@ def contacts_now(flow: ShearFlow, state: State) -> Contacts:
 class Touching(NamedTuple):
     """The contacts of one step among the near pairs, (pairs,) each; normals and approach are zero elsewhere."""
 
+    i: Array
+    j: Array
+    reach: Array
     contact: Array
     nx: Array
     ny: Array
@@ -112,17 +116,18 @@ def collide(
     distance = jnp.sqrt(x * x + y * y)
     nx, ny = (jnp.where(contact, component / distance, 0) for component in (x, y))
     inverse_masses = 1 / grains.masses
-    touching = Touching(
-        contact, nx, ny, distance, nx * pairs.ux + ny * pairs.uy, inverse_masses[near.i], inverse_masses[near.j]
-    )
-    solved = _solved(flow, near, touching, grains.radii.size, meets, options)
+    masses = inverse_masses[near.i], inverse_masses[near.j]
+    touching = Touching(near.i, near.j, near.reach, contact, nx, ny, distance, nx * pairs.ux + ny * pairs.uy, *masses)
+    contacts = jnp.sum(lax.population_count(bit_words(contact)).astype(jnp.int32), dtype=jnp.int32)
+    solved = _solved(flow, touching, contacts, grains.radii.size, options)
     kicks = solved.momenta * inverse_masses[:, None]
     felt_x, felt_y = (kicks[:, a][near.i] - kicks[:, a][near.j] for a in (0, 1))
     binary = _binary_impulses(touching, 1 + flow.restitution)
     half_change = (nx * felt_x + ny * felt_y) / 2
-    sums = _with_contacts(sums, near, touching, solved, binary, half_change, 1 + flow.restitution, meets)
+    added, deepest = _contact_sums(flow, touching, contacts, solved, binary, half_change, options)
+    sums = _with_solve(sums._replace(contact=sums.contact + added), solved, deepest, meets)
     if observe_now is not None:
-        network, index = _network(near, touching, contact_capacities(grains.radii.size)[-1])
+        network, index = _network(touching, contact_capacities(grains.radii.size)[-1])
         impulses = jnp.where(network.used, solved.impulses[index], 0)
         user_sums = with_contacts(sums.user_sums, observe_now, network, impulses)
         sums = sums._replace(user_sums=jax.tree.map(partial(jnp.where, meets), user_sums, sums.user_sums))
@@ -134,34 +139,33 @@ def collide(
     return velocities + kicks, pairs._replace(ux=pairs.ux + felt_x, uy=pairs.uy + felt_y), sums, shift
 
 
-def _network(near: PairList, touching: Touching, capacity: int) -> tuple[Contacts, Array]:
+def _network(touching: Touching, capacity: int) -> tuple[Contacts, Array]:
     """The contacts in a buffer, and the number of the pair of each slot; unused slots have that of the first pair."""
-    index = set_bits(bit_words(touching.contact), capacity, touching.contact.size)
-    used = index < touching.contact.size
-    index = jnp.where(used, index, 0)
-
-    def picked(values: Array) -> Array:
-        return jnp.where(used, values[index], 0)
-
+    picked, used, index = _picked(touching, touching.contact, capacity)
     network = Contacts(
-        i=near.i[index],
-        j=near.j[index],
-        normals=jnp.stack([picked(touching.nx), picked(touching.ny)], axis=-1),
+        i=touching.i[index],
+        j=touching.j[index],
+        normals=jnp.stack([picked.nx, picked.ny], axis=-1),
         distances=touching.distance[index],
-        approach=picked(touching.approach),
-        inverse_mass_i=picked(touching.inverse_mass_i),
-        inverse_mass_j=picked(touching.inverse_mass_j),
+        approach=picked.approach,
+        inverse_mass_i=picked.inverse_mass_i,
+        inverse_mass_j=picked.inverse_mass_j,
         used=used,
     )
     return network, index
 
 
-def _solved(
-    flow: ShearFlow, near: PairList, touching: Touching, grains: int, meets: Array, options: AdvanceOptions
-) -> Solved:
-    """The impulses of one step, by a program for the smallest buffer that holds its contacts."""
+def _picked(values: T, contact: Array, capacity: int) -> tuple[T, Array, Array]:
+    """Values of the contacts in a buffer, zero in unused slots; which slots are used, and the pairs they are of."""
+    index = set_bits(bit_words(contact), capacity, contact.size)
+    used = index < contact.size
+    index = jnp.where(used, index, 0)
+    return jax.tree.map(lambda x: jnp.where(used, x[index], jnp.zeros((), x.dtype)), values), used, index
+
+
+def _solved(flow: ShearFlow, touching: Touching, contacts: Array, grains: int, options: AdvanceOptions) -> Solved:
+    """The impulses of one step with so many contacts, by a program for the smallest buffer that holds them."""
     slots, dtype = touching.contact.size, touching.approach.dtype
-    contacts = jnp.sum(lax.population_count(bit_words(touching.contact)).astype(jnp.int32), dtype=jnp.int32)
     zero, none = jnp.zeros((), dtype), jnp.int32(0)
     nothing = Solved(jnp.zeros(slots, dtype), jnp.zeros((grains, 2), dtype), none, zero, none)
 
@@ -171,14 +175,14 @@ def _solved(
         response = touching.inverse_mass_i[at] + touching.inverse_mass_j[at]
         impulse = (1 + flow.restitution) * jnp.maximum(0, -touching.approach[at] / response)
         along = impulse * jnp.stack([touching.nx[at], touching.ny[at]])
-        grain = jnp.arange(grains, dtype=near.i.dtype)[:, None]
-        momenta = jnp.where(grain == near.i[at], along, jnp.where(grain == near.j[at], -along, 0))
+        grain = jnp.arange(grains, dtype=touching.i.dtype)[:, None]
+        momenta = jnp.where(grain == touching.i[at], along, jnp.where(grain == touching.j[at], -along, 0))
         status = jnp.where(jnp.isnan(impulse), Status.nonfinite, Status.ok).astype(jnp.int32)
         return Solved(jnp.where(touching.contact, impulse, 0), momenta, jnp.int32(1), zero, status)
 
     def with_capacity(capacity: int):
         def solved(active: Array) -> Solved:
-            network, index = _network(near, touching, capacity)
+            network, index = _network(touching, capacity)
             solution = solve(network, grains, flow.shear_rate, options.solver, active)
             impulses = (1 + flow.restitution) * solution.impulses
             placed = nothing.impulses.at[jnp.where(network.used, index, slots)].set(impulses, mode="drop")
@@ -189,8 +193,12 @@ def _solved(
         return solved
 
     programs = [single, *map(with_capacity, options.capacities)]
-    program = jnp.sum(contacts > jnp.asarray([0, 1, *options.capacities[:-1]], jnp.int32), dtype=jnp.int32)
-    return switch_replica(jnp.where(meets, program, 0), nothing, programs)
+    return switch_replica(_above(contacts, 0, 1, *options.capacities[:-1]), nothing, programs)
+
+
+def _above(contacts: Array, *limits: int) -> Array:
+    """How many of the limits a number of contacts exceeds."""
+    return jnp.sum(contacts > jnp.asarray(limits, jnp.int32), dtype=jnp.int32)
 
 
 def _binary_impulses(touching: Touching, one_plus_alpha: Array | float) -> Float[Array, " pairs"]:
@@ -199,45 +207,63 @@ def _binary_impulses(touching: Touching, one_plus_alpha: Array | float) -> Float
     return one_plus_alpha / response * jnp.maximum(0, -touching.approach)
 
 
-def _with_contacts(
-    sums: RunningSums,
-    near: PairList,
+def _contact_sums(
+    flow: ShearFlow,
     touching: Touching,
+    contacts: Array,
     solved: Solved,
     binary: Array,
     half_change: Array,
-    one_plus_alpha: Array | float,
-    meets: Array,
-) -> RunningSums:
-    """The sums with what the contacts of one step contribute."""
-    nx, ny, impulses, dtype = touching.nx, touching.ny, solved.impulses, touching.nx.dtype
-    overlap = jnp.where(touching.contact, jnp.maximum(near.reach - touching.distance, 0), 0)
-    loaded = impulses > 0
-    # Where neither grain of a contact feels another one, the momentum of both is the contact's to the bit.
-    px, py, (x, y) = nx * impulses, ny * impulses, solved.momenta.T
-    clustered = loaded & ((x[near.i] != px) | (y[near.i] != py) | (x[near.j] != -px) | (y[near.j] != -py))
-    flags = (flag.astype(dtype) for flag in (touching.contact, loaded, touching.approach < 0))
-    terms = contact_terms(
-        nx,
-        ny,
-        touching.distance,
-        overlap,
-        touching.approach,
-        half_change,
-        one_plus_alpha,
-        impulses,
-        binary,
-        jnp.where(clustered, impulses, 0),
-        *flags,
-    )
+    options: AdvanceOptions,
+) -> tuple[Array, Array]:
+    """What the contacts of one step add to the sums, and the largest overlap; the few of a dilute flow apart."""
+    few, values = options.capacities[0], (touching, solved.impulses, binary, half_change)
+
+    def total(touching: Touching, impulses: Array, binary: Array, half_change: Array) -> tuple[Array, Array]:
+        nx, ny, dtype = touching.nx, touching.ny, touching.nx.dtype
+        overlap = jnp.where(touching.contact, jnp.maximum(touching.reach - touching.distance, 0), 0)
+        loaded = impulses > 0
+        # Where neither grain of a contact feels another one, the momentum of both is the contact's to the bit.
+        px, py, (x, y) = nx * impulses, ny * impulses, solved.momenta.T
+        others_of_i = (x[touching.i] != px) | (y[touching.i] != py)
+        clustered = loaded & (others_of_i | (x[touching.j] != -px) | (y[touching.j] != -py))
+        flags = (flag.astype(dtype) for flag in (touching.contact, loaded, touching.approach < 0))
+        terms = contact_terms(
+            nx,
+            ny,
+            touching.distance,
+            overlap,
+            touching.approach,
+            half_change,
+            1 + flow.restitution,
+            impulses,
+            binary,
+            jnp.where(clustered, impulses, 0),
+            *flags,
+        )
+        return jnp.stack(_sums_of(terms)), jnp.max(overlap)
+
+    def of_few(_: Array) -> tuple[Array, Array]:
+        return total(*_picked(values, touching.contact, few)[0])
+
+    def of_all(_: Array) -> tuple[Array, Array]:
+        return total(*values)
+
+    programs = [of_few, of_all] if few < options.capacities[-1] else [of_all]
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(total, *values))
+    return switch_replica(_above(contacts, *[0, few][: len(programs)]), none, programs)
+
+
+def _with_solve(sums: RunningSums, solved: Solved, deepest: Array, meets: Array) -> RunningSums:
+    """The sums with what the solve of one step contributes, beside its contacts."""
+    dtype = deepest.dtype
     solve_counts = [meets, solved.iterations, solved.status != Status.ok]
     above = jnp.append(jnp.ones(1, bool), solved.residual > jnp.asarray(RESIDUAL_EDGES[1:-1], dtype)) & meets
     by_residual = above & ~jnp.append(above[1:], False)
     return sums._replace(
-        contact=sums.contact + jnp.stack(_sums_of(terms)),
         solve=sums.solve
         + jnp.concatenate([jnp.stack([x.astype(dtype) for x in solve_counts]), by_residual.astype(dtype)]),
-        largest=jnp.maximum(sums.largest, jnp.stack([jnp.max(overlap), solved.residual])),
+        largest=jnp.maximum(sums.largest, jnp.stack([deepest, solved.residual])),
         status=jnp.maximum(sums.status, solved.status),
     )
 
