@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 import traceback
@@ -112,3 +114,17 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
     computing = time.process_time()
     time.sleep(0.2)
     assert time.process_time() - computing < 0.1  # nothing goes on beside
+
+
+def test_a_command_does_not_wait_for_a_thread_that_still_computes() -> None:
+    script = """
+import threading, time
+from jaxgran.cli.terminal import end_without_threads
+
+end_without_threads(1)
+threading.Thread(target=time.sleep, args=(100,), name="jaxgran-0").start()
+print("a sentence")
+end_without_threads(130)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "a sentence\n", "")

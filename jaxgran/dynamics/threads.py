@@ -25,7 +25,7 @@ def in_threads(
     """Run a function on the arguments of every task, started in order, and yield each result when it is there.
 
     When the generator ends early, each thread ends at its next message. Ctrl-C also stops the numba engine, within one
-    step. A thread that takes longer, as for a compilation, is left behind, and does not keep the process alive.
+    step. A thread that takes longer, as for a compilation, is left behind; Python ends after it.
 
     Args:
       function: called with the arguments of a task and ``send``. A long task calls ``send`` after each of its parts,
@@ -58,7 +58,7 @@ def in_threads(
                     events.put((_ERROR, error))
                     return
 
-    running = [Thread(target=work, daemon=True) for _ in range(min(threads, len(tasks)))]
+    running = [Thread(target=work, name=f"jaxgran-{k}") for k in range(min(threads, len(tasks)))]
     for thread in running:
         thread.start()
     unfinished = len(tasks)

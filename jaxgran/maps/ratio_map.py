@@ -151,7 +151,7 @@ def _run(
     """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that ended it."""
     from jaxgran.maps.progress import progress  # here: a worker of a cluster need not load Rich
 
-    Thread(target=_load_meanwhile, args=(settings,), daemon=True).start()
+    Thread(target=_load_meanwhile, args=(settings,), name="jaxgran-load").start()
     workers, start = min(_count(settings), run.workers), perf_counter()
     results: dict[Key, Replica | None] = {} if checkpoint is None else dict(checkpoint.done)
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
