@@ -59,6 +59,12 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def usable_threads() -> int:
+    """Number of threads for the replicas of a batch: ``NUMBA_NUM_THREADS``, or one for each usable core."""
+    asked = os.environ.get("NUMBA_NUM_THREADS", "")
+    return int(asked) if asked.isdigit() and int(asked) else usable_cores()
+
+
 def memory() -> str:
     """Total memory in GiB, or "unknown"."""
     try:

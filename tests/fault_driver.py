@@ -1,4 +1,4 @@
-"""The command line with a fault built in, chosen by the environment variable FAULT; its workers have it too."""
+"""The command line with a fault built in, chosen by the environment variable FAULT."""
 
 import os
 import resource
@@ -32,15 +32,6 @@ replicas.advance_batch = advance_slowly
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
-elif FAULT == "deadly batch":
-    measured = replicas._measured
-
-    def deadly(settings, task, drive, refinement=1):
-        if (0, 0) in task:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return measured(settings, task, drive, refinement)
-
-    replicas._measured = deadly
 
 if __name__ == "__main__":
     from jaxgran.cli.app import main

@@ -41,9 +41,9 @@ class Lab:
             patch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
             return jaxgran(self.folder, *MAP, "--workers", "1", "--output", output, *words)
 
-    def start(self, output: str, *words: str, fault: str = "", workers: int = 1) -> subprocess.Popen:
+    def start(self, output: str, *words: str, fault: str = "") -> subprocess.Popen:
         """Start a map in a process of its own, as leader of a group of processes."""
-        command = [sys.executable, str(DRIVER), *MAP, "--workers", str(workers), "--output", output, *words]
+        command = [sys.executable, str(DRIVER), *MAP, "--workers", "2", "--output", output, *words]
         environment = os.environ | {"FAULT": fault}
         environment.pop("TF_CPP_MIN_LOG_LEVEL", None)  # which JAX has set in this process
         streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
@@ -88,27 +88,3 @@ class Lab:
         done = self.run_here(output, "--resume")
         assert done.status == 0, done.err
         self.assert_whole(output)
-
-
-def children(process: int) -> list[int]:
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            text = stat.read_text()
-        except OSError:
-            continue
-        if int(text.rsplit(")", 1)[1].split()[1]) == process:
-            found.append(int(stat.parent.name))
-    return found
-
-
-def workers_of(process: subprocess.Popen) -> list[int]:
-    """The workers of a map, without the process that multiprocessing starts beside them."""
-
-    def words(child: int) -> str:
-        try:
-            return Path(f"/proc/{child}/cmdline").read_text()
-        except OSError:
-            return ""
-
-    return [child for child in children(process.pid) if "spawn_main" in words(child)]

@@ -36,5 +36,5 @@ def test_a_map_on_a_cluster_is_that_of_one_process(tmp_path: Path) -> None:
 def test_a_scheduler_that_does_not_answer_is_one_sentence(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jaxgran.maps.cluster._PATIENCE", "0.5s")
     with pytest.raises(InputError, match="no scheduler answers") as refused:
-        next(run_on_cluster(address, print, [()], print, ()))
+        next(run_on_cluster(address, print, [()]))
     assert one_sentence(str(refused.value))

@@ -119,7 +119,7 @@ def test_the_handler_reads_the_call_frame_where_this_jaxlib_has_it() -> None:
     assert frame["extension_start"] == handler.EXTENSION_START
     assert frame["args"] + words("XLA_FFI_Args")["args"] == handler.ARGS
     assert frame["rets"] + words("XLA_FFI_Rets")["rets"] == handler.RETS
-    assert (buffer["data"], buffer["dims"]) == (handler.DATA, handler.DIMS)
+    assert (buffer["data"], buffer["rank"], buffer["dims"]) == (handler.DATA, handler.RANK, handler.DIMS)
     assert words("XLA_FFI_Metadata_Extension")["metadata"] == handler.METADATA
     assert words("XLA_FFI_Metadata")["api_version"] + words("XLA_FFI_Api_Version")["major_version"] == (
         handler.API_VERSION

@@ -122,6 +122,17 @@ def test_those_who_miss_the_same_file_wait_for_the_first(tmp_path: Path) -> None
     assert list(path.parent.iterdir()) == []
 
 
+def test_threads_compile_a_program_once(folder: Path) -> None:
+    traces: list = []
+    program = counted(traces)
+    threads = [Thread(target=program, args=ARGUMENTS) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(traces) == 1
+
+
 def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "file")

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cache, wraps
 from importlib.metadata import version
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 import jax
@@ -29,6 +30,7 @@ _MOST_PROGRAMS = 64  # of up to 4 MB each
 _PACKAGES = ("jax", "jaxlib", "numpy")
 _CUSTOM_CALL = re.compile(r"stablehlo\.custom_call @(\w+)")
 _MIN_COMPILE_TIME = "jax_persistent_cache_min_compile_time_secs"
+_FIRST_CALL = RLock()  # several threads load or compile a program once, and change JAX's flags in turn
 _SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX loads only on lowering
 
 
@@ -52,11 +54,12 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
         key = (structure, tuple(map(jax.typeof, leaves)))
         if key not in programs:
             path = folder / f"{_digest(function, key)}.program"
-            program = _load(path, register)
-            if program is None:
-                with file_lock(path):
-                    program = _load(path, register) or _compile(jitted, arguments, path)
-            programs[key] = program
+            with _FIRST_CALL:
+                program = programs.get(key) or _load(path, register)
+                if program is None:
+                    with file_lock(path):
+                        program = _load(path, register) or _compile(jitted, arguments, path)
+                programs[key] = program
         return programs[key](*arguments)
 
     return call

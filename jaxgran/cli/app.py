@@ -23,6 +23,7 @@ from jaxgran.cli.tables import use_plain_letters
 from jaxgran.cli.terminal import (
     INTERRUPTED,
     NO_FILE,
+    end_without_threads,
     sigterm_interrupts,
     stop,
     stop_interrupted,
@@ -100,8 +101,12 @@ def main() -> None:
     """Entry point: a mistake in the input ends with one sentence and exit status 2."""
     use_plain_letters()
     gc.set_threshold(50_000, 20, 100)  # raise the garbage collector's thresholds: the process is short-lived
-    with sigterm_interrupts():
-        _run()
+    try:
+        with sigterm_interrupts():
+            _run()
+    except SystemExit as end:
+        end_without_threads(int(end.code or 0))
+        raise
 
 
 def _run() -> NoReturn:

@@ -41,7 +41,7 @@ def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outco
     alone = given.get("scheduler") is not None or given.get("record") is not None
     given.setdefault("workers", usable_cores() if jax.default_backend() == "cpu" and not alone else 1)
     if load:
-        Thread(target=_load, args=(load,), daemon=True).start()
+        Thread(target=_load, args=(load,), name="jaxgran-load").start()
     output = given.get("output")
     before, interrupted = _stamp(output), False
     with warnings.catch_warnings():

@@ -15,6 +15,7 @@ exit status  meaning
 import os
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -99,6 +100,14 @@ def sigterm_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def end_without_threads(status: int) -> None:
+    """End the process if a thread of this package still computes or compiles, which Python would wait for."""
+    if any(thread.name.startswith("jaxgran-") for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def stop_interrupted(sentence: str) -> NoReturn:

@@ -126,14 +126,13 @@ def call_numba(
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
     numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, solved)
-    memory = layout.WORDS + layout.WORDS_PER_GRAIN * count
     record = layout.RECORD_HEAD + (layout.RECORD_OF_GRAIN + 3 * layout.RECORD_OF_CONTACT) * count
-    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (memory,), (room, record)]
+    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (room, record)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all")
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
     given = state.positions, state.velocities, grains.radii, grains.masses, packed
-    positions, velocities, found, _, records = call(*given)
+    positions, velocities, found, records = call(*given)
     tilt = found[layout.TILT]
     end = State(grains, wrap(positions, state.side, tilt), velocities, state.side, tilt)
     return end, sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32)), found, records

@@ -67,7 +67,8 @@ class Numba:
     """The engine for processors, compiled by numba: float64 and the solver ``BarzilaiBorwein`` only.
 
     It solves clusters one by one, by Gauss–Seidel sweeps and then by the method of the solver, to its ``tolerance`` and
-    within its ``max_steps``.
+    within its ``max_steps``. Under ``jax.vmap`` replicas advance on all cores, with the same bits on any number of
+    threads; the environment variable ``NUMBA_NUM_THREADS`` sets their number. ``jax.lax.map`` takes one at a time.
 
     Examples:
       >>> Numba()
@@ -204,7 +205,7 @@ def _why_unsupported(
     if isinstance(engine, Numba) and _dtype(state) != jnp.float64:
         return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
     if isinstance(engine, Numba) and in_batch():
-        return f"in a vmap with the axis name {AXIS!r}", "it advances one replica after another, as in jax.lax.map"
+        return f"in a vmap with the axis name {AXIS!r}", "it takes a vmap without a name"
     if isinstance(engine, Pallas) and flow.grains > MOST_GRAINS:
         return f"with more than {MOST_GRAINS} grains", "every grain has a thread of one block"
     return None

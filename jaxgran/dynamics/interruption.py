@@ -2,12 +2,14 @@
 
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 import jax
 
 _FFI = "jaxgran.dynamics.numba_engine.ffi"
-_PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
+PATIENCE = 0.5  # seconds; longest wait for the end of what was interrupted
 T = TypeVar("T")
 
 
@@ -20,14 +22,23 @@ def waited(results: T) -> T:
     try:
         return jax.block_until_ready(results)
     except KeyboardInterrupt:
-        if _FFI in sys.modules:
-            with sys.modules[_FFI].stopped():
-                _wait(results)
+        with engines_stopped():
+            _wait(results)
         raise
 
 
+@contextmanager
+def engines_stopped() -> Iterator[None]:
+    """Within this block every running call of the numba engine in this process ends, with the status ``failed``."""
+    if _FFI not in sys.modules:
+        yield
+        return
+    with sys.modules[_FFI].stopped():
+        yield
+
+
 def _wait(results: object) -> None:
-    end = time.monotonic() + _PATIENCE
+    end = time.monotonic() + PATIENCE
     arrays = [leaf for leaf in jax.tree.leaves(results) if hasattr(leaf, "is_ready")]
     while time.monotonic() < end and not all(array.is_ready() for array in arrays):
         time.sleep(0.01)

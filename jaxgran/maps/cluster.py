@@ -6,26 +6,24 @@ The cluster replaces workers that die and repeats their tasks. It gives up a tas
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, TypeVar
 
-from jaxgran.maps.pool import WorkerDied
+import jax
+
 from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
 _PATIENCE = "10s"  # longest wait for an answer of the scheduler
 
 
-def run_on_cluster(
-    address: str,
-    function: Callable[..., T],
-    tasks: Sequence[tuple],
-    configure: Callable[..., None],
-    arguments: tuple,
-) -> Generator[tuple[int, T | WorkerDied]]:
-    """Run a function on the arguments of every task on a cluster, and yield each result when it is there.
+def run_on_cluster(address: str, function: Callable[..., T], tasks: Sequence[tuple]) -> Generator[tuple[int, T | None]]:
+    """Run a function on the arguments of every task on a cluster, with the precision of this process.
 
     Args:
       address: address of the scheduler, such as ``tcp://127.0.0.1:8786``.
-      function, tasks: as in ``pool.run_tasks``; the first tasks start first.
-      configure, arguments: a function and its arguments, called on the worker before every task.
+      function: a function that a worker can import.
+      tasks: arguments of each call; the first tasks start first.
+
+    Yields:
+      The number of the task, and its result when it is there; None if the cluster gave it up.
 
     Raises:
       InputError: (a ValueError) Dask is not installed, or no scheduler answers at the address.
@@ -38,19 +36,20 @@ def run_on_cluster(
         client = Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}.") from None
+    x64 = jax.config.read("jax_enable_x64")
     with client:
         futures = {
-            client.submit(_configured, configure, arguments, function, task, pure=False, priority=-number): number
+            client.submit(_with_precision, x64, function, task, pure=False, priority=-number): number
             for number, task in enumerate(tasks)
         }
         for future in as_completed(list(futures), loop=client.loop):
             try:
                 yield futures[future], future.result()
             except KilledWorker:
-                yield futures[future], WorkerDied("a batch has killed its workers too often")
+                yield futures[future], None
             future.release()
 
 
-def _configured(configure: Callable[..., None], arguments: tuple, function: Callable[..., Any], task: tuple) -> Any:
-    configure(*arguments)
+def _with_precision(x64: bool, function: Callable[..., Any], task: tuple) -> Any:
+    jax.config.update("jax_enable_x64", x64)
     return function(*task)

@@ -175,7 +175,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     version_PACKAGE             version of jaxgran and of packages that the numbers depend on
     history, command            when and by what command the map was made
     automatic_choice            what was chosen by ``auto``, in words
-    workers, resumed_replicas   number of processes, and of replicas that an earlier process left
+    workers, resumed_replicas   number of threads, and of replicas that an earlier process left
     wall_time_seconds,          of the last process
     replica_steps_per_second
     ==========================  =======================================================================================

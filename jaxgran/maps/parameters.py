@@ -164,7 +164,7 @@ class RunParameters(MapParameters):
     workers: int = field(
         default=1,
         metadata=row(
-            "Number of processes; more than one only on a CPU.",
+            "Number of batches that run at a time, in threads; more than one only on a CPU.",
             int,
             commands=("map",),
             default="one for each core on a CPU",

@@ -18,7 +18,6 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.output import check_output, remove_pictures
 from jaxgran.maps.parameters import RunParameters, takes
-from jaxgran.maps.pool import require_processes
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.replicas import replicas
 from jaxgran.maps.settings import MapSettings, chosen_settings
@@ -37,8 +36,6 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     With ``output``, finished batches are kept in a folder beside it while the map runs: an unfinished map of the same
     parameters is continued if ``resume`` is True and is an error otherwise, and a finished one is then read from its
     file. A file with anything else is replaced only if ``overwrite`` is True.
-
-    A script with more than one worker must have its main part under ``if __name__ == "__main__":``.
 
     Args:
       {PARAMETERS}
@@ -65,7 +62,8 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     run = RunParameters(*arguments, **parameters)
     output = _checked(run)
     settings, automatic_choice = chosen_settings(run)
-    _require_workers(run)
+    if run.workers > 1 and jax.default_backend() != "cpu":
+        raise refused("workers", run.workers, "must be 1 on an accelerator")
     if automatic_choice:
         _tell(run, f"chosen: {automatic_choice}")
     earlier, difference, finished = (None, "", False) if output is None else _earlier(output, settings)
@@ -85,7 +83,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
                 return earlier
             _tell_resumed(run, settings, checkpoint)
         results, attributes, interruption = _run(run, settings, None if run.record else checkpoint)
-        from jaxgran.maps.dataset import map_dataset  # here, so that workers need not load xarray
+        from jaxgran.maps.dataset import map_dataset  # here: xarray is loaded while the flows run
         from jaxgran.maps.results import write_dataset
 
         attributes |= {"automatic_choice": automatic_choice, **(run.attributes or {})}
@@ -123,7 +121,7 @@ def _checked(run: RunParameters) -> Path | None:
     if run.record is not None and not callable(run.record):
         raise refused("record", run.record, "must be a function")
     if run.record is not None and (run.resume or run.workers > 1 or run.scheduler is not None):
-        raise InputError("what is recorded cannot be resumed, and needs one process.", field="record")
+        raise InputError("what is recorded cannot be resumed, and needs one worker.", field="record")
     if run.attributes is not None and not isinstance(run.attributes, dict):
         raise refused("attributes", run.attributes, "must be a dictionary")
     if run.output is None:
@@ -135,14 +133,6 @@ def _checked(run: RunParameters) -> Path | None:
     output = Path(run.output)
     check_output(output)
     return output
-
-
-def _require_workers(run: RunParameters) -> None:
-    """Raise an InputError where this process cannot have as many workers."""
-    if run.workers > 1 and jax.default_backend() != "cpu":
-        raise refused("workers", run.workers, "must be 1 on an accelerator")
-    if run.workers > 1:
-        require_processes()
 
 
 def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
@@ -159,9 +149,9 @@ def _run(
     run: RunParameters, settings: MapSettings, checkpoint: Checkpoint | None
 ) -> tuple[dict[Key, Replica | None], dict[str, Any], BaseException | None]:
     """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that ended it."""
-    from jaxgran.maps.progress import progress  # here, so that workers need not load Rich
+    from jaxgran.maps.progress import progress  # here: a worker of a cluster need not load Rich
 
-    Thread(target=_load_meanwhile, args=(settings,), daemon=True).start()
+    Thread(target=_load_meanwhile, args=(settings,), name="jaxgran-load").start()
     workers, start = min(_count(settings), run.workers), perf_counter()
     results: dict[Key, Replica | None] = {} if checkpoint is None else dict(checkpoint.done)
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}

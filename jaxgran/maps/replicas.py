@@ -1,4 +1,4 @@
-"""Runs the replicas of a map, in batches: in this process, in worker processes, or on a cluster.
+"""Runs the replicas of a map, in batches: in threads of this process, or on a cluster.
 
 The random numbers of a replica depend on its seed and its point only. So results do not depend on the batches, their
 order or the number of workers.
@@ -19,13 +19,13 @@ import numpy as np
 from jaxtyping import Array, UInt32
 
 from jaxgran.cache.persistent_jit import persistent_jit
+from jaxgran.dynamics.threads import in_threads
 from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
-from jaxgran.maps.pool import WorkerDied, run_tasks, send
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
@@ -50,29 +50,28 @@ def replicas(
     Args:
       settings: the map.
       batch: number of replicas that run together, or "auto", see ``batch_size``.
-      workers: number of processes; more than one only on a CPU. They end when the iterator is closed.
+      workers: number of threads; more than one only on a CPU. See ``in_threads`` for how they end.
       report: called with the replica-steps done since its last call.
       checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor yielded.
       warn: called with one sentence about each batch that is given up.
-      scheduler: address of a Dask scheduler, whose workers run the batches instead of processes of this machine. They
+      scheduler: address of a Dask scheduler, whose workers run the batches instead of this process. They
         keep journals if they can access the folder of the checkpoint. ``report`` is then called after whole batches.
       record: wraps the function that advances a sampled batch, but not the one of its preparation. It has an effect
-        only if the batches run in this process.
+        only with one worker.
     """
     tasks = remaining_batches(settings, batch, workers, checkpoint)
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
-    configuration = (jax.config.read("jax_enable_x64"), jax.config.values["jax_compilation_cache_dir"])
     on_steps = report or (lambda _: None)
     if scheduler is not None:
-        outcomes = run_on_cluster(scheduler, _run_task, calls, _configure, (configuration[0], None))
+        outcomes = run_on_cluster(scheduler, _run_task, calls)
     elif workers > 1:
-        outcomes = run_tasks(_run_task, calls, workers, _configure, configuration, on_steps)
+        outcomes = in_threads(_run_task, calls, workers, on_steps)
     else:
         outcomes = ((number, _run_task(*call, report, record)) for number, call in enumerate(calls))
     with closing(outcomes):
         for number, outcome in outcomes:
-            if isinstance(outcome, WorkerDied):
-                warn(f"{outcome}: {_points(settings, tasks[number])} not measured.")
+            if outcome is None:
+                warn(f"a batch has killed its workers too often: {_points(settings, tasks[number])} not measured.")
                 yield from ((key, None) for key in tasks[number])
                 continue
             if checkpoint is not None:
@@ -80,16 +79,6 @@ def replicas(
             if scheduler is not None:
                 on_steps(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
             yield from outcome
-
-
-def _configure(x64: bool, cache: str | None) -> None:
-    """Set up a worker with the precision and the compilation cache of its parent.
-
-    The flags of XLA are not changed: other flags would sum small matrix products in another order than in the parent.
-    """
-    jax.config.update("jax_enable_x64", x64)
-    if cache is not None:
-        jax.config.update("jax_compilation_cache_dir", cache)
 
 
 def _points(settings: MapSettings, task: Sequence[Key]) -> str:
@@ -108,7 +97,7 @@ def _run_task(
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
     """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
-    drive = reporting(advance_batch, report or send)
+    drive = reporting(advance_batch, report)
     measured = _measured if record is None else partial(_measured, record=record)
     try:
         done = measured(settings, task, drive if journal is None else Journal(journal, task, drive))

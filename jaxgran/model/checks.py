@@ -23,7 +23,7 @@ class InputError(ValueError):
         super().__init__(message)
         self.field, self.value, self.reason = field, value, reason
 
-    def __reduce__(self):  # errors of worker processes are pickled
+    def __reduce__(self):  # errors of other processes are pickled
         return _input_error, (str(self), self.field, self.reason)
 
 

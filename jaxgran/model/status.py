@@ -19,7 +19,7 @@ class Status(IntEnum):
     infeasible = 5  # no impulses satisfy the contact law: the packing is jammed
     capacity = 6  # more pairs or contacts than the buffers hold
     nonfinite = 7  # a position, velocity or impulse is not a finite number
-    failed = 8  # the processes that ran it died, and it was given up
+    failed = 8  # workers of a cluster died of it, and it was given up
 
 
 DEEP_OVERLAP = 1e-2  # σ
@@ -33,7 +33,7 @@ MEANINGS = {
     "infeasible": "no impulses satisfy the contact law, the packing is jammed",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
-    "failed": "its processes died again and again, perhaps for lack of memory; pass `resume=True` to try once more",
+    "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to try once more",
     "not_run": "the point was not run",
 }
 """What each status means for a user, and what to do."""

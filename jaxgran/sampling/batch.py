@@ -23,6 +23,8 @@ from jaxgran.dynamics.advance import advance, register_numba
 from jaxgran.dynamics.engine import Engine, Jax, Numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
+from jaxgran.dynamics.threads import in_threads
+from jaxgran.environment import usable_threads
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -170,6 +172,22 @@ def advance_batch(flow: ShearFlow, numerics: Numerics, state: State, steps: Arra
       InputError: the engine cannot do this.
     """
     return _advance_replicas(flow, numerics, state, steps, lockstep=in_lockstep(numerics.engine))
+
+
+def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+    """``advance_batch`` with the same bits; replicas that advance in turn are shared out to threads."""
+    count = len(steps)
+    threads = min(usable_threads(), count)
+    if threads == 1 or in_lockstep(numerics.engine) or jax.device_count() > 1:
+        return advance_batch(flow, numerics, state, steps)
+    batch = jax.tree.map(np.asarray, (flow, numerics, state, steps))
+
+    def advanced(first: int, _: Callable) -> tuple[State, Tally]:
+        return advance_batch(*jax.tree.map(lambda x: x[first : first + share], batch))
+
+    share = min(_GROUP, -(-count // threads))
+    shares = dict(in_threads(advanced, [(first,) for first in range(0, count, share)], threads, lambda _: None))
+    return jax.tree.map(lambda *x: np.concatenate(x), *(shares[k] for k in sorted(shares)))
 
 
 def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:

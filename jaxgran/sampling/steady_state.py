@@ -34,7 +34,15 @@ from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import AdvanceBatch, advance_batch, batch_program, for_replicas, in_lockstep, stack
+from jaxgran.sampling.batch import (
+    AdvanceBatch,
+    advance_batch,
+    advance_on_all_cores,
+    batch_program,
+    for_replicas,
+    in_lockstep,
+    stack,
+)
 from jaxgran.sampling.correlation_strain import (
     FEWEST_CORRELATION_STRAINS,
     LEAST_SAMPLE,
@@ -120,7 +128,8 @@ def prepare(
         words = "None or a number of at least 0 and at most 1e6"
         require_number("equilibrate", equilibrate, lambda x: (x >= 0) & (x <= 1e6), words)
     require_sheared(flow)
-    batch = prepare_batch(flows, keys, equilibrate, grains=discs, numerics=checked_numerics(solver, engine))
+    numerics = checked_numerics(solver, engine)
+    batch = prepare_batch(flows, keys, equilibrate, advance_on_all_cores, grains=discs, numerics=numerics)
     tolerated = Status.ok if equilibrate is None else Status.not_steady
     if single and batch.status[0] > tolerated:
         raise RuntimeError(f"the flow could not be prepared: {Status(batch.status[0]).name}.")

@@ -1,6 +1,6 @@
 """The arrays of the numba engine, cut from one block of memory.
 
-XLA provides the block with the results of a call. So the numba engine never allocates, and needs no runtime of numba.
+The handler allocates the block, one for each replica. So the engine needs no runtime of numba.
 That is why an intrinsic makes the arrays, by ``numba.np.arrayobj``: the public ``numba.carray`` needs the runtime.
 """
 

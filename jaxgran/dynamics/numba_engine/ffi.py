@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
-from multiprocessing import parent_process
 from pathlib import Path
 from threading import Lock
 
@@ -22,11 +21,13 @@ import jax
 from llvmlite import binding as llvm
 
 from jaxgran.cache.folder import cache_folder, users_folder
+from jaxgran.environment import usable_threads
 from jaxgran.files import file_lock, read_cached, write_cached
 from jaxgran.model.checks import InputError
 
 TARGET = "jaxgran_advance"
-_STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is zero
+STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is zero
+THREADS = "jaxgran_threads"  # a word in the object file: threads that advance the replicas of a call
 _LOCK = Lock()
 _MOST_KEPT = 8  # object files in the cache
 _IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
@@ -84,7 +85,7 @@ def _register() -> None:
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
     _ENGINES.append(engine)
-    _STOP_WORDS.append(ctypes.c_int64.from_address(engine.get_global_value_address(_STOP)))
+    set_word(THREADS, usable_threads())
     try:
         jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(engine.get_function_address(TARGET)), platform="cpu")
     except jax.errors.JaxRuntimeError as error:
@@ -95,12 +96,10 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
     """Compile the numba engine, and write the object file if possible."""
     from jaxgran.dynamics.numba_engine.handler import object_code
 
-    content = object_code(TARGET, _STOP, machine)
+    content = object_code(TARGET, STOP, THREADS, machine)
     try:
         write_cached(path, content, _MOST_KEPT)
     except OSError as error:
-        if parent_process() is not None:  # which warns too
-            return content
         warnings.warn(
             "the numba engine is compiled anew in every process, in about 15 s: the cache folder "
             f"{str(path.parent)!r} cannot be written ({error.strerror}); set XDG_CACHE_HOME or {_CACHE_FOLDER} to "
@@ -113,14 +112,17 @@ def _compiled(path: Path, machine: llvm.TargetMachine) -> bytes:
 @contextmanager
 def stopped() -> Iterator[None]:
     """Within this block every running call of the numba engine ends, with the status ``failed``."""
-    for word in _STOP_WORDS:
-        word.value = 1
+    set_word(STOP, 1)
     try:
         yield
     finally:
-        for word in _STOP_WORDS:
-            word.value = 0
+        set_word(STOP, 0)
+
+
+def set_word(name: str, value: int) -> None:
+    """Set a word of the object file; without effect before it is loaded."""
+    for engine in _ENGINES:
+        ctypes.c_int64.from_address(engine.get_global_value_address(name)).value = value
 
 
 _ENGINES: list[llvm.ExecutionEngine] = []  # they own the memory of the loaded code
-_STOP_WORDS: list[ctypes.c_int64] = []
