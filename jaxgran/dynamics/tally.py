@@ -155,16 +155,10 @@ class RunningSums(NamedTuple):
         """Time so far."""
         return self._named("duration")
 
-    def joined(self, later: "RunningSums") -> "RunningSums":
-        """Sum with a later segment; the user's sums come from that segment."""
-        return RunningSums(
-            self.flight + later.flight,
-            self.contact + later.contact,
-            self.solve + later.solve,
-            jnp.maximum(self.largest, later.largest),
-            jnp.maximum(self.status, later.status),
-            later.user_sums,
-        )
+    @property
+    def steps(self) -> Float[Array, ""]:
+        """Time steps so far."""
+        return self._named("steps")
 
     def tally(self, **ends: Array) -> Tally:
         """The tally; what is known only at the end of an advance is given by name, but the status."""
