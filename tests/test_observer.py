@@ -55,7 +55,7 @@ def plain_sample(flowing):
 
 def test_looking_changes_no_bit_of_state_and_sums(observed, plain_sample) -> None:
     (state, measured), plain = observed, plain_sample
-    unobserved = state, replace(measured, observed_sums=None)
+    unobserved = state, replace(measured, tally=replace(measured.tally, observed=None))
     jax.tree.map(np.testing.assert_array_equal, unobserved, plain)
 
 
