@@ -14,7 +14,7 @@ import xarray as xr
 from jaxgran import environment
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
-from jaxgran.maps.confidence import confidence_variables, point_grains
+from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
 from jaxgran.maps.instants import first_of_points, instant_variables
@@ -98,7 +98,7 @@ def map_dataset(
     groups = {
         "/": _core(settings, grid, averages, statuses),
         "stresses": xr.Dataset(grid.averages(STRESSES, averages.values, averages.stderrs)),
-        "theory": xr.Dataset(theory_variables(settings, grid, averages.samples)),
+        "theory": xr.Dataset(theory_variables(grid, averages.samples)),
         "diagnostics": xr.Dataset(
             diagnostic_variables(grid, averages), {"observable": observable_coordinate(averages)}
         ),
@@ -121,7 +121,7 @@ def _core(settings: MapSettings, grid: PointGrid, averages: PointAverages, statu
     about_strain = {"long_name": "strain over which the flow is correlated, that of one sample", "units": "1"}
     variables = {
         **grid.averages(CORE, averages.values, averages.stderrs),
-        **confidence_variables(settings, grid, averages),
+        **confidence_variables(grid, averages, settings.solver.tolerance),
         **own_variables(settings, grid, averages.samples),
         "status": grid.variable(worst, {**about_status, **STATUS_FLAGS}),
         "correlation_strain": grid.variable(averages.correlation_strain, about_strain),
@@ -140,7 +140,7 @@ def _coordinates(settings: MapSettings, grid: PointGrid) -> dict[str, xr.Variabl
             coordinates[name] = xr.Variable((), value, _AXES[name])
     if settings.grains_by_point is not None:
         about = {"long_name": "number of grains of a point", "units": "1"}
-        coordinates["point_grains"] = grid.variable(point_grains(settings), about)
+        coordinates["point_grains"] = grid.variable(grid.grains, about)
     labels = {
         "error_source": (list(ERROR_SOURCES), "source of an error"),
         "axis_a": (["x", "y"], "direction of the centre-to-centre vector"),

@@ -87,7 +87,7 @@ def own_variables(
     found = {point: observed_estimates(seeds) for point, seeds in samples.items()}
     for name, sums in (sums_by_name(settings) or {}).items():
         dims = _dims(name, sums.shape)
-        value, stderr = (np.full((len(settings.flows()), *sums.shape), np.nan) for _ in range(2))
+        value, stderr = (np.full((len(grid.flows), *sums.shape), np.nan) for _ in range(2))
         for point, (values, stderrs) in found.items():
             value[point], stderr[point] = values[name], stderrs[name]
         interval = np.full((*value.shape, len(ERROR_SOURCES)), np.nan)
@@ -110,7 +110,7 @@ def own_seed_variables(
     totals = {key: one.sample.tally.total(axis=0) for key, one in replicas.items() if one is not None}
     variables = {}
     for name, sums in (sums_by_name(settings) or {}).items():
-        value = np.full((len(settings.flows()), settings.seeds, *sums.shape), np.nan)
+        value = np.full((len(grid.flows), settings.seeds, *sums.shape), np.nan)
         for key, total in totals.items():
             value[key] = np.asarray(total.observed[name]) / np.maximum(total.steps, 1)
         about = {"long_name": f"mean of {name} over all time steps", "cell_methods": "time: mean"}

@@ -50,7 +50,7 @@ def seed_variables(
                           several seeds
     ====================  ===========================================================================================
     """
-    shape = (len(settings.flows()), settings.seeds)
+    shape = (len(grid.flows), settings.seeds)
     strain, equilibration, timestep = (np.full(shape, np.nan) for _ in range(3))
     values = {name: np.full((*shape, *tensor_shape(name)), np.nan) for name in OBSERVABLES}
     for key, replica in replicas.items():
