@@ -5,7 +5,7 @@ import numpy as np
 from jaxgran.analysis.instant import Instant
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.dynamics.tally import Tally
+from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.maps.replica import Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
@@ -21,7 +21,7 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
     """Return a tally of positive random sums, of whole numbers of steps and contacts, with any leading axes."""
     counts = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "iterations", "unconverged")
     values = {}
-    for name in Tally.__dataclass_fields__:
+    for name in TABLE:
         tail = (2, 2) if name.endswith("moment") else (64,) if name == "residual_counts" else ()
         values[name] = rng.gamma(20.0, 1.0, (*shape, *tail))
         if name in counts:

@@ -63,7 +63,7 @@ def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path:
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
-def fake_drive(flow, numerics, state: State, steps):
+def fake_drive(flow, numerics, state: State, steps, observe=None):
     """Random numbers that depend on the state alone."""
     seed = int(np.asarray(state.positions).sum() * 1e6) % 2**31
     tally = random_tally(np.random.default_rng(seed), len(steps))

@@ -1,11 +1,24 @@
 """Tally: what joins two samples, and the one table from which the places of the sums follow."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.contact.law import contact_terms
-from jaxgran.dynamics.tally import CONTACT, EXTREMES, LAYOUT, NUMBERS, TABLE, Tally, empty_tally, span_of
+from jaxgran.dynamics.tally import (
+    CONTACT,
+    EXTREMES,
+    LAYOUT,
+    NUMBERS,
+    TABLE,
+    Tally,
+    empty_tally,
+    flat_tally,
+    span_of,
+    tally_from_flat,
+)
 from jaxgran.model.status import DEEP_OVERLAP, Status
 
 
@@ -19,7 +32,7 @@ def test_joined_sample_has_the_sums_and_the_larger_of_each_extreme():
     for seed in range(5):
         one, two = random_tally(seed), random_tally(seed + 100)
         joined = one + two
-        for name in Tally.__dataclass_fields__:
+        for name in TABLE:
             expected = np.maximum if name in EXTREMES else np.add
             np.testing.assert_array_equal(getattr(joined, name), expected(getattr(one, name), getattr(two, name)))
             assert getattr(joined, name).dtype == getattr(one, name).dtype
@@ -38,6 +51,17 @@ def test_batches_of_tallies_join_replica_by_replica():
     joined = ones + twos
     second = jax.tree.map(lambda leaf: leaf[1], joined)
     jax.tree.map(np.testing.assert_array_equal, second, random_tally(1) + random_tally(3))
+
+
+def test_sums_of_a_users_function_are_joined_and_stored_with_the_others():
+    one, two = (replace(random_tally(seed), observed={"a": np.float64(seed), "b": np.ones(3)}) for seed in (4, 5))
+    joined = one + two
+    assert joined.observed["a"] == 9
+    np.testing.assert_array_equal(joined.observed["b"], [2, 2, 2])
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), one.observed)
+    stored = np.append(flat_tally(one, ()), 7.0)  # a number of something else behind it
+    again = tally_from_flat(stored[None], np.dtype(float), shapes)
+    jax.tree.map(np.testing.assert_array_equal, again, jax.tree.map(lambda x: np.asarray(x)[None], one))
 
 
 def test_running_sums_follow_each_other_without_a_gap():

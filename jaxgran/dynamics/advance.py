@@ -6,6 +6,7 @@ XLA calls the numba engine through its foreign function interface, and the engin
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,6 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Jax, Numba, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, advance_by_jax, ended, require_advance
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
-from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.state import State
@@ -102,22 +102,55 @@ def register_numba() -> None:
 
 def advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the numba engine."""
-    end, sums, _, _ = call_numba(flow, solver, state, steps)
-    return ended(state, end.positions, end.tilt, end.velocities, sums)
+    call = call_numba(flow, solver, state, steps)
+    return ended(state, call.end.positions, call.end.tilt, call.end.velocities, call.sums)
+
+
+class NumbaCall(NamedTuple):
+    """What a call of the numba engine returns.
+
+    =========  ===============  ==========================================================================
+    field      shape            meaning
+    =========  ===============  ==========================================================================
+    end        State            the state at the end, unless the call is suspended
+    sums       RunningSums      the running sums, with those of the calls that it goes on from
+    suspended  ()               where the call is suspended; 0 if it is finished
+    recorded   ()               number of records
+    records    (room, numbers)  see ``numba_engine.records``
+    memory     (words,)         memory of the engine, in which another call goes on; (0,) without records
+    =========  ===============  ==========================================================================
+    """
+
+    end: State
+    sums: RunningSums
+    suspended: Array
+    recorded: Array
+    records: Array
+    memory: Array
+
+
+def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
+    """The memory of the numba engine for one replica."""
+    from jaxgran.dynamics.numba_engine import layout
+
+    return jax.ShapeDtypeStruct((1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64)
 
 
 def call_numba(
-    flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array, solved: Array | int = 0, room: int = 0
-) -> tuple[State, RunningSums, Array, Array]:
+    flow: ShearFlow,
+    solver: ProjectedMethod,
+    state: State,
+    steps: Array,
+    room: int = 0,
+    suspended: Array | int = 0,
+    memory: Array | None = None,
+) -> NumbaCall:
     """Run the numba engine once.
 
     Args:
       flow, solver, state, steps: as in ``advance``.
-      solved: whether the contacts of the first step have acted already.
-      room: number of records, static. The call ends early where there is no room for more; 0 records nothing.
-
-    Returns:
-      The state at the end, the running sums, the results in the order of ``numba_engine.layout``, and the records.
+      room: number of records, static. The call is suspended where there is no room for more; 0 records nothing.
+      suspended, memory: those of an earlier call with the same arguments, where it is to go on; 0 to begin.
     """
     from jaxgran.dynamics.numba_engine import layout
     from jaxgran.dynamics.numba_engine.ffi import TARGET
@@ -125,17 +158,19 @@ def call_numba(
     register_numba()
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
-    numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, solved)
+    numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, suspended)
     record = layout.RECORD_HEAD + (layout.RECORD_OF_GRAIN + 3 * layout.RECORD_OF_CONTACT) * count
-    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), (room, record)]
+    kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
+    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), kept, (room, record)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all")
+    aliases = None if memory is None else {5: 3}
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases)
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
     given = state.positions, state.velocities, grains.radii, grains.masses, packed
-    positions, velocities, found, records = call(*given)
-    tilt = found[layout.TILT]
-    end = State(grains, wrap(positions, state.side, tilt), velocities, state.side, tilt)
-    return end, sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32)), found, records
+    positions, velocities, found, memory, records = call(*given, *(() if memory is None else (memory,)))
+    end = State(grains, positions, velocities, state.side, found[layout.TILT])
+    sums = sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32))
+    return NumbaCall(end, sums, found[layout.SUSPENDED], found[layout.RECORDED].astype(jnp.int32), records, memory)
 
 
 def advance_by_pallas(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:

@@ -1,11 +1,12 @@
 """Advances one replica and sums what a user's function observes, with the engine ``Numba`` or ``Jax``.
 
 The numba engine does not call the function. It records the steps that it visits until the buffer of records is full;
-then JAX applies the function to the records, and the engine continues. So only the function is compiled, not an engine.
+then JAX applies the function to the records, and the engine goes on where it was suspended. So only the function is
+compiled, not an engine, and the trajectory is that of ``advance`` to the bit.
 """
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +17,19 @@ from jaxtyping import Array, Int
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.dynamics.advance import call_numba
+from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
 from jaxgran.dynamics.collision import Observe
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
 from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, observe_by_jax
 from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
-from jaxgran.dynamics.tally import Tally, empty_sums, place_of
+from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.model.status import Status
 
-_ROOM = 64  # records of one call, after which the numba engine searches anew
+_ROOM = 64  # records of one call
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
@@ -59,28 +59,34 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
     return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
 
 
+class _Progress(NamedTuple):
+    """An advance by one call of the numba engine after another, see ``NumbaCall``."""
+
+    unfinished: Array
+    end: State
+    sums: RunningSums
+    suspended: Array
+    memory: Array
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _recorded(
     observe: Observe, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
 ) -> tuple[State, Tally, Any]:
     """``advance_observed`` with the numba engine; its derivatives are those of the engine ``Jax``."""
 
-    def unfinished(now) -> Array:
-        _, done, _, sums = now
-        return (done < steps) & (sums.status < Status.nonfinite)
-
-    def called(now):
-        state, done, solved, sums = now
-        end, new, found, records = call_numba(flow, solver, state, steps - done, solved, _ROOM)
-        flown = found[place_of("steps")]
-        user_sums = _with_records(flow, state, observe, sums.user_sums, records, found, flown)
-        return end, done + flown.astype(done.dtype), _solved(found), sums.joined(new._replace(user_sums=user_sums))
+    def called(now: _Progress) -> _Progress:
+        call = call_numba(flow, solver, state, steps, _ROOM, now.suspended, now.memory)
+        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call)
+        sums = call.sums._replace(user_sums=user_sums)
+        return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 
     dtype = state.positions.dtype
     at_start = partial(observe, flow, state)
     sums = empty_sums(dtype)._replace(user_sums=nothing_observed(at_start, 3 * flow.grains, dtype).sums)
-    now = state, jnp.zeros_like(steps), jnp.zeros((), dtype), sums
-    end, _, _, sums = lax.while_loop(unfinished, called, now)
+    memory = jnp.zeros(numba_memory(flow).shape, dtype)
+    start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
+    end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
     return *ended(state, end.positions, end.tilt, end.velocities, sums), sums.user_sums
 
 
@@ -89,19 +95,12 @@ def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
     return jax.jvp(partial(observe_by_jax, observe=observe), primals, tangents)
 
 
-def _solved(found: Array) -> Array:
-    from jaxgran.dynamics.numba_engine.layout import SOLVED
+def _with_records(flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall) -> Any:
+    """The user sums with what is found in the records of a call."""
+    from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS
 
-    return found[SOLVED]
-
-
-def _with_records(
-    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, records: Array, found: Array, flown: Array
-) -> Any:
-    """The user sums with what is found in the records of a call that flew so many steps from a state."""
-    from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS, RECORDED
-
-    dtype, count = records.dtype, found[RECORDED].astype(jnp.int32)
+    records, count, flown = call.records, call.recorded, call.sums.steps
+    dtype = records.dtype
     most = 3 * flow.grains  # contacts of discs form a planar graph
     sizes = max(4, flow.grains // _FEW), most
 

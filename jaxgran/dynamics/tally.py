@@ -5,7 +5,7 @@ loop runs, an engine keeps the sums as plain numbers. Their order follows from t
 written down anywhere. A new sum over contacts is one row here and one term of ``contact.law.contact_terms``.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -81,6 +81,7 @@ class Tally:
     )
     momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
+    observed: Any = None  # sums of what a user's function observes, a pytree; None without one
 
     @property
     def outcome(self) -> Int[Array | np.ndarray, "*b"]:
@@ -94,10 +95,12 @@ class Tally:
 
     def total(self, axis: int | tuple[int, ...]) -> "Tally":
         """The tally of all that stands along leading axes: sums, and the larger of each of ``EXTREMES``."""
-        return Tally(**{name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in vars(self).items()})
+        sums = {name: getattr(self, name) for name in TABLE}
+        joined = {name: x.max(axis) if name in EXTREMES else x.sum(axis) for name, x in sums.items()}
+        return Tally(**joined, observed=jax.tree.map(lambda x: x.sum(axis), self.observed))
 
 
-TABLE = {row.name: row.metadata for row in fields(Tally)}
+TABLE = {row.name: row.metadata for row in fields(Tally) if row.metadata}
 EXTREMES = tuple(name for name, row in TABLE.items() if row["joined"] == "largest")  # joined by the larger one
 
 
@@ -155,16 +158,10 @@ class RunningSums(NamedTuple):
         """Time so far."""
         return self._named("duration")
 
-    def joined(self, later: "RunningSums") -> "RunningSums":
-        """Sum with a later segment; the user's sums come from that segment."""
-        return RunningSums(
-            self.flight + later.flight,
-            self.contact + later.contact,
-            self.solve + later.solve,
-            jnp.maximum(self.largest, later.largest),
-            jnp.maximum(self.status, later.status),
-            later.user_sums,
-        )
+    @property
+    def steps(self) -> Float[Array, ""]:
+        """Time steps so far."""
+        return self._named("steps")
 
     def tally(self, **ends: Array) -> Tally:
         """The tally; what is known only at the end of an advance is given by name, but the status."""
@@ -201,11 +198,17 @@ def flat_tally(tally: Tally, shape: tuple[int, ...]) -> np.ndarray:
     return np.concatenate(leaves, axis=-1)
 
 
-def tally_from_flat(numbers: np.ndarray, dtype: jnp.dtype) -> Tally:
-    """The tally whose numbers ``flat_tally`` has put together, bit for bit."""
-    leaves, structure = jax.tree.flatten(empty_tally(dtype))
-    edges = np.cumsum([leaf.size for leaf in leaves])[:-1]
-    parts = zip(np.split(numbers, edges, axis=-1), leaves, strict=True)
+def tally_from_flat(numbers: np.ndarray, dtype: jnp.dtype, observed: Any = None) -> Tally:
+    """The tally whose numbers ``flat_tally`` has put together, bit for bit.
+
+    Args:
+      numbers: (..., numbers); any behind those of the tally are left out.
+      dtype: of the sums.
+      observed: a pytree with the shapes of the user's sums.
+    """
+    leaves, structure = jax.tree.flatten(replace(empty_tally(dtype), observed=observed))
+    edges = np.cumsum([leaf.size for leaf in leaves])
+    parts = zip(np.split(numbers, edges, axis=-1)[:-1], leaves, strict=True)
     shape = numbers.shape[:-1]
     return jax.tree.unflatten(structure, [x.reshape(*shape, *leaf.shape).astype(leaf.dtype) for x, leaf in parts])
 

@@ -27,9 +27,10 @@ import jax
 import numpy as np
 
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
-from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
+from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.instants import as_arrays, from_arrays
+from jaxgran.maps.own_observables import identity_of, sums_by_name
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
@@ -163,7 +164,7 @@ class Checkpoint:
         write_arrays(self.folder / f"done-{self._name(list(replicas))}.nc", arrays, {})
 
     def _read(self) -> None:
-        dtype = np.dtype(_precision())
+        dtype, own_sums = np.dtype(_precision()), sums_by_name(self.settings)
         for path in sorted(self.folder.glob("done-*.nc")):
             arrays = self._arrays(path)
             if arrays is None:
@@ -175,7 +176,7 @@ class Checkpoint:
             for row, tally, numbers, instant in zip(*columns, strict=True):
                 point, seed, status = row.tolist()
                 strain, area, shear_rate = numbers
-                tallies = tally_from_flat(tally, dtype)
+                tallies = tally_from_flat(tally, dtype, own_sums)
                 grains = self.settings.flows()[point].grains
                 sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), grains)
                 self.done[point, seed] = Replica(sample, status, float(strain), instant)
@@ -224,11 +225,11 @@ class Checkpoint:
 def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
     versions = {f"version of {name}": version(name) for name in _VERSIONS}
-    here = {"precision": _precision(), "device": jax.default_backend(), "number of running sums": len(fields(Tally))}
+    here = {"precision": _precision(), "device": jax.default_backend(), "number of running sums": len(TABLE)}
     parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
     solver = f"{solver_name(settings.solver)} {json.dumps(solver_numbers(settings.solver))}"
     engine = "auto" if settings.engine is None else settings.engine.name
-    identity = {**parameters, "solver": solver, "engine": engine, **versions, **here}
+    identity = {**parameters, "solver": solver, "engine": engine, "observe": identity_of(settings), **versions, **here}
     return json.loads(json.dumps(identity, default=lambda number: number.item()))
 
 

@@ -5,13 +5,12 @@ import xarray as xr
 
 from jaxgran.maps.points import PointAverages, PointGrid
 from jaxgran.maps.schema import ERROR_SOURCES
-from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.sampling.budget import BUDGET, error_budget
 from jaxgran.sampling.observables import OBSERVABLES
 
 
-def confidence_variables(settings: MapSettings, grid: PointGrid, averages: PointAverages) -> dict[str, xr.Variable]:
+def confidence_variables(grid: PointGrid, averages: PointAverages, tolerance: float) -> dict[str, xr.Variable]:
     """The variables NAME_ci95 of a map, for the names in ``BUDGET``, with the dimension ``error_source``.
 
     ===========  ====================================================================================
@@ -24,15 +23,15 @@ def confidence_variables(settings: MapSettings, grid: PointGrid, averages: Point
     tolerance    bound on the error from the tolerance of the contact solves
     ===========  ====================================================================================
     """
-    flows = stack_of_any_size(settings.flows())
+    flows = grid.batch
     budget = error_budget(
         averages.values,
         averages.stderrs,
         flows.restitution,
         flows.packing_fraction,
-        point_grains(settings),
+        grid.grains,
         flows.timestep,
-        settings.solver.tolerance,
+        tolerance,
     )
     variables = {}
     for name in BUDGET:
@@ -49,8 +48,3 @@ def confidence_variables(settings: MapSettings, grid: PointGrid, averages: Point
         about = {"long_name": f"half-width of the 95 % interval of {long_name}", "units": units}
         variables[f"{name}_ci95"] = grid.variable(values, about, "error_source")
     return variables
-
-
-def point_grains(settings: MapSettings) -> np.ndarray:
-    """The number of grains of every point."""
-    return np.array([flow.grains for flow in settings.flows()])

@@ -14,11 +14,12 @@ import xarray as xr
 from jaxgran import environment
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
-from jaxgran.maps.confidence import confidence_variables, point_grains
+from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import large_system_variables
+from jaxgran.maps.own_observables import identity_of, own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import CORE, ERROR_SOURCES, FORMAT_VERSION, STRESSES
@@ -58,6 +59,7 @@ def map_dataset(
                                                         ``schema.CORE``
     NAME_ci95                     (point,               half-width of its 95 % interval for a large system, for the
                                   error_source)         names in ``BUDGET``
+    NAME, NAME_stderr, NAME_ci95  point, …              only with the setting ``observe``, see ``own_variables``
     status                        point                 worst status
     correlation_strain            point                 strain over which the flow is correlated
     ============================  ====================  =============================================================
@@ -96,7 +98,7 @@ def map_dataset(
     groups = {
         "/": _core(settings, grid, averages, statuses),
         "stresses": xr.Dataset(grid.averages(STRESSES, averages.values, averages.stderrs)),
-        "theory": xr.Dataset(theory_variables(settings, grid, averages.samples)),
+        "theory": xr.Dataset(theory_variables(grid, averages.samples)),
         "diagnostics": xr.Dataset(
             diagnostic_variables(grid, averages), {"observable": observable_coordinate(averages)}
         ),
@@ -119,7 +121,8 @@ def _core(settings: MapSettings, grid: PointGrid, averages: PointAverages, statu
     about_strain = {"long_name": "strain over which the flow is correlated, that of one sample", "units": "1"}
     variables = {
         **grid.averages(CORE, averages.values, averages.stderrs),
-        **confidence_variables(settings, grid, averages),
+        **confidence_variables(grid, averages, settings.solver.tolerance),
+        **own_variables(settings, grid, averages.samples),
         "status": grid.variable(worst, {**about_status, **STATUS_FLAGS}),
         "correlation_strain": grid.variable(averages.correlation_strain, about_strain),
     }
@@ -137,7 +140,7 @@ def _coordinates(settings: MapSettings, grid: PointGrid) -> dict[str, xr.Variabl
             coordinates[name] = xr.Variable((), value, _AXES[name])
     if settings.grains_by_point is not None:
         about = {"long_name": "number of grains of a point", "units": "1"}
-        coordinates["point_grains"] = grid.variable(point_grains(settings), about)
+        coordinates["point_grains"] = grid.variable(grid.grains, about)
     labels = {
         "error_source": (list(ERROR_SOURCES), "source of an error"),
         "axis_a": (["x", "y"], "direction of the centre-to-centre vector"),
@@ -160,8 +163,9 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     title, Conventions          what the file is, and the version of the CF conventions
     format_version              of the groups and names in the file; files of another one are refused
     restitution, …, first_seed  the settings by their names in ``ratio_map``
-    engine, solver              what ran; numbers of grains may have different ones on a GPU
+    engine, solver              what ran; numbers of grains, preparation and sample may have different ones on a GPU
     engine_requested, solver_requested  what was asked for
+    observe                     names of the user's observables, and a hash of what their function computes
     equilibrate                 strain before the sample, or "until steady"
     timestep_unit               of the time step
     strain_meaning              of the strain
@@ -184,9 +188,14 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     equilibrate = parameters.pop("equilibrate")
     if settings.error is not None:
         del parameters["strain"]  # it differs between seeds: see ``strain`` of the group seeds
+    parameters["observe"] = identity_of(settings)
     parameters = {name: value for name, value in parameters.items() if value is not None}
-    flow = settings.flows()[0]
-    engines = [select_engine(replace(flow, grains=grains), settings.numerics) for grains in settings.sizes]
+    flow, of_sample = settings.flows()[0], "" if settings.observe is None else "observe"
+    engines = [
+        select_engine(replace(flow, grains=grains), settings.numerics, option=option)
+        for grains in settings.sizes
+        for option in ("", of_sample)
+    ]
     numbers = solver_numbers(settings.solver)
     solvers = [solver_in_use(engine, settings.solver) for engine in engines]
     return {

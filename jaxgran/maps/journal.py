@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,8 @@ from jaxgran.dynamics.tally import Tally, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.batch import AdvanceBatch
+from jaxgran.sampling.batch import ObserveBatch
+from jaxgran.sampling.observe import Observable, observed_shapes
 
 SECONDS = 5.0  # shortest time between two writes of a journal
 _WRITING_SHARE = 0.05  # of the time: large journals are written less often
@@ -28,7 +30,7 @@ _LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of large
 
 
 class Journal:
-    """An ``AdvanceBatch`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
+    """An ``ObserveBatch`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
 
     Args:
       path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
@@ -40,7 +42,7 @@ class Journal:
       CorruptFile: the file is the journal of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: AdvanceBatch, seconds: float | None = None):
+    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: ObserveBatch, seconds: float | None = None):
         self.path, self.drive, self.seconds = path, drive, seconds
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
@@ -50,13 +52,15 @@ class Journal:
         if path.exists():
             self._read()
 
-    def __call__(self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+    def __call__(
+        self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+    ) -> tuple[State, Tally]:
         k, self.position = self.position, self.position + 1
         if k < len(self.tallies):
             if np.array_equal(self.steps[k], steps):
-                return self._repeated(k, state)
+                return self._repeated(k, state, None if observe is None else observed_shapes(observe, flow))
             raise CorruptFile(f"{self.path.name} is the journal of another run")
-        state, tally = self.drive(flow, numerics, state, steps)
+        state, tally = self.drive(flow, numerics, state, steps, observe)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
         if time.monotonic() >= self.next:
@@ -64,9 +68,9 @@ class Journal:
             self._write()
         return state, tally
 
-    def _repeated(self, k: int, state: State) -> tuple[State, Tally]:
+    def _repeated(self, k: int, state: State, observed: Any) -> tuple[State, Tally]:
         """Tally ``k`` of the journal; with the last tally comes the stored state, and before it the given one."""
-        tally = tally_from_flat(self.tallies[k], state.positions.dtype)
+        tally = tally_from_flat(self.tallies[k], state.positions.dtype, observed)
         if k + 1 < len(self.tallies):
             return state, tally
         leaves = [jnp.asarray(leaf) for leaf in self.leaves]
@@ -75,7 +79,9 @@ class Journal:
     def _write(self) -> None:
         begun = time.monotonic()
         states = {f"state_{k}": leaf for k, leaf in enumerate(self.leaves)}
-        series = {"steps": np.stack(self.steps), "tallies": np.stack(self.tallies)}
+        most = max(numbers.shape[-1] for numbers in self.tallies)  # with a user's sums in those of the sample
+        tallies = [np.pad(numbers, ((0, 0), (0, most - numbers.shape[-1]))) for numbers in self.tallies]
+        series = {"steps": np.stack(self.steps), "tallies": np.stack(tallies)}
         with suppress(FileNotFoundError):  # the folder was removed; ``Checkpoint.add`` makes it again
             write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
         now = time.monotonic()

@@ -146,6 +146,14 @@ class MapParameters:
     first_seed: int = field(
         default=0, metadata=row("Number of the first seed; seeds of other numbers start from other grains.", int)
     )
+    observe: Any = field(
+        default=None,
+        metadata=row(
+            "A function as in `sample` that returns numbers or arrays by name; each is averaged into a variable of "
+            "this name.",
+            commands=(),
+        ),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

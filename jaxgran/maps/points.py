@@ -1,6 +1,8 @@
 """The points of a map: their dimensions, and the averages of the replicas of each."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,7 +10,8 @@ import xarray as xr
 
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import TENSOR_AXES
-from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.settings import MapSettings, stack_of_any_size
+from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
@@ -16,19 +19,31 @@ from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSO
 from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
 
 
-class PointGrid(NamedTuple):
-    """The dimensions of a point, outermost first, and their sizes."""
+@dataclass(frozen=True)
+class PointGrid:
+    """The dimensions of a point, outermost first, their sizes, and the flow of each point."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
+    flows: Sequence[ShearFlow] = ()
 
     @classmethod
     def of(cls, settings: MapSettings) -> "PointGrid":
         """The grid of a map."""
-        return cls(tuple(settings.axes), tuple(map(len, settings.axes.values())))
+        return cls(tuple(settings.axes), tuple(map(len, settings.axes.values())), settings.flows())
+
+    @cached_property
+    def batch(self) -> ShearFlow:
+        """The flows as one batch, for what does not depend on their numbers of grains."""
+        return stack_of_any_size(self.flows)
+
+    @property
+    def grains(self) -> np.ndarray:
+        """The number of grains of every point."""
+        return np.array([flow.grains for flow in self.flows])
 
     def variable(self, values: np.ndarray, attrs: Mapping[str, Any], *further: str) -> xr.Variable:
-        """A variable of values (points, ...) in the order of ``settings.flows()``; ``further`` are its last dims."""
+        """A variable of values (points, ...) in the order of ``flows``; ``further`` are its last dims."""
         return xr.Variable((*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs))
 
     def averages(

@@ -29,7 +29,7 @@ from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper, Report, advance_batch, reporting, stack
+from jaxgran.sampling.batch import AdvanceWrapper, ObserveBatch, Report, advance_batch, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
@@ -137,7 +137,7 @@ def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
 def _measured(
     settings: MapSettings,
     task: Sequence[Key],
-    drive: AdvanceBatch,
+    drive: ObserveBatch,
     refinement: int = 1,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
@@ -149,7 +149,8 @@ def _measured(
     batch = prepare_batch(flow, keys, settings.equilibrate, drive, coarse, numerics=settings.numerics)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
-    batch, sample = sample_batch(batch, settings.strain, drive if record is None else record(drive), error)
+    sampling = drive if settings.observe is None else partial(drive, observe=settings.observe)
+    batch, sample = sample_batch(batch, settings.strain, sampling if record is None else record(sampling), error)
     instants = first_instants(batch, task) if settings.snapshots else [None] * len(task)
     numbers = zip(batch.status.tolist(), strain_before.tolist(), instants, strict=True)
     return [

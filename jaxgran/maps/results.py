@@ -77,7 +77,7 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
     """The parameters of a map, as arguments of ``MapSettings``; InputError if one is missing.
 
     Engine and solver are those that were requested, not those that ran. The solver of a user's own class is given by
-    its name and numbers, as the class is not in the file.
+    its name and numbers, and what a user observes by names and a hash, as class and function are not in the file.
     """
     from jaxgran.dynamics.engine import engine_named  # here, so that figures are drawn without loading JAX
     from jaxgran.maps.settings import MapSettings
@@ -93,7 +93,7 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.name not in ("strain", "error", "grains_by_point"):  # which not every map has
+            elif field.name not in ("strain", "error", "grains_by_point", "observe"):  # which not every map has
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         chosen["snapshots"] = bool(chosen["snapshots"])
@@ -124,6 +124,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
     The description is "" if the file holds a map of the same settings.
     """
     from jaxgran.contact.projected_methods import solver_name, solver_numbers
+    from jaxgran.maps.own_observables import identity_of
 
     try:
         data = read_dataset(path)
@@ -131,7 +132,8 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
     except InputError:
         return None, "something other than a map of this version"
     for field in fields(settings):
-        there, here = chosen.get(field.name, field.default), getattr(settings, field.name)
+        there: Any = chosen.get(field.name, field.default)
+        here: Any = identity_of(settings) if field.name == "observe" else getattr(settings, field.name)
         if isinstance(there, str) and field.name == "solver":
             here = f"{solver_name(here)} {json.dumps(solver_numbers(here))}"
         if there != here:

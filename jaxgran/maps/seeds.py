@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from jaxgran.maps.own_observables import own_seed_variables
 from jaxgran.maps.points import PointGrid, tensor_shape
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import TENSOR_AXES
@@ -45,10 +46,11 @@ def seed_variables(
     strain                sampled strain
     equilibration_strain  strain before the sample
     sample_timestep       time step of the sample, shorter than asked for where a replica was retried
-    NAME                  average of each observable over the replica; only if the map has several seeds
+    NAME                  average of each observable, also of the user's, over the replica; only if the map has
+                          several seeds
     ====================  ===========================================================================================
     """
-    shape = (len(settings.flows()), settings.seeds)
+    shape = (len(grid.flows), settings.seeds)
     strain, equilibration, timestep = (np.full(shape, np.nan) for _ in range(3))
     values = {name: np.full((*shape, *tensor_shape(name)), np.nan) for name in OBSERVABLES}
     for key, replica in replicas.items():
@@ -73,7 +75,7 @@ def seed_variables(
         tensor_dims = TENSOR_AXES if name in TENSORS else ()
         attrs = {"long_name": long_name, "units": units}
         variables[name] = grid.variable(values[name], attrs, "seed", *tensor_dims)
-    return variables
+    return variables | own_seed_variables(settings, grid, replicas)
 
 
 def seed_coordinate(settings: MapSettings) -> xr.Variable:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
+from jaxgran.maps.own_observables import require_observe
 from jaxgran.maps.parameters import MapParameters
 from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
@@ -56,7 +57,9 @@ class MapSettings(MapParameters):
                 require_number(row.name, value, *ranged)
         flows = stack_of_any_size(self._checked_flows())
         if self.engine is not None:
-            select_engine(flows, self.numerics)
+            select_engine(flows, self.numerics, option="" if self.observe is None else "observe")
+        if self.observe is not None:
+            require_observe(self.observe, self._checked_flows()[0])
         shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
             raise refused("timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate")

@@ -1,15 +1,16 @@
 """Batches of replicas: flows stacked into one, and the functions that advance them.
 
 All arrays of a batch have a leading (replicas,) axis. Only an ``AdvanceBatch`` changes its states. ``advance_batch`` is
-the plain one. Wrappers around it report progress, record frames or keep a journal.
+the plain one. Wrappers around it report progress, record frames or keep a journal. An ``ObserveBatch`` also takes a
+function of a user's, whose sums come with the tally.
 
 JAX may see several devices, of this host or of all hosts that ``jax.distributed`` connects. Each device then advances
 its share of the replicas. Devices wait for each other only at the end of a call. All hosts get all results.
 """
 
 from collections.abc import Callable
-from functools import wraps
-from typing import Any
+from functools import lru_cache, wraps
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
 from jaxgran.cache.persistent_jit import persistent_jit
-from jaxgran.dynamics.advance import advance, register_numba
+from jaxgran.dynamics.advance import register_numba
 from jaxgran.dynamics.engine import Engine, Jax, Numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
@@ -28,11 +29,22 @@ from jaxgran.environment import usable_threads
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
+from jaxgran.sampling.observe import Observable, advance_and_observe
 
 Report = Callable[[float], None]  # called with the replica-steps done since the last call
 # Advances each replica by its number of steps, and a wrapper that adds reports or records and leaves the states alone.
 AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
+
+
+class ObserveBatch(Protocol):
+    """An ``AdvanceBatch`` that can observe the replicas while it advances them."""
+
+    def __call__(
+        self, flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+    ) -> tuple[State, Tally]: ...
+
+
 _DEVICES = "devices"
 _GROUP = 4  # replicas of a compiled program that advances them in turn
 
@@ -105,7 +117,11 @@ def _on_all_devices(batched: Callable) -> Callable:
     return on_all_devices
 
 
-def batch_program(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
+def batch_program(
+    function: Callable,
+    register: Callable[[], None] = lambda: None,
+    compiled: Callable[[Callable, Callable[[], None]], Callable] = persistent_jit,
+) -> Callable:
     """The compiled function of one replica for a batch, called with batched arguments and ``lockstep``.
 
     Replicas that advance in turn do so in groups of one size. So one compiled program serves batches of any size. For
@@ -129,8 +145,8 @@ def batch_program(function: Callable, register: Callable[[], None] = lambda: Non
 
         return lax.map(lambda each: one(*each), (real, arguments))
 
-    everything = {True: persistent_jit(together, register), False: persistent_jit(in_turn, register)}
-    in_group = persistent_jit(group, register)
+    everything = {True: compiled(together, register), False: compiled(in_turn, register)}
+    in_group = compiled(group, register)
 
     @wraps(function)
     def program(*arguments, lockstep: bool):
@@ -154,24 +170,38 @@ def _on_host(array: Array) -> Array | np.ndarray:
 
 
 def _advance_replica(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
-    return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+    return advance_and_observe(flow, numerics, state, steps, None)
 
 
 _advance_replicas = batch_program(_advance_replica, register_numba)
 
 
-def advance_batch(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+@lru_cache(maxsize=8)
+def _observe_replicas(observe: Observable) -> Callable:
+    """The program of ``advance_batch`` with a user's function, of which no key for a file is known."""
+
+    def observe_replica(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+        return advance_and_observe(flow, numerics, state, steps, observe)
+
+    return batch_program(observe_replica, compiled=lambda function, _: jax.jit(function))
+
+
+def advance_batch(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+) -> tuple[State, Tally]:
     """Advance each replica of a batch by its number of time steps.
 
     Args:
       flow, state: those of the replicas, see ``stack``.
       numerics: those of the replicas, see ``for_replicas``.
       steps: (replicas,) numbers of time steps.
+      observe: a function of a ``Snapshot``, see ``sample``; its sums are in ``Tally.observed``.
 
     Raises:
       InputError: the engine cannot do this.
     """
-    return _advance_replicas(flow, numerics, state, steps, lockstep=in_lockstep(numerics.engine))
+    program = _advance_replicas if observe is None else _observe_replicas(observe)
+    return program(flow, numerics, state, steps, lockstep=in_lockstep(numerics.engine))
 
 
 def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
@@ -190,13 +220,15 @@ def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, step
     return jax.tree.map(lambda *x: np.concatenate(x), *(shares[k] for k in sorted(shares)))
 
 
-def reporting(drive: AdvanceBatch, report: Report | None) -> AdvanceBatch:
+def reporting(drive: ObserveBatch, report: Report | None) -> ObserveBatch:
     """The same advance with a report of the replica-steps after each call; unchanged without ``report``."""
     if report is None:
         return drive
 
-    def driven(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
-        state, tally = drive(flow, numerics, state, steps)
+    def driven(
+        flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
+    ) -> tuple[State, Tally]:
+        state, tally = drive(flow, numerics, state, steps, observe)
         report(float(np.sum(tally.steps)))
         return state, tally
 

@@ -12,24 +12,19 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
-from jaxgran.dynamics.observed_advance import advance_observed
-from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
-from jaxgran.dynamics.tally import Tally
+from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import in_numpy, replica_of
 from jaxgran.model.checks import InputError, require_untraced, require_whole, short_repr, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
-from jaxgran.model.status import Status
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
+from jaxgran.sampling.observe import Observable, advance_and_observe
 from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
 
-Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 BLOCKS = 32
 MOST_BLOCKS = 10**6
 ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # a target for the relative error holds for these
@@ -47,7 +42,7 @@ _UNITS_OF_SHOWN = {
 
 
 def _rows(sample: "Sample") -> list[Row]:
-    known = arrays(*vars(sample.tally).values(), sample.area, sample.shear_rate)
+    known = arrays(*(getattr(sample.tally, name) for name in TABLE), sample.area, sample.shear_rate)
     if not known or np.ndim(sample.tally.contact_moment) < 3:
         return [Row("grains", sample.grains), Row("area", sample.area, "σ²")]
     here = in_numpy(sample)
@@ -67,16 +62,14 @@ def _rows(sample: "Sample") -> list[Row]:
 class Sample:
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
-    =============  =========  ====  =================================================
-    field          shape      unit  meaning
-    =============  =========  ====  =================================================
-    tally          (blocks,)  –     sums over the steps of each block of strain
-    area           ()         σ²    area of the cell
-    shear_rate     ()         1/t   γ̇
-    grains         static     –     number of grains
-    observed_sums  (blocks,)  –     sums over the steps of what ``observe`` returns,
-                                    a pytree; None without ``observe``
-    =============  =========  ====  =================================================
+    ==========  =========  ====  =================================================
+    field       shape      unit  meaning
+    ==========  =========  ====  =================================================
+    tally       (blocks,)  –     sums over the steps of each block of strain
+    area        ()         σ²    area of the cell
+    shear_rate  ()         1/t   γ̇
+    grains      static     –     number of grains
+    ==========  =========  ====  =================================================
 
     The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
     default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``. They are NumPy numbers,
@@ -87,7 +80,6 @@ class Sample:
     area: Float[Array | np.ndarray, "*replicas"]
     shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
-    observed_sums: Any = None
 
     __repr__, _repr_html_ = display_methods("Sample", _rows)
 
@@ -146,6 +138,11 @@ class Sample:
         return self._total.outcome
 
     @property
+    def observed_sums(self) -> Any:
+        """Sums over the steps of each block of what ``observe`` returns, a pytree; None without ``observe``."""
+        return self.tally.observed
+
+    @property
     def _total(self) -> Tally:
         return in_numpy(self.tally).total(axis=np.ndim(self.area))
 
@@ -181,18 +178,27 @@ class Sample:
             raise InputError("observed() needs one replica, sampled with observe: sample[0] is the first of a batch.")
         require_untraced("observed()", "take it of the finished sample", self)
 
-        def estimate_of_sums(sums: Any, steps: Array) -> Any:
-            return estimate(jax.tree.map(lambda x: x / steps, sums))
+        return observed_estimates([self], estimate)
 
-        def leaves_by_number(parts: tuple[Any, Array]) -> dict[str, Array]:
-            leaves = jax.tree.leaves(jax.vmap(estimate_of_sums)(*parts))
-            return {str(k): leaf for k, leaf in enumerate(leaves)}
 
-        sums = jax.tree.map(lambda x: np.asarray(x)[None], (self.observed_sums, self.tally.steps))
-        total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
-        structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
-        values, errors = standard_errors(leaves_by_number, sums)
-        return structure.unflatten(values.values()), structure.unflatten(errors.values())
+def observed_estimates(
+    seeds: Sequence[Sample], estimate: Callable[[Any], Any] = lambda means: means
+) -> tuple[Any, Any]:
+    """``Sample.observed`` over several replicas of one flow."""
+
+    def estimate_of_sums(sums: Any, steps: Array) -> Any:
+        return estimate(jax.tree.map(lambda x: x / steps, sums))
+
+    def leaves_by_number(parts: tuple[Any, Array]) -> dict[str, Array]:
+        leaves = jax.tree.leaves(jax.vmap(estimate_of_sums)(*parts))
+        return {str(k): leaf for k, leaf in enumerate(leaves)}
+
+    parts = ((seed.observed_sums, seed.tally.steps) for seed in seeds)
+    sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *parts)
+    total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
+    structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
+    values, errors = standard_errors(leaves_by_number, sums)
+    return structure.unflatten(values.values()), structure.unflatten(errors.values())
 
 
 def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
@@ -344,22 +350,12 @@ def _sample_blocks(
 ) -> tuple[State, Sample]:
     """The final state and the sample of blocks with the given numbers of time steps."""
 
-    def block(state: State, steps: Array) -> tuple[State, tuple[Tally, Any]]:
-        if observe is None:
-            state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
-            return state, (tally, None)
-        now = partial(_observe_snapshot, observe)
-        state, tally, observed_sums = advance_observed(flow, numerics, state, steps, now)
-        return state, (tally, observed_sums)
+    def block(state: State, steps: Array) -> tuple[State, Tally]:
+        return advance_and_observe(flow, numerics, state, steps, observe)
 
-    state, (tally, observed_sums) = lax.scan(block, state, steps)
+    state, tally = lax.scan(block, state, steps)
     shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
-    return state, Sample(tally, state.side**2, shear_rate, flow.grains, observed_sums)
-
-
-def _observe_snapshot(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:
-    """The result of ``observe`` for the contacts and impulses of one step."""
-    return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
+    return state, Sample(tally, state.side**2, shear_rate, flow.grains)
 
 
 _sample_one_block = jax.jit(_sample_blocks, static_argnames="observe")
@@ -386,9 +382,9 @@ def _sample_with_callback(
 
 def _joined(parts: list[Sample]) -> Sample:
     """One sample from successive samples of the same flow."""
-    sums = ((part.tally, part.observed_sums) for part in parts)
-    tally, observed = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *sums)
-    return replace(parts[-1], tally=tally, observed_sums=observed)
+    tallies = (part.tally for part in parts)
+    tally = jax.tree.map(lambda *x: jnp.asarray(np.concatenate([np.asarray(one) for one in x])), *tallies)
+    return replace(parts[-1], tally=tally)
 
 
 def check_precision(flow: ShearFlow, state: State) -> None:

@@ -1,7 +1,8 @@
 """The arrays of the numba engine, cut from one block of memory.
 
-The handler allocates the block, one for each replica. So the engine needs no runtime of numba.
-That is why an intrinsic makes the arrays, by ``numba.np.arrayobj``: the public ``numba.carray`` needs the runtime.
+The handler allocates the block, one for each replica, unless XLA keeps it for another call. So the engine needs no
+runtime of numba. That is why an intrinsic makes the arrays, by ``numba.np.arrayobj``: the public ``numba.carray`` needs
+the runtime.
 """
 
 # pyright: reportCallIssue=false
@@ -15,14 +16,24 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 from jaxgran.dynamics.numba_engine.compilation import inline_njit
-from jaxgran.dynamics.numba_engine.layout import LANES, WORDS, WORDS_PER_GRAIN, Clusters, Grains, Network, Order, Pairs
+from jaxgran.dynamics.numba_engine.layout import (
+    LANES,
+    SAVED,
+    WORDS,
+    WORDS_PER_GRAIN,
+    Clusters,
+    Grains,
+    Network,
+    Order,
+    Pairs,
+)
 from jaxgran.dynamics.tally import NUMBERS
 
 _PAIR_CAPACITY = 16  # slots of pairs for each grain
 
 
 class Arrays(NamedTuple):
-    """All arrays of the time loop: see ``layout``; ``step_sums`` is (NUMBERS,)."""
+    """All arrays of the time loop: see ``layout``; step_sums: (NUMBERS,); saved: (NUMBERS + SAVED,), see ``loop``."""
 
     grains: Any
     pairs: Any
@@ -30,6 +41,7 @@ class Arrays(NamedTuple):
     clusters: Any
     order: Any
     step_sums: Any
+    saved: Any
 
 
 def _array_of(kind: types.Type) -> Any:
@@ -139,9 +151,10 @@ def arrays_of(memory, count):
         _unsigned_at(_reserve(memory, count + 2, 4), (count + 2,)),
     )
     step_sums = doubles_at(_reserve(memory, NUMBERS, 8), (NUMBERS,))
+    saved = doubles_at(_reserve(memory, NUMBERS + SAVED, 8), (NUMBERS + SAVED,))
     fits = memory[0] <= end
     for g in range(count if fits else 0):
         network.degree[g] = network.loaded[g] = 0
         network.kicks[g, 0] = network.kicks[g, 1] = 0.0
         clusters.reached[g] = 0
-    return Arrays(grains, pairs, network, clusters, order, step_sums), fits
+    return Arrays(grains, pairs, network, clusters, order, step_sums, saved), fits

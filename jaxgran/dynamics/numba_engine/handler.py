@@ -172,16 +172,19 @@ def _handler(frame, replica, stop):
     if replica == _COUNT:
         return _replicas(args, 4)
     grains = _length(args, 2, 1)
-    room, record = _length(rets, 3, 2), _length(rets, 3, 1)
+    room, record = _length(rets, 4, 2), _length(rets, 4, 1)
     results = doubles_at(_data(rets, 2, replica, RESULTS), (RESULTS,))
-    block = _allocate(8 * (1 + WORDS + WORDS_PER_GRAIN * grains))
+    words = 1 + WORDS + WORDS_PER_GRAIN * grains
+    kept = _length(rets, 3, 1) > 0  # the memory outlasts the call
+    block = _data(rets, 3, replica, words) if kept else _allocate(8 * words)
     if block == 0:
         return _refuse(results)
     memory = integers_at(block, (1,))
     memory[0] = block + 8  # the first free byte is behind this number
     arrays, fits = arrays_of(memory, grains)
     if not fits:  # the bounds in ``layout`` are wrong
-        _release(block)
+        if not kept:
+            _release(block)
         return _refuse(results)
     advance_loop(
         doubles_at(_data(args, 0, replica, 2 * grains), (grains, 2)),
@@ -192,11 +195,12 @@ def _handler(frame, replica, stop):
         doubles_at(_data(rets, 0, replica, 2 * grains), (grains, 2)),
         doubles_at(_data(rets, 1, replica, 2 * grains), (grains, 2)),
         results,
-        doubles_at(_data(rets, 3, replica, room * record), (room, record)),
+        doubles_at(_data(rets, 4, replica, room * record), (room, record)),
         arrays,
         integers_at(stop, (1,)),
     )
-    _release(block)
+    if not kept:
+        _release(block)
     return 0
 
 

@@ -12,9 +12,11 @@ from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import Status
 
 INPUTS = 10  # numbers of a flow and of its advance
-STATUS, TILT, SOLVED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
+STATUS, TILT, SUSPENDED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
 RESULTS = NUMBERS + 4
-WORDS, WORDS_PER_GRAIN = 1024 + NUMBERS, 187  # of eight bytes: bounds of the memory that ``memory`` cuts up
+BETWEEN_LISTS, WITHIN_LIST = 1, 2  # where a suspended loop goes on
+SAVED = 16  # numbers of a suspended loop, behind its sums
+WORDS, WORDS_PER_GRAIN = 1024 + 2 * NUMBERS + SAVED, 187  # of eight bytes: bounds of the memory that ``memory`` cuts up
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains

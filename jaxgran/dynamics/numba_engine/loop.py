@@ -12,6 +12,8 @@ the same sums. It differs in what it visits:
   squared residual that the clusters before it have not used, each may leave the share of its number of contacts.
 - *Renew the calendar.* An impulse changes the entries of the struck grains' pairs, and no others.
 - *Deliver.* At the end of a list the grains are moved to where they are.
+- *Suspend.* Where the records are full, the loop ends as it stands. The next call goes on in the same memory, so the
+  trajectory and its sums are those of one call, to the bit.
 """
 
 import math
@@ -27,6 +29,7 @@ from jaxgran.dynamics.numba_engine.calendar import (
 from jaxgran.dynamics.numba_engine.cluster_solver import solve_cluster
 from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
+    BETWEEN_LISTS,
     CAPACITY,
     EPSILON,
     FAILED,
@@ -39,12 +42,13 @@ from jaxgran.dynamics.numba_engine.layout import (
     RECORDED,
     RESULTS,
     SECOND,
-    SOLVED,
     STATUS,
     STRIKES,
+    SUSPENDED,
     TILT,
     VX,
     VY,
+    WITHIN_LIST,
     Flow,
     X,
     Y,
@@ -60,6 +64,7 @@ from jaxgran.dynamics.numba_engine.near_pairs import (
 from jaxgran.dynamics.numba_engine.network import find_clusters, gather_kicks, make_network, solve_isolated
 from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
 from jaxgran.dynamics.numba_engine.sums import add_contacts, add_flight, add_solve
+from jaxgran.dynamics.tally import NUMBERS
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
@@ -74,16 +79,15 @@ def advance_loop(
     """Advance one replica.
 
     Args:
-      positions, velocities: (grains, 2) as in a State; ``new_positions`` and ``new_velocities`` receive those after,
-        the positions not wrapped.
+      positions, velocities: (grains, 2) as in a State; ``new_positions`` and ``new_velocities`` receive those after.
       radii, masses: (grains,).
       numbers: side, tilt, restitution, timestep, shear rate, tolerance, activation fraction, most iterations of a
-        solve, steps, and whether the contacts of the first step have acted already.
-      results: (RESULTS,) receives the running sums, the status, the tilt, whether the contacts of the step at which the
-        loop ends have acted, and the number of records.
-      records: (room, numbers) receives ``records`` of steps; the loop ends where it is full. Without room it records
-        nothing.
-      arrays: memory of the loop, see ``memory``.
+        solve, steps, and where an earlier call was suspended, 0 to begin.
+      results: (RESULTS,) receives the running sums, the status, the tilt, where the loop is suspended, 0 if it is
+        finished, and the number of records.
+      records: (room, numbers) receives ``records`` of steps; the loop is suspended where they are full, before it
+        delivers anything. Without room it records nothing.
+      arrays: memory of the loop, see ``allocation``; of the earlier call where one was suspended.
       stop: (1,), a number that others set; the loop ends with the status ``failed`` where it is not zero.
     """
     side, tilt, alpha, dt, rate = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
@@ -92,42 +96,55 @@ def advance_loop(
     for n in range(RESULTS):
         results[n] = 0.0
 
-    grains, pairs, network, clusters, order, step_sums = arrays
-    put_in_order(positions, side, tilt, order)
-    largest, finite = _take_grains(positions, velocities, radii, masses, order.given, rate, grains)
+    grains, pairs, network, clusters, order, step_sums, saved = arrays
+    going_on = int(numbers[9])
+    if going_on > 0:
+        for n in range(NUMBERS):
+            results[n] = saved[n]
+        tilt, largest, done, solved, status = _advance_saved(saved[NUMBERS:])
+    else:
+        put_in_order(positions, side, tilt, order)
+        largest, finite = _take_grains(positions, velocities, radii, masses, order.given, rate, grains)
+        # steps until the last search; whether the contacts of the present step have been dealt with
+        done, solved, status = 0, 0, OK if finite else NONFINITE
     widest = max(side / 2 - largest, 1e-3)  # nearest images are unique
     expected = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
     usual = min(max(expected, _NARROWEST_SKIN), widest)
 
-    room, recorded = records.shape[0], 0
-    done, solved = (
-        0,
-        int(numbers[9]),
-    )  # steps until the last search; whether the contacts of the present step have been dealt with
-    status = OK if finite else NONFINITE
-    while done < steps and status < NONFINITE and (room == 0 or recorded + 2 <= room):  # of a list and of contacts
-        fastest = bring_into_cell(grains, side, tilt, rate)
-        kinetic = kinetic_sums(grains, rate)
-        needed = 1.2 * (2 * fastest * (1 + LIFE) + rate * largest) * ahead  # what one step may need
-        found, skin, fits = search(grains, pairs, side, tilt, largest, min(max(needed, usual), widest))
-        loss = skin_loss(fastest, rate, largest + skin)
-        slack = skin - loss * ahead
-        if slack < 0.0 or not fits:
-            status = max(status, CAPACITY)
-        if not loss < math.inf:
-            status = NONFINITE
+    life = LIFE / rate if rate > 0.0 else math.inf
+    room, recorded, suspended = records.shape[0], 0, 0
+    while done < steps and status < NONFINITE:
+        if 0 < room < recorded + 2:  # for a list and for contacts
+            suspended = BETWEEN_LISTS
             break
-        life = LIFE / rate if rate > 0.0 else math.inf
-        horizon = max(min(slack / loss if loss > 0.0 else math.inf, life), dt) + ahead
-        for p in range(found):
-            pairs.listed[p] = p
-        predict_contact_steps(found, 0.0, solved, horizon, flow, grains, pairs)
-        blocks = clear_calendar(found, pairs)
+        if going_on == WITHIN_LIST:
+            fresh = False
+            k, found, skin, loss, slack, fastest, kinetic = _list_saved(saved[NUMBERS:])
+            blocks = clear_calendar(found, pairs)
+            going_on = 0
+        else:
+            k, fresh = 0, True  # steps since the search
+            fastest = bring_into_cell(grains, side, tilt, rate)
+            kinetic = kinetic_sums(grains, rate)
+            needed = 1.2 * (2 * fastest * (1 + LIFE) + rate * largest) * ahead  # what one step may need
+            found, skin, fits = search(grains, pairs, side, tilt, largest, min(max(needed, usual), widest))
+            loss = skin_loss(fastest, rate, largest + skin)
+            slack = skin - loss * ahead
+            if slack < 0.0 or not fits:
+                status = max(status, CAPACITY)
+            if not loss < math.inf:
+                status = NONFINITE
+                break
+            horizon = max(min(slack / loss if loss > 0.0 else math.inf, life), dt) + ahead
+            for p in range(found):
+                pairs.listed[p] = p
+            predict_contact_steps(found, 0.0, solved, horizon, flow, grains, pairs)
+            blocks = clear_calendar(found, pairs)
 
         if room > 0:
-            record_flight(records[recorded], done, solved, tilt, 0.0, rate, grains, order.given)
+            t = k * dt
+            record_flight(records[recorded], done + k, solved, tilt + rate * t, t, rate, grains, order.given)
             recorded += 1
-        k, fresh = 0, True  # steps since the search
         while True:
             # The next step to visit is that of a contact, the end of the list's life, or that of the advance.
             spare = min(slack / (loss * dt), life / dt - k, MANY) if loss > 0.0 else MANY
@@ -164,19 +181,55 @@ def advance_loop(
             listed = _list_struck(k, hits, found if overfull else contacts, overfull, pairs, network)
             predict_contact_steps(listed, t, k + 1, horizon, flow, grains, pairs)
             if 0 < room == recorded:
+                suspended = WITHIN_LIST
                 break
 
+        if suspended > 0:
+            _save_list(k, found, skin, loss, slack, fastest, kinetic, saved[NUMBERS:])
+            break
         done += k
         tilt += rate * k * dt
         tilt -= math.floor(tilt + 0.5)
         _move(k * dt, grains)
 
-    _deliver(order.given, rate, grains, new_positions, new_velocities)
-    if done == 0 and recorded < 2:  # as it was, to the bit
+    if suspended > 0:
+        for n in range(NUMBERS):
+            saved[n] = results[n]
+        _save_advance(tilt, largest, done, solved, status, saved[NUMBERS:])
+    elif done > 0:
+        _deliver(order.given, side, tilt, rate, grains, new_positions, new_velocities)
+    else:  # as it was, to the bit
         for g in range(count):
-            new_positions[g, 0], new_positions[g, 1] = positions[g, 0], positions[g, 1]
+            new_positions[g, 0], new_positions[g, 1] = _wrapped(positions[g, 0], positions[g, 1], side, tilt)
             new_velocities[g, 0], new_velocities[g, 1] = velocities[g, 0], velocities[g, 1]
-    results[STATUS], results[TILT], results[SOLVED], results[RECORDED] = status, tilt, solved, recorded
+    results[STATUS], results[TILT], results[SUSPENDED], results[RECORDED] = status, tilt, suspended, recorded
+
+
+@inline_njit
+def _save_advance(tilt, largest, done, solved, status, saved):
+    """Save the numbers of a suspended advance."""
+    saved[0], saved[1], saved[2], saved[3], saved[4] = tilt, largest, done, solved, status
+
+
+@inline_njit
+def _advance_saved(saved):
+    """The numbers of ``_save_advance``."""
+    return saved[0], saved[1], int(saved[2]), int(saved[3]), int(saved[4])
+
+
+@inline_njit
+def _save_list(k, found, skin, loss, slack, fastest, kinetic, saved):
+    """Save the numbers of a list that is in use."""
+    saved[5], saved[6], saved[7], saved[8] = k, found, skin, loss
+    saved[9], saved[10] = slack, fastest
+    saved[11], saved[12], saved[13] = kinetic
+
+
+@inline_njit
+def _list_saved(saved):
+    """The numbers of ``_save_list``."""
+    kinetic = saved[11], saved[12], saved[13]
+    return int(saved[5]), int(saved[6]), saved[7], saved[8], saved[9], saved[10], kinetic
 
 
 @njit
@@ -283,10 +336,23 @@ def _move(t, grains):
 
 
 @njit
-def _deliver(places, rate, grains, new_positions, new_velocities):
-    """Positions and peculiar velocities of the grains, in the order in which they were given."""
+def _deliver(places, side, tilt, rate, grains, new_positions, new_velocities):
+    """Positions, in the cell, and peculiar velocities of the grains, in the order in which they were given."""
     motion = grains.motion
     for g in range(places.size):
         given = places[g]
-        new_positions[given, 0], new_positions[given, 1] = motion[g, X], motion[g, Y]
+        new_positions[given, 0], new_positions[given, 1] = _wrapped(motion[g, X], motion[g, Y], side, tilt)
         new_velocities[given, 0], new_velocities[given, 1] = motion[g, VX] - rate * motion[g, Y], motion[g, VY]
+
+
+@inline_njit
+def _wrapped(x, y, side, tilt):
+    """The image of a position that has x and y in [0, L), as by ``model.cell.wrap``.
+
+    Where XLA does this, its rounding depends on the program around it.
+    """
+    rows = np.floor(y / side)
+    rows = rows + 1.0 if y - rows * side >= side else rows
+    x, y = x - rows * tilt * side, y - rows * side
+    x = x - side * np.floor(x / side)
+    return 0.0 if x >= side else x, 0.0 if y < 0.0 else y

@@ -2,7 +2,8 @@
 
 A record is a row of numbers: its step, whether contacts act in it, how many there are, and the tilt; then x, y, c_x and
 c_y of every grain before the contacts act; then i, j, n_x, n_y, u, distance and impulse of every contact. Positions are
-not wrapped. A list of near pairs begins with a record without contacts, so no flight outlasts a list unseen.
+not wrapped. A list of near pairs, and a call that goes on in one, begin with a record without contacts. So no flight
+outlasts a list unseen.
 """
 
 import math

@@ -1,0 +1,79 @@
+"""What a user's function observes: it runs in every time step of a sample, and is checked and identified before."""
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxgran.contact.network import Contacts
+from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.engine import Numerics
+from jaxgran.dynamics.observed_advance import advance_observed
+from jaxgran.dynamics.observer import nothing_observed, without_contacts
+from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
+from jaxgran.dynamics.tally import Tally
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
+from jaxgran.model.status import Status
+
+Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
+
+
+def advance_and_observe(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None
+) -> tuple[State, Tally]:
+    """``advance``, with the sums of what a function observes in ``Tally.observed``."""
+    if observe is None:
+        return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+    end, tally, sums = advance_observed(flow, numerics, state, steps, partial(_observe_step, observe))
+    return end, replace(tally, observed=sums)
+
+
+def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:
+    """Shape and dtype of the sums of what a function observes in a flow, a pytree of ``jax.ShapeDtypeStruct``.
+
+    Raises:
+      InputError: the function does not return real numbers, or does not sum over contacts.
+    """
+
+    def sums(state: State) -> Any:
+        now = partial(_observe_step, observe, flow, state)
+        return nothing_observed(now, 3 * flow.grains, state.positions.dtype).sums
+
+    return jax.eval_shape(sums, _abstract_state(flow.grains))
+
+
+def digest_of(observe: Observable, flow: ShearFlow) -> str:
+    """A hash of what a function computes in a flow: its jaxpr, the values of the constants in it, and its results."""
+
+    def without(state: State) -> Any:
+        return without_contacts(partial(_observe_step, observe, flow, state), state.positions.dtype)
+
+    jaxpr, results = jax.make_jaxpr(without, return_shape=True)(_abstract_state(flow.grains))
+    text = re.sub(" at 0x[0-9a-f]+", "", f"{jaxpr} {results}")  # addresses of functions
+    digest = hashlib.sha256(text.encode())
+    for constant in jaxpr.consts:
+        digest.update(np.asarray(constant).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _observe_step(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:
+    """The result of ``observe`` for the contacts and impulses of one step."""
+    return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
+
+
+def _abstract_state(grains: int) -> State:
+    """The shapes of a state of so many grains, in JAX's default precision."""
+
+    def array(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+
+    return State(Grains(array(grains), array(grains)), array(grains, 2), array(grains, 2), array(), array())

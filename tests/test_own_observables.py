@@ -1,0 +1,165 @@
+"""A user's observables in a map are averaged like the built-in ones, survive an interruption, and change nothing."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from synthetic import one_sentence
+
+from jaxgran.contact.projected_methods import Jacobi
+from jaxgran.dynamics.engine import Numba, Pallas
+from jaxgran.maps import journal
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.own_observables import RESERVED, identity_of
+from jaxgran.maps.ratio_map import ratio_map
+from jaxgran.maps.results import choices_of, read_dataset
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.checks import InputError
+
+GRAINS = 32
+MAP: dict[str, Any] = {
+    "restitution": (0.5, 0.9),
+    "packing_fraction": (0.7,),
+    "grains": GRAINS,
+    "seeds": 2,
+    "equilibrate": 0.5,
+    "strain": 3.2,  # blocks of 100 time steps: more steps with contacts than the numba engine records in a call
+}
+pytestmark = pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
+
+
+def observe(seen) -> dict:
+    pushes, n = seen.impulses > 0, seen.contacts.normals
+    forces = seen.impulses / seen.timestep
+    return {
+        "contacts_per_grain": 2 * jnp.sum(pushes) / GRAINS,
+        "own_stress": jnp.einsum("c,ca,cb->ab", forces * seen.contacts.distances, n, n) / seen.state.side**2,
+    }
+
+
+@pytest.fixture(scope="module")
+def plain() -> xr.DataTree:
+    return ratio_map(**MAP)
+
+
+@pytest.fixture(scope="module")
+def observed() -> xr.DataTree:
+    return ratio_map(**MAP, observe=observe)
+
+
+def assert_same_variables(data: xr.DataTree, other: xr.DataTree) -> None:
+    """All variables of ``other`` are in ``data``, bit for bit."""
+    for node in other.subtree:
+        for name, variable in node.data_vars.items():
+            np.testing.assert_array_equal(data[node.path][name], variable, err_msg=f"{node.path} {name}")
+
+
+def test_observing_changes_no_bit_of_a_map(observed, plain) -> None:
+    assert_same_variables(observed, plain)
+
+
+def test_what_repeats_a_built_in_average_has_its_values_and_errors(observed) -> None:
+    for end in ("", "_stderr"):
+        own, built_in = observed[f"contacts_per_grain{end}"], observed[f"coordination_number{end}"]
+        np.testing.assert_allclose(own, built_in, rtol=1e-9)
+        own, built_in = observed[f"own_stress{end}"], observed[f"stresses/contact_stress{end}"]
+        np.testing.assert_allclose(own, built_in, rtol=1e-9)
+    np.testing.assert_allclose(observed["seeds/contacts_per_grain"], observed["seeds/coordination_number"], rtol=1e-12)
+    np.testing.assert_allclose(observed["seeds/own_stress"], observed["seeds/contact_stress"], rtol=1e-12)
+
+
+def test_variables_have_the_dimensions_of_what_is_returned(observed) -> None:
+    point = ("packing_fraction", "restitution")
+    assert observed.own_stress.dims == (*point, "own_stress_dim_0", "own_stress_dim_1")
+    assert observed["seeds/own_stress"].dims == (*point, "seed", "own_stress_dim_0", "own_stress_dim_1")
+    assert "units" not in observed.own_stress.attrs
+    interval = observed.contacts_per_grain_ci95
+    np.testing.assert_allclose(interval.sel(error_source="sampling"), 1.96 * observed.contacts_per_grain_stderr)
+    assert interval.sel(error_source=["total", "timestep", "size", "tolerance"]).isnull().all()
+
+
+def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
+    observed, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journal, "SECONDS", 0.0)
+    monkeypatch.setattr(journal, "_WRITING_SHARE", 1e9)
+    folder, output = tmp_path / "map.nc.unfinished", tmp_path / "map.nc"
+    calls = 0
+
+    def cut_off(_: float) -> None:  # in the sample of the second batch
+        nonlocal calls
+        calls += bool(list(folder.glob("done-*")))
+        if calls > 20:
+            raise RuntimeError("cut off")
+
+    with pytest.raises(RuntimeError, match="cut off"):
+        ratio_map(**MAP, observe=observe, output=output, progress=cut_off)
+    assert list(folder.glob("done-*")) and list(folder.glob("journal-*"))
+    for other in (None, lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS}):
+        with pytest.raises(InputError, match=r"has observe 'contacts_per_grain, own_stress: \w{16}', not ") as caught:
+            ratio_map(**MAP, observe=other, output=output, resume=True)
+        assert one_sentence(str(caught.value))
+    steps: list[float] = []
+    data = ratio_map(**MAP, observe=lambda seen: observe(seen), output=output, resume=True, progress=steps.append)
+    sample_and_before = 2 * 4 * (3.2 + 0.5) / 1e-3
+    assert sum(steps) < 0.4 * sample_and_before
+    assert_same_variables(data, observed)
+    assert_same_variables(read_dataset(output), observed)
+    assert_same_variables(ratio_map(**MAP, observe=observe, output=output, resume=True), observed)
+    with pytest.raises(InputError, match=r"has a map with observe 'contacts_per_grain, own_stress: .*' and not None"):
+        ratio_map(**MAP, output=output, resume=True)
+    with pytest.raises(InputError, match="must be a function that is passed to `ratio_map`") as caught:
+        MapSettings(**choices_of(data))
+    assert one_sentence(str(caught.value))
+
+
+def test_what_a_function_computes_counts_and_not_its_place() -> None:
+    def of(function) -> str | None:
+        return identity_of(MapSettings(**MAP, observe=function))
+
+    constant = np.arange(3.0)
+    assert of(observe) == of(lambda seen: observe(seen)) != None  # noqa: E711
+    assert of(lambda _: {"a": constant}) != of(lambda _: {"a": constant + 1})
+    assert of(lambda _: {"a": constant}) != of(lambda _: {"b": constant})
+    assert identity_of(MapSettings(**MAP)) is None
+
+
+REFUSED = {
+    words: function
+    for function, words in [
+        (3, "must be a function that is passed to `ratio_map`, or None, not 3"),
+        (lambda seen: seen.state.side, "must return a dictionary of numbers or arrays by name"),
+        (lambda _: {}, "a dictionary of numbers"),
+        (lambda _: {"a": {"b": 1.0}}, "must return a dictionary"),
+        (lambda _: {"a": "much"}, "must return real numbers, not 'much'"),
+        (lambda seen: {"a": seen.impulses}, "must return sums over the contacts"),
+        (lambda _: {"of all": 1.0}, "names without spaces and signs, not .'of all'."),
+        (lambda _: {"pressure": 1.0}, "names that a map does not have, not 'pressure'"),
+        (lambda _: {"a": 1.0, "a_stderr": 1.0}, "names that a map does not have, not 'a_stderr'"),
+        (lambda _: {"a": np.ones(2), "a_dim_0": 1.0}, "names that a map does not have, not 'a_dim_0'"),
+    ]
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        ratio_map(**MAP, observe=REFUSED[words])
+    assert one_sentence(str(caught.value))
+
+
+def test_an_engine_that_cannot_observe_is_refused() -> None:
+    with pytest.raises(InputError, match="not pallas"):
+        MapSettings(**MAP, engine=Pallas(), observe=observe)
+    with pytest.raises(InputError, match="with the solver jacobi, not numba"):
+        MapSettings(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)
+
+
+def test_no_name_of_a_map_is_free() -> None:
+    settings = MapSettings(**{**MAP, "grains": (32, 64), "timestep": (1e-3, 1e-4), "snapshots": True})
+    data = map_dataset(settings, {}, {})
+    names = {*data.children, *data.dims, *data.coords, *data.data_vars}
+    names |= {name for group in data.children.values() for name in (*group.dims, *group.coords)}
+    assert {*names, *data["seeds"].data_vars} <= RESERVED
