@@ -49,6 +49,7 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "heaviside": lambda x, _: jg.heaviside(x).second_moment,
     "grid": lambda x, _: jg.grid(x, 3),
     "fields_at": lambda x, _: jg.fields_at(seen(), jnp.asarray([[1.0, 1.2]]), jg.gaussian(x)),
+    "jax_md_space": lambda x, state: jg.jax_md_space(replace(state, tilt=x))[2],
     "solve_contacts": lambda x, _: jg.solve_contacts(PAIR, x).velocities,
     "contact_residuals": lambda x, _: jg.contact_residuals(PAIR, x * jnp.ones(2)).natural_map,
     "predict": lambda x, _: jg.predict(known_closure(), x, 0.7),
@@ -75,7 +76,18 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 # Classes, and what takes datasets and files.
 WITHOUT_ARRAYS = {
     *("ContactNetwork", "ContactResiduals", "ContactSolution", "DelassusProblem", "FisherInformation", "TrackNoise"),
-    *("Closure", "Cooling", "Fields", "Grains", "InputError", "RestitutionFit", "ShearFlow", "Snapshot", "State"),
+    *(
+        "JaxMdSpace",
+        "Closure",
+        "Cooling",
+        "Fields",
+        "Grains",
+        "InputError",
+        "RestitutionFit",
+        "ShearFlow",
+        "Snapshot",
+        "State",
+    ),
     *("Status", "Tally", "Trajectory", "averages_against_grains", "cluster_shares", "dominating_errors"),
     *(
         "enable_cache",
