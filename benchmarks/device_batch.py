@@ -19,10 +19,10 @@ import jaxgran as jg
 from benchmarks import rival_numba
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, select_engine
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, in_lockstep, select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
-from jaxgran.sampling.batch import advance_batch, for_replicas, in_lockstep, replicated
+from jaxgran.sampling.batch import advance_batch, for_replicas, replicated
 
 POINTS, TIMESTEPS = ((0.9, 0.56), (0.5, 0.7), (0.5, 0.8)), (1e-3, 1e-4)
 REPLICAS, GRAINS, STRAIN = 1000, 256, 0.2

@@ -150,6 +150,12 @@ BENCHMARKS = (
         (Option("--grains", "one flow of so many grains, printed as JSON", int),),
     ),
     Benchmark(
+        "many_replicas",
+        "Which way to advance many replicas is the fastest, and what does it take to compile and to hold?",
+        (8, 3),
+        ("many_replicas.json",),
+    ),
+    Benchmark(
         "device_batch",
         "How many replica-steps per second does this device make, beside one core of the numba loop?",
         (3, 1),

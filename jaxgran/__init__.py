@@ -6,9 +6,27 @@
     state, sample = jg.sample(flow, state, strain=5.0)
     sample.force_ratio, sample.errors()["force_ratio"]
 
+Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis. A grid of α and ν, as in the README:
+
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    import jaxgran as jg
+
+    alphas, nus = (x.ravel() for x in jnp.meshgrid(jnp.array([0.3, 0.6, 0.9]), jnp.array([0.5, 0.6, 0.7])))
+    flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
+    states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # packed, heated, sheared until steady
+    states, samples = jg.sample(flows, states, strain=5.0)  # or jax.vmap(jg.sample, (0, 0, None))(flows, states, 5.0)
+    for row in zip(alphas, nus, samples.force_ratio, samples.errors()["force_ratio"]):
+        print("α = {:.1f}, ν = {:.1f}: {:.3f} ± {:.3f}".format(*row))
+
+``sample``, ``advance``, ``snapshot_series`` and ``cooling`` take a batch directly, and so do ``prepare`` and ``heated``
+with a batch of keys. ``jax.vmap`` and ``jax.lax.map`` of them do the same. Leave ``engine`` out: on a processor the
+numba engine is then chosen, also under a plain ``vmap``, and nothing is faster there. A ``vmap`` with
+``axis_name="replica"`` takes the engine ``Jax`` in lockstep, which is for accelerators, and far slower on a processor.
+
 Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pairs,)``, of contacts ``(contacts,)``.
-Every function of an engine is written for one replica. A batch adds a leading ``(replicas,)`` axis, with ``jax.vmap``
-and ``axis_name="replica"``, or with ``jax.lax.map``.
 
 Units: mean grain diameter σ, mass m of a grain of that diameter, and the time unit t of the shear rate (t = 1/γ̇ at the
 default γ̇ = 1).

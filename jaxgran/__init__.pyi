@@ -2,6 +2,7 @@
 
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
+from .analysis.jax_md_space import JaxMdSpace, jax_md_space
 from .cache.folder import enable_cache
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
@@ -66,6 +67,7 @@ __all__ = [
     "JacobiCount",
     "JacobiDiagonal",
     "Jax",
+    "JaxMdSpace",
     "Nesterov",
     "Numba",
     "Page",
@@ -102,6 +104,7 @@ __all__ = [
     "grid",
     "heated",
     "heaviside",
+    "jax_md_space",
     "lucy",
     "own_grains",
     "pack",

@@ -284,8 +284,6 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "pack of a batch": (lambda: jg.pack(BATCH, KEY), "one ShearFlow, and this is a batch"),
     "prepare of a batch": (lambda: jg.prepare(BATCH, KEY), r"single ones or arrays \(1,\), one for each key"),
     "prepare with a table of keys": (lambda: jg.prepare(flow(), jax.random.split(KEY, (2, 2))), "a random key such as"),
-    "sample of a batch": (lambda: jg.sample(BATCH, SEEN.state, 1.0), "one ShearFlow, and this is a batch"),
-    "sample of a batch of states": (lambda: jg.sample(flow(), SEVERAL.state, 1.0), f"one State of {GRAINS} grains"),
     "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
     "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "take one of a series by"),
     "fields at a point": (lambda: jg.fields_at(SEEN, np.zeros(2), jg.lucy(1.0)), r"\(points, 2\) of finite numbers"),

@@ -13,7 +13,7 @@ from synthetic import one_sentence
 import jaxgran as jg
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics import advance
-from jaxgran.dynamics.engine import Numerics, _warn_once, select_engine, solver_in_use
+from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine, solver_in_use
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
@@ -174,7 +174,7 @@ def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
 def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) -> None:
     program = batch.batch_program(lambda x: jnp.full_like(x, in_batch()))
     for engine, together in ((None, False), (jg.Numba(), False), (jg.Jax(), True)):
-        found = program(jnp.ones(2), lockstep=batch.in_lockstep(engine))
+        found = program(jnp.ones(2), lockstep=in_lockstep(engine))
         np.testing.assert_array_equal(found, together)
 
 

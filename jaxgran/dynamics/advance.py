@@ -16,6 +16,7 @@ from jaxtyping import Array, Int
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Jax, Numba, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, advance_by_jax, ended, require_advance
+from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
@@ -35,21 +36,25 @@ def advance(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Tally]:
-    """Advance one replica by a number of time steps.
+    """Advance a flow, or a batch of flows, by a number of time steps; ``jit``, ``vmap`` and ``lax.map`` apply.
+
+    A batch is a flow or a state whose arrays have a leading (replicas,) axis, as in ``sample``.
 
     Without an ``engine`` a compiled one is taken on a processor or an NVIDIA GPU, if the solver is a
     ``BarzilaiBorwein`` and ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. All
-    engines solve the same steps to the same tolerance. On a processor ``Numba`` is typically 5 to 7 times faster than
-    ``Jax``. The engines differ by rounding and within the tolerance only.
+    engines solve the same steps to the same tolerance, and differ by rounding and within the tolerance only. On a
+    processor ``Numba`` takes a tenth or less of the time of ``Jax``, and far less of that of a ``vmap`` of ``Jax``; the
+    page "Many replicas at once" of the documentation has measurements. This function does not compile itself: call it
+    within ``jax.jit``.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
     (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
     event, about 0.7 kB a grain. It computes contacts and impulses again in the backward pass.
 
     Args:
-      flow: parameters of one replica.
-      state: the flow at the beginning.
-      steps: number of time steps, traced.
+      flow: parameters of the state; or those (replicas,) of a batch.
+      state: the flow at the beginning; or a batch of states.
+      steps: number of time steps, traced; for a batch also (replicas,).
       free_flight: True jumps over steps without an approaching contact; False visits every step. The trajectory is the
         same.
       events: number of visited steps, static, for a loop of fixed length; ``steps + 1`` is always enough, and
@@ -60,18 +65,29 @@ def advance(
       engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for an automatic choice, see ``dynamics.engine``.
 
     Returns:
-      The state after the last step, and the tally of the steps. A replica with a number that is not finite stops with
-      the status ``nonfinite``. On a GPU, a replica whose lists are full stops with ``capacity``.
+      The state after the last step, and the tally of the steps, with a leading (replicas,) axis for a batch. A replica
+      with a number that is not finite stops with the status ``nonfinite``. On a GPU, a replica whose lists are full
+      stops with ``capacity``.
 
     Raises:
-      InputError: the engine cannot do this, or a derivative in reverse mode lacks ``events``.
+      InputError: the axes of a batch differ, the engine cannot do this, or a derivative in reverse mode lacks
+        ``events``.
     """
-    require_advance(flow, state, steps)
     numerics = checked_numerics(solver, engine)
+    options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
+    option = " and ".join(name for name, given in options.items() if given)
+    if batch := batch_of(flow, state, steps):
+        for one in replicas_to_check(batch):
+            require_advance(*one)
+
+        def advance_one(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
+            return advance(flow, state, steps, free_flight, events, moving_contacts, solver=solver, engine=engine)
+
+        return over_replicas(advance_one, numerics, batch, option)
+    require_advance(flow, state, steps)
     if events is None:
         flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
-    options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
-    selected = select_engine(flow, numerics, state, " and ".join(name for name, given in options.items() if given))
+    selected = select_engine(flow, numerics, state, option)
     if isinstance(selected, Jax):
         return advance_by_jax(flow, numerics.solver, state, steps, free_flight, events, moving_contacts)
     compiled = advance_by_numba if isinstance(selected, Numba) else advance_by_pallas

@@ -176,6 +176,15 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     raise InputError(f"engine must be jax or chosen automatically {where}, not {engine.name}: {reason}.")
 
 
+def in_lockstep(engine: Engine | None = None) -> bool:
+    """Whether the replicas of a batch advance together: on an accelerator, and with the engine ``Jax`` on any device.
+
+    The batch is then one array program and waits for its slowest replica. On a processor an automatic choice of the
+    engine advances one replica after another, which is faster, also where it selects ``Jax``.
+    """
+    return isinstance(engine, Jax) or jax.default_backend() != "cpu"
+
+
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
     """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in all of them.
 

@@ -6,9 +6,11 @@ then fly freely for dt (``flown``). A contact force is the impulse over dt.
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -19,8 +21,9 @@ from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.collision import contacts_now
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
+from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
 from jaxgran.model.cell import remap_tilt, wrap
-from jaxgran.model.checks import require_whole
+from jaxgran.model.checks import require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 
@@ -79,27 +82,48 @@ def snapshot_series(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Snapshot]:
-    """Shear a flow and take snapshots at equal intervals of strain; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Shear a flow, or a batch of flows, and take snapshots at equal intervals of strain; ``jit`` and ``vmap`` apply.
 
     Args:
-      flow: parameters of the state.
-      state: the flow at the beginning, usually from ``prepare``.
-      strain: total strain, rounded to whole time steps. A new value does not recompile.
+      flow: parameters of the state; or those (replicas,) of a batch, as in ``sample``.
+      state: the flow at the beginning, usually from ``prepare``; or a batch of states.
+      strain: total strain, rounded to whole time steps; for a batch also (replicas,). A new value does not recompile.
       count: number of snapshots, static. The first is taken after a strain of ``strain / count``. With a strain of
         ``count`` time steps, there is a snapshot of every step.
       solver, engine: as in ``advance``; the solver also solves the contacts of the snapshots.
 
     Returns:
-      The final state, which is that of the last snapshot, and the snapshots with a leading (times,) axis.
+      The final state, which is that of the last snapshot, and the snapshots with a leading (times,) axis; before it
+      is that of the replicas of a batch.
 
     Raises:
-      InputError: (a ValueError) the strain is not a positive number, is shorter than one time step a snapshot, or is
-        longer than 2**31 - 1 time steps; or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ; the strain is not a positive number, is shorter than one
+        time step a snapshot, or is longer than 2**31 - 1 time steps; or the engine cannot do this.
     """
+    numerics = checked_numerics(solver, engine)
+    require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    if batch := batch_of(flow, state, strain):
+        for one in replicas_to_check(batch):
+            _require_series(count, *one)
+        return _snapshot_series_of_replicas(count, numerics, *batch)
+    _require_series(count, flow, state, strain)
+    return _snapshot_series(flow, numerics, state, strain, count)
+
+
+def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> None:
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_GRAIN_SNAPSHOTS // flow.grains, "as memory is limited")
     require_strain(flow, strain, count)
-    return _snapshot_series(flow, checked_numerics(solver, engine), state, strain, count)
+
+
+@partial(jax.jit, static_argnums=0)
+def _snapshot_series_of_replicas(
+    count: int, numerics: Numerics, flow: ShearFlow, state: State, strain: Array
+) -> tuple[State, Snapshot]:
+    def one(flow: ShearFlow, state: State, strain: Array) -> tuple[State, Snapshot]:
+        return _snapshot_series(flow, numerics, state, strain, count)
+
+    return over_replicas(one, numerics, (flow, state, strain))
 
 
 @partial(jax.jit, static_argnames="count")

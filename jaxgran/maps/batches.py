@@ -9,11 +9,11 @@ from typing import Literal
 
 import jax
 
+from jaxgran.dynamics.engine import in_lockstep
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.batch import in_lockstep
 
 _LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs

@@ -5,9 +5,11 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxgran.model.batches import replica_of
 from jaxgran.model.checks import InputError, concrete_or_none, require, require_number, require_whole, short_repr
 from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS, Activation
 from jaxgran.model.display import Row, display_methods
@@ -25,10 +27,11 @@ class ShearFlow:
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
     The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
-    ``grains`` is static. All other fields are traced: changing them recompiles nothing, and a batch of flows is one
-    ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis. JAX traces the number θ of ``activation``, so the
-    flow that a transformed function receives has θ in that field. How a flow is solved is no part of it: see the
-    arguments ``solver`` and ``engine`` of ``sample``.
+    ``grains`` is static. All other fields are traced: changing them recompiles nothing. A batch of flows is one
+    ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis; numbers that are the same for all are broadcast,
+    and ``flows[0]`` is the first of them. JAX traces the number θ of ``activation``, so a batch, and the flow that a
+    transformed function receives, have θ in that field. How a flow is solved is no part of it: see the arguments
+    ``solver`` and ``engine`` of ``sample``.
 
     ================  =================  ===============================================================
     field             unit               meaning
@@ -44,7 +47,13 @@ class ShearFlow:
     ================  =================  ===============================================================
 
     Raises:
-      InputError: (a ValueError) a number is outside its range; traced numbers are not checked.
+      InputError: (a ValueError) a number is outside its range, or arrays differ in shape; the values of traced numbers
+        are not checked.
+
+    Examples:
+      >>> flows = ShearFlow(grains=64, restitution=np.array([0.5, 0.9]), packing_fraction=0.6, timestep=1e-3)
+      >>> flows.packing_fraction.tolist(), float(flows[1].restitution)
+      ([0.6, 0.6], 0.9)
     """
 
     grains: int = field(metadata={"static": True})
@@ -71,6 +80,12 @@ class ShearFlow:
             too_long = timestep is not None and shear_rate is not None and np.any(timestep * shear_rate > 0.1)
         if too_long:
             raise InputError(f"timestep must be at most 0.1 / shear_rate, not {short_repr(self.timestep)}.")
+        if shapes:
+            _broadcast(self, shapes[0])
+
+    def __getitem__(self, replica: Any) -> "ShearFlow":
+        """The flow of one replica of a batch, or of several by a slice or a list."""
+        return replica_of(self, replica, np.shape(self.restitution))
 
     @property
     def activation_fraction(self) -> float | jax.Array:
@@ -84,6 +99,18 @@ _STATIC_FIELDS = tuple(f.name for f in fields(ShearFlow) if f.metadata.get("stat
 
 def _traced(flow: ShearFlow, name: str) -> Any:
     return flow.activation_fraction if name == "activation" else getattr(flow, name)
+
+
+def _broadcast(flow: ShearFlow, shape: tuple[int, ...]) -> None:
+    """Give every number of a batch its axis of replicas, in the precision of those that have it already."""
+    numbers = {name: _traced(flow, name) for name in _TRACED_FIELDS}
+    kind = jnp.result_type(*(value for value in numbers.values() if np.ndim(value)))
+    kind = kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float)
+    for name, value in numbers.items():
+        if np.ndim(value) == 0:
+            traced = isinstance(value, Tracer)
+            repeated = jnp.broadcast_to(value, shape) if traced else np.broadcast_to(np.asarray(value, kind), shape)
+            object.__setattr__(flow, name, repeated)
 
 
 def _unflatten(static: tuple, traced: Iterable) -> ShearFlow:
@@ -149,8 +176,13 @@ def _require_flows(flow: Any) -> None:
         raise InputError(f"flow must be a ShearFlow, not {short_repr(flow)}.")
 
 
+def is_batch(flow: Any) -> bool:
+    """Whether this is a ShearFlow whose numbers have an axis of replicas."""
+    return isinstance(flow, ShearFlow) and any(np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS)
+
+
 def require_flow(flow: Any) -> None:
     """Raise an InputError unless this is a single ShearFlow, not a batch."""
     _require_flows(flow)
-    if any(np.ndim(getattr(flow, name)) for name in _TRACED_FIELDS):
+    if is_batch(flow):
         raise InputError("flow must be one ShearFlow, and this is a batch: use jax.vmap or jax.lax.map.")

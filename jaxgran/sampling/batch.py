@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from jaxgran.cache.persistent_jit import persistent_jit
 from jaxgran.dynamics.advance import register_numba
-from jaxgran.dynamics.engine import Engine, Jax, Numerics
+from jaxgran.dynamics.engine import Numerics, in_lockstep
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.tally import Tally
 from jaxgran.dynamics.threads import in_threads
@@ -69,15 +69,6 @@ def for_replicas(numerics: Numerics, count: int) -> Numerics:
         return np.broadcast_to(number.astype(kind), (count, *number.shape))
 
     return jax.tree.map(repeated, numerics)
-
-
-def in_lockstep(engine: Engine | None = None) -> bool:
-    """Whether the replicas of a batch advance together: on an accelerator, and with the engine ``Jax`` on any device.
-
-    The batch is then one array program and waits for its slowest replica. On a processor an automatic choice of the
-    engine advances one replica after another, which is faster, also where it selects ``Jax``.
-    """
-    return isinstance(engine, Jax) or jax.default_backend() != "cpu"
 
 
 def replicated(function: Callable, lockstep: bool) -> Callable:

@@ -22,6 +22,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
+from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, as_array, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
@@ -66,7 +67,7 @@ def cooling(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Cooling]:
-    """Advance a flow without shear and record how it cools; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Advance a flow without shear, or a batch of them, and record how it cools; ``jit`` and ``vmap`` apply.
 
         flow = jg.ShearFlow(256, restitution=0.9, packing_fraction=0.3, timestep=1e-3, shear_rate=0.0)
         state = jg.heated(flow, jax.random.key(0), temperature=1.0)
@@ -78,25 +79,41 @@ def cooling(
     coolings.
 
     Args:
-      flow: parameters of the state, with ``shear_rate`` zero.
-      state: the flow at the beginning, usually from ``heated`` and some collisions at restitution one.
-      times: (times,) increasing times of the record, in t since the beginning, rounded to whole time steps.
+      flow: parameters of the state, with ``shear_rate`` zero; or those (replicas,) of a batch, as in ``sample``.
+      state: the flow at the beginning, usually from ``heated`` and some collisions at restitution one; or a batch.
+      times: (times,) increasing times of the record, in t since the beginning, rounded to whole time steps; the same
+        for all replicas.
       solver, engine: as in ``sample``.
 
     Returns:
       The state at the last of the times, and the record.
 
     Raises:
-      InputError: (a ValueError) the flow is sheared, the state has another packing fraction or polydispersity,
-        the times do not increase by a time step or more, a grain of thermal speed would cross more than a tenth of its
-        diameter in one step, positions cannot resolve a step, or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ, the flow is sheared, the state has another packing fraction
+        or polydispersity, the times do not increase by a time step or more, a grain of thermal speed would cross more
+        than a tenth of its diameter in one step, positions cannot resolve a step, or the engine cannot do this.
     """
+    numerics = checked_numerics(solver, engine)
+    batch = batch_of(flow, state)
+    if batch is None:
+        return waited(_cooling(flow, numerics, state, _require_cooling(times, flow, state)))
+    same_times = [_require_cooling(times, *one) for one in replicas_to_check(batch)]
+    return waited(_cooling_replicas(numerics, *batch, same_times[0]))
+
+
+def _require_cooling(times: ArrayLike, flow: ShearFlow, state: State) -> Array:
+    """The times as an array; InputError unless the state can cool at them."""
     require_state(flow, state)
     require("shear_rate", flow.shear_rate, lambda x: x == 0, "0 in free cooling")
-    times = _require_times(flow, times)
+    found = _require_times(flow, times)
     _require_slow(flow, state)
     require_match(flow, state)
-    return waited(_cooling(flow, checked_numerics(solver, engine), state, times))
+    return found
+
+
+@jax.jit
+def _cooling_replicas(numerics: Numerics, flow: ShearFlow, state: State, times: Array) -> tuple[State, Cooling]:
+    return over_replicas(lambda flow, state: _cooling(flow, numerics, state, times), numerics, (flow, state))
 
 
 @jax.jit

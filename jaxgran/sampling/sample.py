@@ -1,6 +1,6 @@
 """Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow from them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -15,9 +15,10 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
+from jaxgran.dynamics.replicas import batch_of, compiled_for_few_sizes, over_replicas, replicas_to_check
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import in_numpy, replica_of
-from jaxgran.model.checks import InputError, require_untraced, require_whole, short_repr, two_digits
+from jaxgran.model.checks import InputError, require, require_untraced, require_whole, short_repr, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
@@ -264,7 +265,14 @@ def sample(
     solver: ProjectedMethod = DEFAULT_SOLVER,
     engine: Engine | None = None,
 ) -> tuple[State, Sample]:
-    """Shear a flow and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
+    """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
+
+    A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the same for all. Each
+    replica has the results of its own call. These two lines do the same; the first is faster with the engine ``Jax``,
+    and is compiled for 1, 2, 4, 8, … replicas only:
+
+        states, samples = jg.sample(flows, states, 5.0)
+        states, samples = jax.vmap(jg.sample, (0, 0, None))(flows, states, 5.0)
 
     The result of ``observe`` is averaged over **every** time step, in the same run (see ``observer``). A few instants
     do not suffice for contact forces: at a short time step, most instants of a collisional flow have no contact with a
@@ -290,9 +298,10 @@ def sample(
         fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
 
     Args:
-      flow: parameters of the state, with its packing fraction and polydispersity.
-      state: the flow at the beginning, usually from ``prepare``.
-      strain: strain γ̇t to sample, rounded to whole time steps. A new value does not recompile.
+      flow: parameters of the state, with its packing fraction and polydispersity; or those (replicas,) of a batch.
+      state: the flow at the beginning, usually from ``prepare``; or a batch of states.
+      strain: strain γ̇t to sample, rounded to whole time steps; for a batch also (replicas,). A new value does not
+        recompile.
       blocks: number of equal parts of the strain, static; a tally is kept for each.
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is static: each new function,
         such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
@@ -301,34 +310,45 @@ def sample(
         The contacts are those of a step with an approaching contact, before the impulses act. The size of their
         buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
-        One block is then compiled at a time, and JAX transformations do not apply.
+        One block is then compiled at a time, and neither batches nor JAX transformations apply.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
       engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for the fastest that can do this, see ``advance``.
 
     Returns:
-      The final state and the sample.
+      The final state and the sample; those of a batch have a leading (replicas,) axis.
 
     Raises:
-      InputError: (a ValueError) the state has another packing fraction or polydispersity than the flow; the flow is
-        not sheared; the strain is not a positive number, is shorter than one time
-        step a block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the
-        result of ``observe`` is not summed over contacts; or the engine cannot do this.
+      InputError: (a ValueError) the axes of a batch differ; the state has another packing fraction or polydispersity
+        than the flow; the flow is not sheared; the strain is not a positive number, is shorter than one time step a
+        block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the result of
+        ``observe`` is not summed over contacts; or the engine cannot do this.
     """
-    require_state(flow, state)
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
-    require_strain(flow, strain, blocks)
-    require_match(flow, state)
-    check_precision(flow, state)
+    require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
+    batch = batch_of(flow, state, strain)
+    each: Iterable[Any] = replicas_to_check(batch) if batch else [(flow, state, strain)]
+    for one in each:
+        _require_sheared_state(blocks, *one)
     numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
             raise InputError(f"{name} must be a function or None, not {short_repr(function)}.")
     if callback is None:
-        measured = _sample(flow, numerics, state, strain, blocks, observe)
-        return waited(measured)
-    if any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, numerics, state, strain))):
-        raise InputError("callback must be None where a sample is transformed, as by jax.jit or jax.vmap.")
+        if batch is None:
+            return waited(_sample(flow, numerics, state, strain, blocks, observe))
+        program = partial(_sample_replicas, blocks, observe, numerics)
+        return compiled_for_few_sizes(program, numerics, batch)
+    if batch or any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, numerics, state, strain))):
+        raise InputError("callback must be None for a batch, and where a sample is transformed, as by jax.jit.")
     return _sample_with_callback(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback)
+
+
+def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: Any) -> None:
+    """Raise an InputError unless a flow can shear a state by a strain of so many blocks."""
+    require_state(flow, state)
+    require_strain(flow, strain, blocks)
+    require_match(flow, state)
+    check_precision(flow, state)
 
 
 @partial(jax.jit, static_argnames=("blocks", "observe"))
@@ -336,6 +356,16 @@ def _sample(
     flow: ShearFlow, numerics: Numerics, state: State, strain: Array, blocks: int, observe: Observable | None = None
 ) -> tuple[State, Sample]:
     return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _sample_replicas(
+    blocks: int, observe: Observable | None, numerics: Numerics, flow: ShearFlow, state: State, strain: Array
+) -> tuple[State, Sample]:
+    def one(flow: ShearFlow, state: State, strain: Array) -> tuple[State, Sample]:
+        return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
+
+    return over_replicas(one, numerics, (flow, state, strain), "" if observe is None else "observe")
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:

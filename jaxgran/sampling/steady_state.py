@@ -19,28 +19,29 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics
+from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics, in_lockstep
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import key_shape, require_key, require_number, require_untraced
+from jaxgran.model.checks import InputError, key_shape, require, require_key, require_number
 from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
+from jaxgran.model.vmapped_in_python import vmapped_in_python
 from jaxgran.sampling.batch import (
     AdvanceBatch,
     advance_batch,
     advance_on_all_cores,
     batch_program,
     for_replicas,
-    in_lockstep,
     stack,
 )
 from jaxgran.sampling.correlation_strain import (
@@ -74,6 +75,10 @@ _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is 
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
 _LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing before the last chunk
 _LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
+_UNCOMPILED = (
+    "{} cannot be transformed by jax.jit or jax.grad, since it decides in Python: call it before, and pass its state "
+    "to what is transformed."
+)
 
 
 class Batch(NamedTuple):
@@ -98,10 +103,13 @@ def prepare(
 ) -> State:
     """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
 
-    A batch of keys gives as many states, each to rounding that of its own flow and key alone:
+    A batch of keys gives as many states, each to rounding that of its own flow and key alone. ``jax.vmap`` does the
+    same:
 
         flows = jg.ShearFlow(256, restitution=jnp.array([0.5, 0.7]), packing_fraction=0.7, timestep=1e-3)
-        states = jg.prepare(flows, jax.random.split(jax.random.key(0), 2))
+        keys = jax.random.split(jax.random.key(0), 2)
+        states = jg.prepare(flows, keys)
+        states = jax.vmap(jg.prepare)(flows, keys)
         first = states[0]
 
     Args:
@@ -120,9 +128,16 @@ def prepare(
     Raises:
       InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
         diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains, or
-        the engine cannot do this. Or JAX transforms this function, which decides in Python when a flow is steady.
+        the engine cannot do this. Or this function, which decides in Python when a flow is steady, stands within
+        ``jax.jit`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
     """
+    if _is_traced(flow, key, grains):
+
+        def of_batch(flow: ShearFlow, key: Array, grains: Grains | None) -> State:
+            return prepare(flow, key, equilibrate, grains, solver=solver, engine=engine)
+
+        return vmapped_in_python(of_batch, _UNCOMPILED.format("prepare"), flow, key, grains)
     flows, keys, discs, single = _replicas("prepare", flow, key, grains)
     if equilibrate is not None:
         words = "None or a number of at least 0 and at most 1e6"
@@ -218,21 +233,32 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     Args:
       flow: parameters of one flow, sheared or not; or numbers (replicas,) of several flows.
       key: JAX random key; the same key gives the same state. Keys (replicas,) make a batch, as in ``prepare``.
-      temperature: exact value of Σ m c²/(2N), in mσ²/t². Grains of every mass have this temperature on average. The
-        total momentum is zero.
+      temperature: exact value of Σ m c²/(2N), in mσ²/t², of all replicas or (replicas,). Grains of every mass have this
+        temperature on average. The total momentum is zero.
       grains: given discs, see ``own_grains`` and ``prepare``; None for diameters uniform in σ ± ``polydispersity``.
 
     Raises:
-      InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or JAX
-        transforms this function.
+      InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or this
+        function stands within ``jax.jit`` or a derivative.
       RuntimeError: no packing was found.
     """
+    if _is_traced(flow, key, temperature, grains):
+        return vmapped_in_python(heated, _UNCOMPILED.format("heated"), flow, key, temperature, grains)
     flows, keys, discs, single = _replicas("heated", flow, key, grains)
-    require_number("temperature", temperature, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    state, found = _heated(flows, keys, jnp.full(len(keys), temperature, float), discs, lockstep=in_lockstep())
+
+    def accepted(x: np.ndarray) -> Any:
+        return (x > 0) & np.isfinite(x) & (x.shape in ((), (len(keys),) if not single else ()))
+
+    require("temperature", temperature, accepted, "a positive number")
+    temperatures = jnp.broadcast_to(jnp.asarray(temperature, float), len(keys))
+    state, found = _heated(flows, keys, temperatures, discs, lockstep=in_lockstep())
     if not np.all(found):
         raise RuntimeError("no packing without overlap was found: the packing fraction is too high for these grains.")
     return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), state)
+
+
+def _is_traced(*values: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _replicas(
@@ -240,10 +266,10 @@ def _replicas(
 ) -> tuple[ShearFlow, Array, Grains | None, bool]:
     """Flows, keys and given grains with a leading (replicas,) axis, and whether they are those of one replica.
 
-    InputError if the key is not one or several, if the others do not suit it, or if JAX transforms the function.
+    InputError if the key is not one or several, if the others do not suit it, or if JAX compiles the function.
     """
-    within = jnp.zeros(())  # traced inside of ``jax.jit``, whatever the arguments are
-    require_untraced(name, "give it a batch of keys, and numbers (replicas,) of the flow", flow, key, grains, within)
+    if _is_traced(jnp.zeros(())):  # inside of ``jax.jit``, whatever the arguments are
+        raise InputError(_UNCOMPILED.format(name))
     shape = key_shape(key)
     if shape is None or len(shape) > 1 or shape == (0,):
         require_key(key)

@@ -1,0 +1,84 @@
+"""Batches of flows and states: a function of one replica applied to all of them, as their engine does it fastest."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import Tracer
+
+from jaxgran.dynamics.engine import Jax, Numerics, in_lockstep, select_engine
+from jaxgran.dynamics.interruption import waited
+from jaxgran.model.checks import InputError
+from jaxgran.model.control_flow import AXIS
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
+
+Arguments = tuple[Any, ...]  # a flow, a state and numbers
+_DIMENSIONS = (1, 1, 2, 2, 0, 0)  # of the arrays of one state, in the order of its leaves
+
+
+def batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
+    """The arguments of a batch, broadcast to a leading (replicas,) axis; None where flow and state are single ones.
+
+    Raises:
+      InputError: the axes differ in length, or there are several.
+    """
+    if not (isinstance(flow, ShearFlow) and isinstance(state, State)):
+        return None
+    shapes = {*map(np.shape, jax.tree.leaves(flow)), np.shape(state.side)} - {()}
+    if not shapes:
+        return None
+    shapes |= {np.shape(x) for x in numbers} - {()}
+    if len(shapes) > 1 or len(max(shapes)) > 1:
+        raise InputError(
+            "a batch must have one axis of replicas, the same in the flow, the state and all numbers, not those of "
+            f"{', '.join(map(str, sorted(shapes)))}."
+        )
+
+    def with_axis(x: Any, dimensions: int = 0) -> Any:
+        x = jnp.asarray(x, state.side.dtype) if isinstance(x, float) else x if hasattr(x, "ndim") else jnp.asarray(x)
+        return jnp.broadcast_to(x, (*max(shapes), *x.shape)) if x.ndim == dimensions else x
+
+    leaves, structure = jax.tree.flatten(state)
+    states = jax.tree.unflatten(structure, map(with_axis, leaves, _DIMENSIONS))
+    return jax.tree.map(with_axis, flow), states, *map(with_axis, numbers)
+
+
+def replicas_to_check(batch: Arguments) -> Iterator[Any]:
+    """The arguments of each replica; the first ones stand for all where JAX traces them."""
+    leaves = jax.tree.leaves(batch)
+    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+    known = batch if traced else jax.tree.map(np.asarray, batch)
+    for k in range(1 if traced else len(leaves[0])):
+        yield jax.tree.map(lambda x, k=k: x[k], known)
+
+
+def over_replicas(function: Callable, numerics: Numerics, batch: Arguments, option: str = "") -> Any:
+    """The function of one replica for a batch, with the engine that ``select_engine`` takes for it.
+
+    A compiled engine advances the replicas by ``vmap``, and so does the engine ``Jax`` in lockstep, with a named axis.
+    Where it is chosen automatically on a processor, they advance in turn by ``lax.map``, which is faster.
+    """
+    flow, state, *_ = batch
+    if in_lockstep(numerics.engine):
+        return jax.vmap(function, axis_name=AXIS)(*batch)
+    if isinstance(select_engine(flow, numerics, state, option), Jax):
+        return lax.map(lambda one: function(*one), batch)
+    return jax.vmap(function)(*batch)
+
+
+def compiled_for_few_sizes(program: Callable[..., Any], numerics: Numerics, batch: Arguments) -> Any:
+    """``program(*batch)``, compiled for 1, 2, 4, 8, … replicas; the last number of those that fill up is zero.
+
+    Replicas in lockstep are not filled up, since memory is what limits them.
+    """
+    count = len(batch[-1])
+    size = 1 << (count - 1).bit_length()
+    if size == count or in_lockstep(numerics.engine) or any(isinstance(x, Tracer) for x in jax.tree.leaves(batch)):
+        return waited(program(*batch))
+    *others, number = jax.tree.map(lambda x: np.asarray(x)[np.minimum(np.arange(size), count - 1)], batch)
+    filled = waited(program(*others, np.where(np.arange(size) < count, number, 0)))
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[:count]), filled)

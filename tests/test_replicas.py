@@ -1,0 +1,145 @@
+"""A batch of flows has the results of its replicas: called directly, under ``jax.vmap``, and one by one."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flows import GRAINS
+from synthetic import one_sentence
+from test_docs import python_of
+
+import jaxgran as jg
+from jaxgran.dynamics.engine import Numerics
+from jaxgran.dynamics.replicas import over_replicas
+from jaxgran.model.control_flow import in_batch
+from jaxgran.model.state import State
+from jaxgran.sampling import sample as sample_module
+
+ALPHAS, NUS = jnp.asarray([0.3, 0.5, 0.8]), jnp.asarray([0.5, 0.6, 0.7])
+KEYS = jax.random.split(jax.random.key(0), 4)
+FLOWS = jg.ShearFlow(GRAINS, restitution=ALPHAS, packing_fraction=NUS, timestep=1e-3)
+sample = partial(jg.sample, blocks=4)
+
+
+@pytest.fixture(scope="module")
+def states() -> State:
+    return jg.prepare(FLOWS, KEYS[:3], equilibrate=1.0)
+
+
+def assert_same(one: Any, other: Any, but: str = "nothing") -> None:
+    for (path, left), right in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
+        name = jax.tree_util.keystr(path)
+        rtol = 4 * np.finfo(float).eps if but in name else 0
+        np.testing.assert_allclose(left, right, rtol=rtol, atol=0, err_msg=name)
+
+
+def test_numbers_that_are_the_same_for_all_replicas_are_broadcast() -> None:
+    assert {np.shape(leaf) for leaf in jax.tree.leaves(FLOWS)} == {(3,)}
+    assert_same(FLOWS[1], jg.ShearFlow(GRAINS, 0.5, 0.6, 1e-3))
+    assert_same(replace(FLOWS, timestep=1e-4)[2], jg.ShearFlow(GRAINS, 0.8, 0.7, 1e-4))
+    single = jg.ShearFlow(GRAINS, jnp.float32([0.5, 0.6]), 0.6, 1e-3)
+    assert {leaf.dtype for leaf in jax.tree.leaves(single)} == {np.dtype("float32")}
+    of_traced = jax.jit(lambda x: jg.ShearFlow(GRAINS, ALPHAS, x, 1e-3))(0.6)
+    np.testing.assert_array_equal(of_traced.packing_fraction, 0.6)
+
+
+def test_batch_is_sampled_as_under_vmap_and_as_one_by_one(states: State) -> None:
+    """To the bit, but for the energy of waves: vectors of cosines are rounded by their length."""
+    together = sample(FLOWS, states, 0.3)
+    assert_same(together, jax.vmap(sample, (0, 0, None))(FLOWS, states, 0.3))
+    for k in range(3):
+        alone = sample(FLOWS[k], states[k], 0.3)
+        assert_same(jax.tree.map(lambda x, k=k: x[k], together), alone, but="wave_kinetic")
+
+
+def test_what_lacks_the_axis_is_the_same_for_all_replicas(states: State) -> None:
+    three = jax.tree.map(lambda x: jnp.stack([x, x, x]), states[1])
+    flows = replace(FLOWS, packing_fraction=0.6)
+    assert_same(sample(flows, states[1], 0.2), sample(flows, three, 0.2))
+    assert_same(
+        sample(flows[1], three, np.full(3, 0.2)),
+        sample(jax.tree.map(lambda x: x[np.array([1, 1, 1])], flows), three, 0.2),
+    )
+
+
+def test_strains_and_steps_may_differ_between_replicas(states: State) -> None:
+    np.testing.assert_array_equal(sample(FLOWS, states, np.array([0.1, 0.2, 0.3]))[1]._total.steps, [100, 200, 300])
+    np.testing.assert_array_equal(jax.jit(jg.advance)(FLOWS, states, np.array([1, 0, 3]))[1].steps, [1, 0, 3])
+
+
+def test_snapshots_and_cooling_take_a_batch(states: State) -> None:
+    series = partial(jg.snapshot_series, strain=0.02, count=2)
+    assert_same(series(FLOWS, states), jax.vmap(series)(FLOWS, states))
+    cooled = partial(jg.cooling, times=np.array([0.01, 0.02]))
+    flows = replace(FLOWS, shear_rate=0.0)
+    assert_same(cooled(flows, states), jax.vmap(cooled)(flows, states))
+
+
+def test_states_are_prepared_under_vmap_as_by_a_batch_of_keys(states: State) -> None:
+    def prepared(alpha, nu, key):
+        return jg.prepare(jg.ShearFlow(GRAINS, alpha, nu, 1e-3), key, equilibrate=1.0)
+
+    assert_same(jax.vmap(prepared)(ALPHAS, NUS, KEYS[:3]), states)
+    table = jax.vmap(jax.vmap(prepared, (None, 0, 0)), (0, None, 0))(ALPHAS[:2], NUS[:2], KEYS.reshape(2, 2))
+    assert_same(jax.tree.map(lambda x: x[0, 0], table), states[0])
+    assert_same(jax.tree.map(lambda x: x[1, 0], table), jg.prepare(jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3), KEYS[2], 1.0))
+
+
+def test_gases_are_heated_under_vmap_as_by_a_batch_of_keys() -> None:
+    temperatures = jnp.asarray([0.5, 1.0, 2.0])
+    assert_same(jax.vmap(jg.heated)(FLOWS, KEYS[:3], temperatures), jg.heated(FLOWS, KEYS[:3], temperatures))
+
+
+@pytest.mark.parametrize(
+    ("numerics", "together"), [({}, False), ({"engine": jg.Jax()}, True), ({"solver": jg.Jacobi()}, False)]
+)
+def test_only_the_engine_in_jax_by_name_has_the_axis_of_lockstep(states: State, numerics: Any, together: bool) -> None:
+    found = over_replicas(lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states))
+    np.testing.assert_array_equal(found, ALPHAS * float(together))
+
+
+def test_more_replicas_up_to_a_power_of_two_compile_nothing(states: State, monkeypatch: pytest.MonkeyPatch) -> None:
+    traced = []
+    original = sample_module._sample_blocks
+    monkeypatch.setattr(sample_module, "_sample_blocks", lambda *x: (traced.append(x), original(*x))[1])
+    for count in (5, 6, 8, 7):
+        many = np.arange(count) % 3
+        _, found = jg.sample(FLOWS[many], states[many], 0.1, blocks=3)
+        assert found.tally.steps.shape == (count, 3)
+    assert len(traced) == 1
+
+
+MISTAKES = {
+    "flows and states of other numbers": (lambda s: sample(FLOWS, s[:2], 0.1), "one axis of replicas"),
+    "strains of another number": (lambda s: sample(FLOWS, s, np.ones(2)), "one axis of replicas"),
+    "two axes": (lambda s: sample(jax.tree.map(lambda x: x[None], FLOWS), s, 0.1), "one axis of replicas"),
+    "another packing fraction": (lambda s: sample(replace(FLOWS, packing_fraction=0.6), s, 0.1), "must be 0.5, which"),
+    "a strain below zero": (lambda s: sample(FLOWS, s, np.array([0.1, 0.1, -1])), "a positive number"),
+    "a callback": (lambda s: sample(FLOWS, s, 0.1, callback=print), "callback must be None for a batch"),
+    "steps below zero": (lambda s: jg.advance(FLOWS, s, np.array([1, 2, -1])), "a whole number of 0 to"),
+    "one key": (lambda _: jg.prepare(FLOWS, KEYS[0]), "one for each key"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_batches_that_do_not_fit_are_refused_in_one_sentence(mistake: str, states: State) -> None:
+    function, words = MISTAKES[mistake]
+    with pytest.raises(jg.InputError, match=words) as refused:
+        function(states)
+    assert one_sentence(str(refused.value))
+
+
+def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.CaptureFixture) -> None:
+    (example,) = python_of("../README.md")
+    assert len(example.splitlines()) <= 13
+    assert all(line.strip() in jg.__doc__ for line in example.splitlines())
+    assert example.split("import jaxgran as jg\n")[1].strip().splitlines()[:2] == [
+        line for line in python_of("tutorial.md")[2].splitlines() if line.startswith(("alphas", "flows"))
+    ]
+    exec(example, {})
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 9 and lines[0].startswith("α = 0.3, ν = 0.5: 1.0")
