@@ -24,13 +24,15 @@ from jaxgran.sampling.timestep import JAMMING
 def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Dataset:
     """Predict every point of a map by the closure fitted to all others.
 
-    ================  ===============================  ==============================================================
-    data              (packing_fraction, restitution)  as for :func:`fit_closure`, and `shear_stress` with `_stderr`
-    jamming_fraction  ()                               ν_J
-    returns           (packing_fraction, restitution)  the variables below; NaN where a point is not fitted
-    raises            InputError                       fewer than 13 points, or fewer than 3 values of α or of ν
-                                                       when one point is left out
-    ================  ===============================  ==============================================================
+    Args:
+      data: as for :func:`fit_closure`, and `shear_stress` with `_stderr`.
+      jamming_fraction: ν_J.
+
+    Returns:
+      A dataset of the variables below, by packing fraction and restitution; NaN where a point is not fitted.
+
+    Raises:
+      InputError: (a ValueError) fewer than 13 points, or than 3 values of α or of ν when one point is left out.
 
     ==================  =============================================================================================
     variable            meaning; NAME is pressure, shear_stress or force_ratio
