@@ -242,14 +242,6 @@ def assert_derivatives(function, at, along, step=1e-6):
     np.testing.assert_allclose([reverse, forward], (up - down) / (2 * step), rtol=1e-5)
 
 
-def test_cap_returns_the_best_iterate_and_a_status():
-    problem = network_of(0)[0]
-    solutions = [solve_contacts(problem, solver=BarzilaiBorwein(1e-12, cap)) for cap in (5, 10, 20)]
-    assert [int(one.iterations) for one in solutions] == [5, 10, 20]
-    assert {int(one.status) for one in solutions} == {Status.iteration_limit}
-    assert np.all(np.diff([one.residuals.natural_map for one in solutions]) <= 0)
-
-
 def test_unit_of_velocity_and_mass_changes_no_residual_and_no_iteration():
     problem = matrix_problem(5)
     scaled = DelassusProblem(problem.matrix * 2.0**-20, problem.approach * 2.0**30)
