@@ -218,6 +218,32 @@ def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
     assert (nothing.status == NOT_RUN).all()
 
 
+def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: Path) -> None:
+    timesteps = (1e-3, 1e-4)
+    settings = MapSettings(ALPHAS[:1], NUS, grains=64, seeds=SEEDS, timestep=timesteps, strain=2.0)
+    rng = np.random.default_rng(1)
+    keys = [(point, seed) for point in range(4) for seed in range(SEEDS)]
+    results = {key: random_replica(rng, settings, Status.deep_overlap if key[0] == 2 else Status.ok) for key in keys}
+    data = map_dataset(settings, results, {})
+    point = ("timestep", "packing_fraction", "restitution")
+    for name in OBSERVABLES:
+        tail = ("axis_a", "axis_b") if name in TENSORS else ()
+        assert data[path_of(name)].dims == data[f"{path_of(name)}_stderr"].dims == (*point, *tail)
+        assert data["seeds"][name].dims == (*point, "seed", *tail)
+    assert data.status.dims == point
+    for name in ("seeds/status", "seeds/equilibration_strain"):
+        assert data[name].dims == (*point, "seed")
+    for (k, seed), replica in results.items():
+        there = data.sel(timestep=timesteps[k // 2], packing_fraction=NUS[k % 2], restitution=ALPHAS[0])
+        np.testing.assert_allclose(there["seeds/pressure"][seed], replica.sample.averages["pressure"], rtol=1e-12)
+        assert there.status == (Status.deep_overlap if k == 2 else Status.ok)
+    assert data.attrs["timestep"] == data.timestep.values.tolist() == list(timesteps)
+    assert data.timestep.attrs["reduced_unit"] == "1 / shear rate"
+    few = with_variables(data, *FEW)
+    write_dataset(few, tmp_path / "map.nc")
+    assert read_dataset(tmp_path / "map.nc").equals(few)
+
+
 def test_a_list_of_one_time_step_keeps_its_dimension() -> None:
     data = map_dataset(MapSettings(ALPHAS, NUS, grains=64, timestep=(1e-3,), strain=2.0), {}, {})
     assert data.force_ratio.sizes == {"timestep": 1, "packing_fraction": 2, "restitution": 2}
