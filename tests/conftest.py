@@ -5,12 +5,14 @@ caches. Both folders may be deleted at any time.
 """
 
 import os
+import sys
 from pathlib import Path
 
 FOLDER = os.environ.get("JAXGRAN_TEST_CACHE") or Path(__file__).parents[1] / ".pytest_cache" / "jaxgran"
 os.environ["XDG_CACHE_HOME"] = str(FOLDER)  # also for the processes that tests start
 # Most of the time of a run is compilation, which takes half as long with less optimisation.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+sys.modules["colorama"] = None  # with it numba replaces sys.stderr while it compiles
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets it, and tables would take that width
 
 import hypothesis  # noqa: E402

@@ -1,5 +1,9 @@
 """Flows of ``GRAINS`` grains, the number that tests share, and when two runs are the same."""
 
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -23,6 +27,20 @@ def flow_of(packing_fraction=0.6, **change) -> ShearFlow:
     """A flow of the shared number of grains."""
     numbers = {"restitution": 0.5, "timestep": 1e-3}
     return ShearFlow(GRAINS, packing_fraction=packing_fraction, **{**numbers, **change})
+
+
+def stacked(trees: list) -> Any:
+    """A batch of replicas."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def replica(batch: Any, k: int) -> Any:
+    """One replica of a batch."""
+    return jax.tree.map(lambda leaf: leaf[k], batch)
+
+
+def assert_same_bits(one: Any, other: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def assert_same_state(one, two, atol: float):

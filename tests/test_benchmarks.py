@@ -6,15 +6,13 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from observed import RESTITUTION, noisy, tracks
 
-import jaxgran as jg
 from benchmarks import __main__ as door
-from benchmarks import fit_design, fit_map, fit_methods, fit_rivals, output, speed_vs_accuracy, timestep_study
+from benchmarks import fit_rivals, output, speed_vs_accuracy, timestep_study
 from benchmarks.output import Output
 from benchmarks.registry import BENCHMARKS
 
@@ -100,25 +98,6 @@ def test_a_full_run_is_refused_from_a_changed_tree(
     assert not runs[2].hardware["commit"].endswith("-dirty")
 
 
-def test_uncommitted_changes_are_those_beside_the_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def git(*words: str) -> None:
-        subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True)
-
-    monkeypatch.setattr(output, "ROOT", tmp_path)
-    assert output.uncommitted() == []  # no checkout
-    folder = tmp_path / "benchmarks" / "results"
-    folder.mkdir(parents=True)
-    (tmp_path / "code.py").write_text("1\n")
-    git("init", "--quiet")
-    git("add", ".")
-    git("commit", "--quiet", "--message", "first")
-    (folder / "paper.json").write_text("{}\n")
-    assert output.uncommitted() == []
-    (tmp_path / "code.py").write_text("2\n")
-    (tmp_path / "more.py").write_text("3\n")
-    assert sorted(output.uncommitted()) == ["code.py", "more.py"]
-
-
 def test_results_say_what_they_were_measured_with_and_quick_ones_have_names_of_their_own(tmp_path: Path) -> None:
     made = {"processor": "one", "commit": "abc"}
     for quick, name in ((False, "paper"), (True, "paper_quick")):
@@ -169,64 +148,3 @@ def test_other_methods_find_the_restitution_of_tracked_discs() -> None:
     restitution, tried = fit_rivals.by_simulations(pairs, noise, 1e-9, window=8, every=8)
     assert abs(restitution - RESTITUTION) < 5e-3
     assert tried > 5
-
-
-def test_charts_of_fits_show_every_point_with_a_result_and_no_other() -> None:
-    row = {
-        "restitution": 0.3,
-        "packing_fraction": 0.6,
-        "camera": "steady",
-        "fits": 4,
-        "held": 3,
-        "coverage": (0.3, 0.95),
-    }
-    row |= {"bias_in_errors": -1.0, "spread_in_errors": 1.0, "rejected": 1.0, "collisions": 3.0}
-    figure = fit_map.draw([row, row | {"fits": 0}, row | {"camera": "quicker"}])
-    share, bias, left_out = figure.axes
-    assert [len(axes.containers) for axes in (share, bias)] == [2, 2]
-    assert [line.get_ydata()[0] for line in left_out.lines if len(line.get_ydata())] == [0.25, 0.25]
-
-    done = {"restitution": 0.6, "velocity_noise": 0.01, "position_noise": 1e-4, "interval": 0.005, "seconds": 1.0}
-    done |= {"error": 1e-3, "error_stderr": 1e-4}
-    name, other = list(fit_methods.STYLES)[:2]
-    rows = [done | {"method": name, "frames": n} for n in (20, 50)]
-    rows.append({**done, "method": other, "frames": 20, "error": None})
-    frames, interval, _ = fit_methods.draw(rows).axes
-    drawn = {each.get_label(): each.lines[0].get_xdata().tolist() for each in frames.containers}
-    assert drawn[name] == [20, 50] and drawn[other] == []
-    assert interval.containers[0].lines[0].get_xdata().tolist() == [0.005]
-
-
-def test_design_is_compared_with_the_errors_that_fits_state_and_with_how_far_they_are_off(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Four fits, off by 2 of the errors that they state; a fifth one is refused."""
-    fits = [SimpleNamespace(restitution=0.5 + sign * 2e-3, stderr=1e-3, collisions=30) for sign in (1, -1, 1, -1)]
-    tracks = jg.Tracks(np.arange(2.0), np.ones(1), np.ones(1), *np.zeros((2, 2, 1, 2)), np.ones((2, 3)), 1.0)
-    found = iter([*fits, None] * 2)
-
-    def fitted(seen: jg.Tracks) -> SimpleNamespace:
-        fit = next(found)
-        if fit is None:
-            raise jg.InputError("tracks must show more.")
-        return fit
-
-    def expected(flow: jg.ShearFlow, frames: int, noise: jg.TrackNoise, **options) -> jg.FisherInformation:
-        if noise.velocity is None:
-            raise jg.InputError("nothing will be learnt.")
-        return jg.FisherInformation(1e6, 1e-3, 1e-4, 40.0, 0.5, options["frame_strain"], 0.1, 0.5, 0.5, 0.0)
-
-    monkeypatch.setattr(fit_design, "trajectories", lambda *given: [tracks] * 5)
-    monkeypatch.setattr(jg, "fit_restitution", fitted)
-    monkeypatch.setattr(jg, "fisher_information", expected)
-    rows = fit_design.fit_rows(0.5, 0.4, 0.1, 5)
-    for row in rows:
-        assert row["fits"] == 4
-        assert row["stated"] == pytest.approx(1e-3)
-        assert row["off"] == pytest.approx(2e-3)
-        assert row["off_error"] == pytest.approx(2e-3 / np.sqrt(8))
-    assert rows[1]["refused"] == "nothing will be learnt."
-    left, _, right = fit_design.picture(rows, rows, rows).axes
-    drawn = [bars.lines[0].get_xydata() for bars in left.containers]
-    np.testing.assert_allclose([y for line in drawn for _, y in line], [1, 2])  # over the prediction; one is refused
-    assert [len(bars.lines[0].get_xydata()) for bars in right.containers] == [1, 0]

@@ -8,9 +8,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
+from flows import assert_same_bits
 from synthetic import one_sentence, random_replica
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -47,12 +47,6 @@ def cut_off(output: Path) -> dict[Key, Replica]:
         run.add(batch)
     run.close(finished=False)
     return run.done
-
-
-def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
-    assert set(one) == set(other)
-    for key in one:
-        jax.tree.map(np.testing.assert_array_equal, one[key], other[key])
 
 
 def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:

@@ -304,37 +304,6 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_other(
     assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
 
 
-def test_file_is_readable_by_others_as_the_umask_says(few, tmp_path: Path) -> None:
-    write_dataset(few, tmp_path / "map.nc")
-    (tmp_path / "plain").touch()
-    assert (tmp_path / "map.nc").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-@pytest.mark.parametrize("kind", ["missing", "folder", "text", "empty", "truncated", "flipped", "other"])
-def test_reading_what_is_no_map_is_one_sentence(few, kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "file.nc"
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "text":
-        path.write_text("not a dataset\n" * 100)
-    elif kind == "empty":
-        path.touch()
-    elif kind == "truncated":
-        write_dataset(few, path)
-        path.write_bytes(path.read_bytes()[:4000])  # HDF5 leaves room at the end
-    elif kind == "flipped":
-        write_dataset(few, path)
-        content = bytearray(path.read_bytes())
-        for place in (3923, 524, 18433):
-            content[place % len(content)] ^= 4
-        path.write_bytes(content)
-    elif kind == "other":
-        xr.Dataset({"temperature": ("x", np.arange(3.0))}).to_netcdf(path, engine="netcdf4")
-    with pytest.raises(ValueError, match=r"file\.nc") as caught:
-        read_dataset(path)
-    assert one_sentence(str(caught.value))
-
-
 def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(few, tmp_path: Path) -> None:
     path, rng = tmp_path / "map.nc", np.random.default_rng(0)
     few.to_netcdf(path, engine="netcdf4")
@@ -352,24 +321,6 @@ def test_a_file_that_was_edited_by_others_is_read(few, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "map.nc", "r+") as file:
         file["force_ratio"][0, 0] = 7.0
     assert read_dataset(tmp_path / "map.nc").force_ratio[0, 0] == 7.0
-
-
-@pytest.mark.parametrize(
-    ("name", "accepted"),
-    [
-        ("map.txt", "ends in .nc"),
-        ("map", "ends in .nc"),
-        ("folder.nc", "a folder"),
-        ("picture.nc", "picture_timestep.png' is a folder"),
-        ("none/map.nc", "exists"),
-    ],
-)
-def test_output_that_cannot_be_a_dataset_is_one_sentence(name: str, accepted: str, tmp_path: Path) -> None:
-    (tmp_path / "folder.nc").mkdir()
-    (tmp_path / "picture_timestep.png").mkdir()
-    with pytest.raises(ValueError, match=accepted) as caught:
-        check_output(tmp_path / name)
-    assert one_sentence(str(caught.value))
 
 
 def test_checking_the_output_leaves_the_folder_as_it_was(tmp_path: Path) -> None:

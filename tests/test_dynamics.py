@@ -6,7 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import EXACT, GRAINS, OF_INSTANTS, assert_same_state, assert_same_tally, flow_of
+from flows import (
+    EXACT,
+    GRAINS,
+    OF_INSTANTS,
+    assert_same_bits,
+    assert_same_state,
+    assert_same_tally,
+    flow_of,
+    replica,
+    stacked,
+)
 from jax.extend.core import jaxprs_in_params
 from oracles import gaps_of
 
@@ -22,10 +32,6 @@ EPS = np.finfo(float).eps
 # The same steps in one advance and in two, where contacts are listed and solved in another order
 JOINED = {"numba": 1e-7, "pallas": 1e-7, "jax": 1e-10}
 UNCHANGED = {"numba": 0, "pallas": 0, "jax": 4 * EPS}
-
-
-def assert_identical(one, two):
-    jax.tree.map(np.testing.assert_array_equal, one, two)
 
 
 def test_grain_flies_straight_in_the_laboratory(engine_run, scene):
@@ -172,14 +178,6 @@ def replicas(flowing):
     return stacked(flows), stacked(states)
 
 
-def stacked(trees):
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
-
-
-def replica(tree, index: int):
-    return jax.tree.map(lambda leaf: leaf[index], tree)
-
-
 def exact_advance(flow, state, steps):
     return advance_by_jax(flow, EXACT, state, steps)
 
@@ -217,7 +215,7 @@ def test_batch_advances_as_single_runs_do(run, replicas, batch_advance):
 def test_replica_is_the_same_to_the_bit_whatever_its_neighbours(flowing, replicas, batch_advance, healthy):
     others = stacked([flowing(0.6), flowing(0.8, 1), flowing(0.1, 1)])
     changed = batch_advance(replicas[0], others, jnp.int32(200))
-    assert_identical(replica(healthy, 0), replica(changed, 0))
+    assert_same_bits(replica(healthy, 0), replica(changed, 0))
 
 
 @pytest.mark.parametrize("field", ["positions", "velocities"])
@@ -227,7 +225,7 @@ def test_replica_that_is_not_finite_leaves_the_others_alone(replicas, batch_adva
     result = batch_advance(flows, spoilt, jnp.int32(200))
     np.testing.assert_array_equal(result[1].status, [Status.ok, Status.nonfinite, Status.ok])
     for index in (0, 2):
-        assert_identical(replica(result, index), replica(healthy, index))
+        assert_same_bits(replica(result, index), replica(healthy, index))
 
 
 def equations_of(jaxpr) -> list:

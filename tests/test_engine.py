@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import GRAINS
+from flows import GRAINS, assert_same_bits
 from synthetic import one_sentence
 
 import jaxgran as jg
@@ -34,10 +34,6 @@ def selected(state=None, option="", **numerics) -> str:
 
 def single(state: jg.State) -> jg.State:
     return jax.tree.map(lambda x: x.astype(jnp.float32), state)
-
-
-def assert_same_bits(one, other) -> None:
-    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def refusal(call) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, contour_lines, legend_texts, write_without_drawing
+from drawn import caption, contour_lines, legend_texts
 from made_up_maps import RATE, excess_of, ratio_dataset, with_timesteps
 from matplotlib import _pylab_helpers, rcParams
 from matplotlib.container import ErrorbarContainer
@@ -160,13 +160,6 @@ def test_curves_are_told_apart_without_colour() -> None:
     assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 14
 
 
-def test_ratio_axis_is_logarithmic_only_for_a_wide_range() -> None:
-    data = ratio_dataset()
-    assert ratio_curves(data).axes[0].get_yscale() == "log"
-    narrow = data.assign(force_ratio=1.0 + 0.01 * (data.force_ratio - 1.0))
-    assert ratio_curves(narrow).axes[0].get_yscale() == "linear"
-
-
 def test_points_of_bad_status_are_ringed_and_explained() -> None:
     data = ratio_dataset()
     data.status[5, 0], data.status[2, 3] = 1, 2
@@ -178,13 +171,6 @@ def test_points_of_bad_status_are_ringed_and_explained() -> None:
     for figure in (curves, contours):
         assert "status not ok" in legend_texts(figure)
         assert "Status not ok: not steady (1), iteration limit (1)" in caption(figure)
-
-
-def test_no_mark_is_explained_where_all_is_well() -> None:
-    for figure in (ratio_curves(ratio_dataset()), ratio_contours(ratio_dataset())):
-        assert len(rings(figure)) == 0
-        assert not {"status not ok", "no value"} & set(legend_texts(figure))
-        assert "not ok" not in caption(figure)
 
 
 def test_missing_points_leave_the_rest() -> None:
@@ -223,12 +209,6 @@ def test_contours_of_a_line_of_points_are_refused(alphas: int, nus: int) -> None
         ratio_contours(ratio_dataset(alphas, nus))
 
 
-def test_caption_names_what_the_ratio_depends_on() -> None:
-    for figure in (ratio_curves(ratio_dataset()), ratio_contours(ratio_dataset())):
-        for words in ("N=256", "2 seeds", r"3\times 10^{-4}", r"\dot{\gamma}", "midpoint activation", "strain 5"):
-            assert words in caption(figure)
-
-
 @pytest.mark.parametrize("draw", [ratio_curves, ratio_contours])
 def test_curves_and_contours_of_several_time_steps_are_those_of_the_shortest(draw) -> None:
     data = ratio_dataset()
@@ -264,13 +244,6 @@ def test_every_point_is_a_curve_against_the_time_step_with_its_errors(alphas: in
     assert r"\mathrm{d}t" not in caption(figure) and "N=256" in caption(figure)
 
 
-def test_curves_against_the_time_step_are_told_apart_without_colour() -> None:
-    lines = [
-        c.lines[0] for c in ratio_against_timestep(with_timesteps(ratio_dataset(4, 2), 1e-3, 1e-4)).axes[0].containers
-    ]
-    assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 8
-
-
 def test_bad_status_has_a_ring_at_its_time_step() -> None:
     data = with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4)
     data.status[0, 1, 0] = 1
@@ -297,20 +270,6 @@ def test_one_time_step_is_nothing_to_draw_against() -> None:
             ratio_against_timestep(data)
 
 
-def test_time_steps_without_any_value_are_drawn() -> None:
-    data = with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4)
-    figure = ratio_against_timestep(data.assign(force_ratio=data.force_ratio * np.nan))
-    figure.canvas.draw()
-    assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
-
-
-def test_files_are_written_whole(tmp_path: Path) -> None:
-    written = save_figures(ratio_dataset(), tmp_path / "my.map")
-    assert [path.name for path in written] == ["my.map_curves.png", "my.map_contours.png"]
-    assert sorted(tmp_path.iterdir()) == sorted(written)
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
-
-
 @pytest.mark.parametrize(("format", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_the_same_map_gives_the_same_bytes_in_every_format(format, start: bytes, tmp_path: Path) -> None:
     files = [save_figures(ratio_dataset(1, 2), tmp_path / name, format, dpi=50)[0] for name in ("first", "second")]
@@ -335,20 +294,6 @@ def test_other_formats_and_resolutions_are_refused_in_a_sentence(choice: dict, t
     assert not list(tmp_path.iterdir())
 
 
-def test_line_of_points_writes_only_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_without_drawing(monkeypatch)
-    assert save_figures(ratio_dataset(alphas=1), tmp_path / "line") == [tmp_path / "line_curves.png"]
-
-
-def test_several_time_steps_have_a_file_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_without_drawing(monkeypatch)
-    written = save_figures(with_timesteps(ratio_dataset(2, 2), 1e-3, 1e-4), tmp_path / "map")
-    assert [path.name for path in written] == ["map_curves.png", "map_contours.png", "map_timestep.png"]
-    assert sorted(tmp_path.iterdir()) == sorted(written)
-    line = save_figures(with_timesteps(ratio_dataset(1, 2), 1e-3), tmp_path / "line")
-    assert [path.name for path in line] == ["line_curves.png"]
-
-
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "map_curves.png").write_text("old")
 
@@ -360,16 +305,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(OSError, match="disc full"):
         save_figures(ratio_dataset(), tmp_path / "map")
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("map_curves.png", "old")]
-
-
-def test_stored_dataset_gives_the_same_figures(tmp_path: Path) -> None:
-    data = ratio_dataset()
-    data.status[5, 0] = 1
-    data.to_netcdf(tmp_path / "map.nc", engine="netcdf4")
-    with xr.open_dataset(tmp_path / "map.nc", engine="netcdf4") as stored:
-        figure = ratio_contours(stored)
-        assert caption(figure) == caption(ratio_contours(data))
-        np.testing.assert_array_equal(rings(figure), rings(ratio_contours(data)))
 
 
 def test_global_plotting_state_is_untouched(tmp_path: Path) -> None:

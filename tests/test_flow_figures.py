@@ -271,9 +271,3 @@ def test_mp4_is_written_where_there_is_ffmpeg(tmp_path: Path) -> None:
     write_movie(tmp_path / "flow.mp4", kept(4))
     content = (tmp_path / "flow.mp4").read_bytes()
     assert content[4:8] == b"ftyp" and len(content) > 2000
-
-
-def test_mp4_is_refused_where_there_is_no_ffmpeg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
-    with pytest.raises(InputError, match=r"no ffmpeg to write \.mp4: use \.gif, or install ffmpeg\.$"):
-        check_movie(tmp_path / "flow.mp4")

@@ -1,10 +1,8 @@
 """Free cooling: Haff's law in collisions and in time, no gain of energy, none lost by elastic grains, no time scale."""
 
 from dataclasses import replace
-from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import one_sentence
@@ -107,15 +105,6 @@ def test_record_is_at_the_times_in_whole_steps_and_starts_at_the_start(gases) ->
     np.testing.assert_allclose(record.times, [0.010, 0.5, 0.6, *times[3:]], rtol=1e-12)
     np.testing.assert_array_equal(record.tally.steps, [10, 490, 100, 100, 100, 100, 100, 100])
     np.testing.assert_allclose(record.collisions, 2 * np.cumsum(record.tally.collisions) / GRAINS)
-
-
-@pytest.mark.parametrize("way", ["map", "vmap"])
-def test_transformations_apply(gases, way: str) -> None:
-    one = partial(cooling, FLOW, times=TIMES)
-    all_of_them = jax.vmap(one, axis_name="replica") if way == "vmap" else partial(jax.lax.map, one)
-    made = jax.eval_shape(all_of_them, jax.tree.map(lambda *x: jnp.stack(x), *gases[:2]))
-    assert made[0].positions.shape == (2, GRAINS, 2)
-    assert made[1].temperature.shape == made[1].collisions.shape == (2, len(TIMES))
 
 
 def test_a_change_of_numbers_compiles_nothing_anew(gases, cooled) -> None:

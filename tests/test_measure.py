@@ -3,13 +3,12 @@
 import re
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flows import OF_INSTANTS
+from flows import OF_INSTANTS, replica
 from synthetic import one_sentence, random_tally
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
@@ -26,10 +25,6 @@ from jaxgran.sampling.steady_state import Batch, prepare_batch, sample_batch
 
 GRAINS, TIMESTEP, STRAIN = 64, 1e-2, 0.64
 FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
-
-
-def replica(tree: Any, k: int) -> Any:
-    return jax.tree.map(lambda x: x[k], tree)
 
 
 def assert_agree(measured: Sample, expected: Sample) -> None:
@@ -160,14 +155,6 @@ def test_averages_of_a_sample_are_of_numpy_and_those_that_jax_traces(measured) -
     traced = jax.jit(lambda one: (one.averages, one.status))(measured[1])
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-15), traced[0], measured[1].averages)
     assert traced[1] == measured[1].status
-
-
-@pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), float("inf")])
-def test_strain_that_is_not_positive_is_one_sentence(state, strain: float) -> None:
-    with pytest.raises(ValueError, match="strain must be a positive number") as caught:
-        sample(FLOWS[0], state, strain)
-    assert isinstance(caught.value, InputError)
-    assert one_sentence(str(caught.value))
 
 
 def in_float32(state: State) -> State:

@@ -347,13 +347,6 @@ def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) 
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
 
 
-def test_mistakes_are_one_sentence(flowing) -> None:
-    with pytest.raises(InputError, match="a whole number of 0"):
-        advance_module.advance(of(0.6), flowing(0.6), 0.5)
-    with pytest.raises(InputError, match="state must be one State"):
-        advance_module.advance(of(0.6), jax.tree.map(lambda x: x[:3], flowing(0.6).positions), 5)
-
-
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     place=st.floats(-300, 308).map(lambda x: 10**x),

@@ -24,14 +24,6 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def changed(path: Path, old: str, new: str) -> None:
-    text = path.read_text(encoding="utf-8")
-    assert old in text
-    times = path.stat()
-    path.write_text(text.replace(old, new), encoding="utf-8")
-    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # the time stamp says nothing
-
-
 @pytest.fixture
 def of_copy(copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The same folder, where the numba engine now finds its sources."""
@@ -50,15 +42,6 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
     compiled_here = {*(of_copy / "jaxgran" / "dynamics" / "numba_engine").glob("*.py")}
     imported = {of_copy / "jaxgran" / name for name in ("contact/law.py", "model/status.py", "dynamics/tally.py")}
     assert compiled_here and compiled_here | imported <= set(sources)
-
-
-def test_a_constant_and_a_function_of_other_folders_change_the_file(of_copy: Path) -> None:
-    kept = {ffi.object_file()}
-    changed(of_copy / "jaxgran" / "model" / "status.py", "DEEP_OVERLAP = 1e-2", "DEEP_OVERLAP = 1e3")
-    kept.add(ffi.object_file())
-    changed(of_copy / "jaxgran" / "contact" / "law.py", "        overlap,\n", "        2 * overlap,\n")
-    kept.add(ffi.object_file())
-    assert len(kept) == 3
 
 
 def test_another_compiler_or_processor_has_another_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,12 +76,6 @@ def test_only_some_files_are_kept_and_the_oldest_go(tmp_path: Path) -> None:
         os.utime(tmp_path / f"{k}.o", (k, k))
     write_cached(tmp_path / "last.o", b"code", 3)
     assert {path.name for path in tmp_path.iterdir()} == {"last.o", "3.o", "4.o"}
-
-
-def test_a_cache_that_cannot_be_written_is_an_error_of_the_file_system(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("no folder")
-    with pytest.raises(OSError):
-        write_cached(tmp_path / "file" / "numba" / "code.o", b"code", 1)
 
 
 def words(structure: str) -> dict[str, int]:

@@ -40,10 +40,5 @@ def test_public_names_resolve_and_are_documented(name: str) -> None:
     assert getattr(jaxgran, name).__module__.startswith("jaxgran.")
 
 
-def test_unknown_names_are_attribute_errors() -> None:
-    with pytest.raises(AttributeError, match="sampel"):
-        _ = jaxgran.sampel
-
-
 def test_version_is_that_of_the_installed_package() -> None:
     assert jaxgran.__version__ == version("jaxgran")

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import assert_same_bits, replica
 from synthetic import one_sentence
 
 from jaxgran.dynamics.engine import Numerics
@@ -28,14 +29,6 @@ FLOWS = [ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0.5, 0.9)]
 
 def with_timesteps(*timesteps: float) -> ShearFlow:
     return stack([replace(flow, timestep=dt) for flow, dt in zip(FLOWS, timesteps, strict=True)])
-
-
-def assert_same_bits(one: Any, other: Any) -> None:
-    jax.tree.map(np.testing.assert_array_equal, one, other)
-
-
-def replica(tree: Any, k: int) -> Any:
-    return jax.tree.map(lambda x: x[k], tree)
 
 
 @pytest.fixture(scope="module")

@@ -27,48 +27,28 @@ GOOD: dict[str, Any] = {
 
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"restitution": (-0.1, 0.5)}, "between 0 and 1"),
-    ({"restitution": (0.5, 1.1)}, "between 0 and 1"),
     ({"restitution": (float("nan"),)}, "between 0 and 1"),
-    ({"restitution": ()}, "at least one number"),
     ({"restitution": (0.5, 0.1, 0.9)}, "sorted"),
     ({"restitution": (0.5, 0.5)}, "without repetition"),
     ({"restitution": ((0.1, 0.5), (0.7, 0.9))}, "a list of numbers"),
     ({"packing_fraction": (0.0, 0.5)}, "above 0 and at most 0.83"),
-    ({"packing_fraction": (0.84,)}, "above 0 and at most 0.83"),
-    ({"packing_fraction": ()}, "at least one number"),
-    ({"packing_fraction": (0.7, 0.6, 0.65)}, "sorted"),
     ({"grains": 15}, "at least 16"),
     ({"grains": 64.0}, "a whole number"),
-    ({"grains": ()}, "at least one number"),
-    ({"grains": (256, 64, 1000)}, "sorted"),
     ({"grains": (64, 64)}, "without repetition"),
     ({"grains": ("many",)}, "a list of numbers"),
-    ({"grains": (15, 64)}, "at least 16"),
     ({"grains": (64, 10**8)}, "at most 10000000"),
-    ({"grains": (64.0, 256.0)}, "a whole number"),
     ({"grains": [64, 256]}, "a whole number"),  # a list is for ratio_map; settings are tuples
     ({"seeds": 0}, "at least 1"),
     ({"first_seed": -1}, "at least 0"),
     ({"seeds": True}, "a whole number"),
     ({"timestep": 0.0}, "a positive number"),
-    ({"timestep": -1e-3}, "a positive number"),
-    ({"timestep": float("nan")}, "a positive number"),
     ({"timestep": 0.2}, "at most 0.1"),
     ({"timestep": 5e-3}, "at most .* at restitution 0.9 and packing fraction 0.6"),
-    ({"timestep": ()}, "at least one number"),
-    ({"timestep": (1e-4, 1e-3, 1e-5)}, "sorted"),
-    ({"timestep": (1e-3, 1e-3)}, "without repetition"),
-    ({"timestep": ((1e-3, 1e-4),)}, "a list of numbers"),
-    ({"timestep": [1e-3, 1e-4]}, "a positive number"),  # a list is for ratio_map; settings are tuples
-    ({"timestep": (1e-3, 0.0)}, "a positive number"),
     ({"timestep": (1e-3, 5e-3)}, "at most"),
-    ({"strain": 0.0}, "a positive number"),
     ({"strain": float("inf")}, "a positive number"),
     ({"strain": 0.1}, "at least 160 time steps"),
     ({"strain": 0.1, "timestep": (1e-4, 1e-3)}, "at least 160 time steps, that is 0.16"),
     ({"error": 0.0}, "between 1e-3 and 0.5"),
-    ({"error": 1.0}, "between 1e-3 and 0.5"),
-    ({"error": float("nan")}, "between 1e-3 and 0.5"),
     ({"equilibrate": -1.0}, "at least 0"),
     ({"solver": "gauss"}, "a ProjectedMethod, such as"),
     ({"activation": "always"}, "midpoint or touching"),
@@ -90,7 +70,8 @@ def test_a_mistake_is_one_sentence_with_the_accepted_range(mistake: dict[str, An
 
 
 def test_lists_may_fall_as_well_as_rise() -> None:
-    assert MapSettings(**{**GOOD, "restitution": (0.9, 0.5)}).restitution == (0.9, 0.5)
+    falling = {"restitution": (0.9, 0.5), "timestep": (1e-4, 1e-3)}
+    assert {name: MapSettings(**{**GOOD, **falling}).axes[name] for name in falling} == falling
 
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
@@ -106,18 +87,10 @@ def test_numbers_of_numpy_are_accepted() -> None:
     MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-3)})
 
 
-def test_time_step_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
-    one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "timestep": (1e-3, 1e-4)})
-    assert list(one.axes) == ["packing_fraction", "restitution"]
-    assert list(some.axes) == ["timestep", "packing_fraction", "restitution"]
-    points = [(flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
-    assert points == list(product(*some.axes.values()))
-    assert some.flows()[:2] == one.flows()
-
-
-def test_number_of_grains_is_an_axis_where_it_is_a_list_and_then_the_slowest() -> None:
+def test_grains_and_time_step_are_axes_where_they_are_lists_and_then_the_slowest() -> None:
     one, some = MapSettings(**GOOD), MapSettings(**{**GOOD, "grains": (64, 256), "timestep": (1e-3, 1e-4)})
     assert (one.sizes, some.sizes) == ((64,), (64, 256))
+    assert list(one.axes) == ["packing_fraction", "restitution"]
     assert list(some.axes) == ["grains", "timestep", "packing_fraction", "restitution"]
     points = [(flow.grains, flow.timestep, flow.packing_fraction, flow.restitution) for flow in some.flows()]
     assert points == list(product(*some.axes.values()))
@@ -168,11 +141,6 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
     for value in (0.0, 1.0, "small"):
         with pytest.raises(InputError, match="tolerance must be between"):
             chosen(**{**GOOD, "tolerance": value})
-
-
-def test_time_steps_may_fall_as_well_as_rise() -> None:
-    for timesteps in ((1e-3, 1e-4), (1e-4, 1e-3), (1e-3,)):
-        assert MapSettings(**{**GOOD, "timestep": timesteps}).axes["timestep"] == timesteps
 
 
 def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:

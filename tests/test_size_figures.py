@@ -4,12 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from drawn import caption, legend_texts, write_without_drawing
-from made_up_maps import dense_map, ratio_dataset, with_grains, with_timesteps
+from made_up_maps import ratio_dataset, with_grains, with_timesteps
 from matplotlib.figure import Figure
 
-from jaxgran.inference.friction_law import dense_points
 from jaxgran.maps.schema import finest, parts
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
@@ -55,11 +53,6 @@ def test_a_panel_has_at_most_eight_curves_and_the_figure_says_what_is_left_out()
     assert legend_texts(figure)[0] == "0.1" and legend_texts(figure)[-1] == "0.9"
 
 
-def test_curves_against_the_number_of_grains_are_told_apart_without_colour() -> None:
-    lines = [c.lines[0] for c in averages_against_grains(with_grains(ratio_dataset(4, 2), *SIZES)).axes[0].containers]
-    assert len({(line.get_marker(), str(line._dash_pattern)) for line in lines}) == 8
-
-
 def test_bad_status_and_missing_values_are_marked_at_their_number_of_grains() -> None:
     data = with_grains(ratio_dataset(2, 2), *SIZES)
     data.status[0, 1, 0] = 1
@@ -94,13 +87,6 @@ def test_other_figures_show_the_largest_number_of_grains_and_name_it(draw) -> No
         assert caption(figure) == caption(expected) and "$N=4000$" in caption(figure)
         for line, other in zip(figure.axes[0].lines, expected.axes[0].lines, strict=True):
             np.testing.assert_array_equal(line.get_xydata(), other.get_xydata())
-
-
-def test_laws_of_dense_flow_are_fitted_at_the_largest_number_of_grains() -> None:
-    data = dense_map()
-    larger = data.assign(macroscopic_friction=2 * data.macroscopic_friction)
-    several = xr.concat([larger, data], xr.Variable("grains", [4000, 256]))
-    np.testing.assert_array_equal(dense_points(several).macroscopic_friction, dense_points(larger).macroscopic_friction)
 
 
 def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:

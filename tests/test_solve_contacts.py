@@ -242,14 +242,6 @@ def assert_derivatives(function, at, along, step=1e-6):
     np.testing.assert_allclose([reverse, forward], (up - down) / (2 * step), rtol=1e-5)
 
 
-def test_cap_returns_the_best_iterate_and_a_status():
-    problem = network_of(0)[0]
-    solutions = [solve_contacts(problem, solver=BarzilaiBorwein(1e-12, cap)) for cap in (5, 10, 20)]
-    assert [int(one.iterations) for one in solutions] == [5, 10, 20]
-    assert {int(one.status) for one in solutions} == {Status.iteration_limit}
-    assert np.all(np.diff([one.residuals.natural_map for one in solutions]) <= 0)
-
-
 def test_unit_of_velocity_and_mass_changes_no_residual_and_no_iteration():
     problem = matrix_problem(5)
     scaled = DelassusProblem(problem.matrix * 2.0**-20, problem.approach * 2.0**30)
@@ -272,28 +264,18 @@ SADDLE = (SADDLE + SADDLE.T) / 2
         (3, "a ContactNetwork or a DelassusProblem"),
         (replace(MATRIX, approach=jnp.zeros(0)), "at least one contact"),
         (replace(MATRIX, approach=MATRIX.approach[:-1]), r"matrix must be an array \(11, 11\)"),
-        (replace(MATRIX, approach=[1.0] * SIZE), "approach must be an array"),
         (replace(MATRIX, approach=MATRIX.approach[None]), "jax.vmap"),
         (replace(MATRIX, approach=MATRIX.approach.at[0].set(jnp.nan)), "approach must be finite"),
-        (replace(MATRIX, matrix=MATRIX.matrix.at[0, 0].set(jnp.inf)), "matrix must be finite"),
         (replace(MATRIX, matrix=jnp.asarray(LOPSIDED)), "symmetric"),
-        (replace(MATRIX, matrix=scipy.sparse.csr_array(LOPSIDED)), "symmetric"),
         (replace(MATRIX, matrix=jnp.asarray(SADDLE)), "no negative eigenvalue"),
-        (replace(MATRIX, matrix=scipy.sparse.csr_array(SADDLE)), "no negative eigenvalue"),
         (replace(MATRIX, matrix=-MATRIX.matrix), "positive diagonal"),
-        (replace(MATRIX, matrix=jnp.zeros((SIZE, SIZE))), "positive diagonal"),
         (replace(MATRIX, matrix=scipy.sparse.csr_array((SIZE, SIZE))), "must have entries"),
-        (replace(MATRIX, matrix=scipy.sparse.eye_array(SIZE + 1)), r"\(12, 12\)"),
         (replace(NETWORK, masses=jnp.zeros_like(NETWORK.masses)), "masses must be positive"),
         (replace(NETWORK, masses=jnp.full_like(NETWORK.masses, jnp.inf)), "two walls"),
-        (replace(NETWORK, masses=jnp.ones((2, 60))), "jax.vmap"),
         (replace(NETWORK, masses=NETWORK.masses[:3]), "numbers of grains, 0 to 2"),
         (replace(NETWORK, ends=NETWORK.ends.astype(float)), "whole numbers"),
         (replace(NETWORK, ends=jnp.ones_like(NETWORK.ends)), "one grain twice"),
-        (replace(NETWORK, ends=NETWORK.ends[:5]), r"ends must be an array \(192, 2\)"),
         (replace(NETWORK, normals=2 * NETWORK.normals), "unit vectors"),
-        (replace(NETWORK, normals=NETWORK.normals.at[0, 0].set(jnp.nan)), "normals must be finite"),
-        (replace(NETWORK, approach=NETWORK.approach.at[0].set(jnp.nan)), "approach must be finite"),
     ],
 )
 def test_problem_that_cannot_be_is_refused_in_a_sentence(problem, words):
@@ -302,21 +284,13 @@ def test_problem_that_cannot_be_is_refused_in_a_sentence(problem, words):
     assert str(refused.value).endswith(".") and "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"restitution": 1.5}, "restitution must be between 0 and 1"),
-        ({"restitution": jnp.zeros(SIZE)}, "restitution must be between 0 and 1"),
-        ({"solver": "newton"}, "solver must be a ProjectedMethod"),
-        ({"solver": Nesterov}, "solver must be a ProjectedMethod"),
-    ],
-)
-def test_number_out_of_range_is_refused_in_a_sentence(options, words):
-    with pytest.raises(InputError, match=words):
-        solve_contacts(MATRIX, **options)
-
-
-def test_impulses_of_another_problem_are_refused():
+def test_numbers_solvers_and_impulses_that_cannot_be_are_refused():
+    for restitution in (1.5, jnp.zeros(SIZE)):
+        with pytest.raises(InputError, match="restitution must be between 0 and 1"):
+            solve_contacts(MATRIX, restitution)
+    for solver in ("newton", Nesterov):
+        with pytest.raises(InputError, match="solver must be a ProjectedMethod"):
+            solve_contacts(MATRIX, solver=solver)
     with pytest.raises(InputError, match=r"impulses must be an array \(12,\)"):
         contact_residuals(MATRIX, jnp.zeros(SIZE - 1))
 

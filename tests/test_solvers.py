@@ -14,12 +14,10 @@ from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
 from benchmarks.exact_contacts import incidence as dense_incidence
 from benchmarks.networks import Network
-from benchmarks.solvers import groups, measure
-from benchmarks.solvers.charts import DRAWN, draw_times
+from benchmarks.solvers import measure
 from benchmarks.solvers.forms import program_of, weighted
-from benchmarks.solvers.measure import TARGETS, Row, run_solvers
+from benchmarks.solvers.measure import TARGETS, run_solvers
 from benchmarks.solvers.roster import Solver, our_solvers
-from benchmarks.solvers.run import agreement
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -91,54 +89,6 @@ def test_failures_are_missed_slow_or_skipped(entries, monkeypatch):
 def networks_problem(discs: int):
     network = networks.chain(discs)
     return compact(network.contacts, network.masses)
-
-
-def row(solver: str, problem: int, family: str, target: float, seconds: float | None) -> Row:
-    if seconds is None:
-        return Row(solver, str(problem), family, 20 * (problem + 1), target, "missed")
-    return Row(
-        solver, str(problem), family, 20 * (problem + 1), target, "ok", target, seconds, 10.0, target, 0.0, target
-    )
-
-
-@pytest.fixture
-def rows() -> list[Row]:
-    costs = {"numba engine": (1e-5, 1e-5, 4e-5), "PIQP": (2e-5, 3e-5, 1e-5), "Pinocchio PGS": (1e-4, None, None)}
-    return [
-        row(solver, problem, "flow" if problem < 2 else "chain", target, seconds)
-        for solver, each in costs.items()
-        for problem, seconds in enumerate(each)
-        for target in TARGETS
-    ]
-
-
-def test_table_names_the_fastest_and_counts_failures(rows):
-    lines = groups.table(rows, targets=(1e-4,)).splitlines()
-    small, medium, chains = (line.split(" | ") for line in lines[2:])
-    assert small[2].startswith("numba engine: 10 µs") and small[3].startswith("PIQP: 20 µs")
-    assert medium[4].startswith("Pinocchio PGS: –, 0 of 1")
-    assert chains[2].startswith("PIQP: 10 µs") and chains[3].startswith("numba engine: 40 µs")
-
-
-def test_summary_has_a_null_where_the_median_fails(rows):
-    lines = groups.summary(rows)
-    line = next(x for x in lines if (x["group"], x["solver"]) == ("chain", "Pinocchio PGS"))
-    assert line["seconds"] is None and line["missed"] == 1 and line["ok"] == 0
-    json.dumps(lines, allow_nan=False)
-
-
-def test_figure_shows_the_median_times_and_no_failure(rows):
-    for axes in draw_times(groups.summary(rows)).axes:
-        times = {line.get_label(): line.get_xdata() for line in axes.lines}
-        assert set(times) == set(DRAWN)
-        np.testing.assert_allclose(times["numba engine"][[0, 1, 4]], [0.01, 0.01, 0.04])
-        np.testing.assert_allclose(times["Pinocchio PGS"], [0.1, *[np.nan] * 7])
-
-
-def test_agreement_is_the_largest_difference_of_a_pair():
-    zero, one = np.zeros(2), np.array([0.0, 1e-7])
-    found = agreement({"a": {"x": zero, "y": one}, "b": {"x": zero, "y": zero}, "c": {"x": zero}})
-    assert found == [{"solvers": ["x", "y"], "problems": 2, "largest_difference": 1e-7}]
 
 
 def test_committed_solutions_of_ours_agree_with_those_of_package_solvers():

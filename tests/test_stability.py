@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks import stability
-from jaxgran.model.checks import InputError
-from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import DEEP_OVERLAP, Status
-from jaxgran.sampling.sample import sample
 
 PAIRS = stability.GRAINS // 2
 pack = jax.jit(stability.pack)
@@ -44,12 +41,6 @@ def test_float32_positions_lose_collisions_at_a_timestep_below_their_rounding() 
         assert wide == PAIRS
         lost = PAIRS - narrow
         assert lost == 0 if found else lost > 4 * np.sqrt(PAIRS) / 2, timestep  # four errors of a count out of PAIRS
-
-
-def test_sample_refuses_float32_positions_at_a_short_timestep() -> None:
-    state = jax.tree.map(lambda x: x.astype("float32"), warm(0.9, 0.6)[0])
-    with pytest.raises(InputError, match="float64"):
-        sample(ShearFlow(stability.GRAINS, 0.9, 0.6, 1e-5), state, strain=1.0)
 
 
 @cache

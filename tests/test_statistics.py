@@ -54,17 +54,6 @@ def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkey
     assert abs(variances.mean() - expected) < 4 * variances.std() / np.sqrt(TRIALS) + 0.01 * expected
 
 
-def test_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> None:
-    # The largest of the errors of three merges is taken, so the error errs on the large side, by 4 to 20 %.
-    rng = np.random.default_rng(2)
-    samples = [jackknife(ratio, correlated_blocks(rng, 4, 16)) for _ in range(TRIALS)]
-    values = np.array([value["ratio"] for value, _ in samples])
-    errors = np.array([error["ratio"] for _, error in samples])
-    assert abs(values.mean() - 2.0) < 4 * values.std() / np.sqrt(TRIALS)
-    spread, uncertainty = values.std(), values.std() / np.sqrt(2 * TRIALS)
-    assert spread - 3 * uncertainty < errors.mean() < 1.2 * spread + 3 * uncertainty
-
-
 def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlation_asks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -44,15 +44,6 @@ def test_tally_of_no_time_is_neutral():
     assert empty.status == Status.ok and empty.status.dtype == np.int32
 
 
-def test_batches_of_tallies_join_replica_by_replica():
-    ones, twos = (
-        jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(random_tally, seeds)) for seeds in ((0, 1), (2, 3))
-    )
-    joined = ones + twos
-    second = jax.tree.map(lambda leaf: leaf[1], joined)
-    jax.tree.map(np.testing.assert_array_equal, second, random_tally(1) + random_tally(3))
-
-
 def test_sums_of_a_users_function_are_joined_and_stored_with_the_others():
     one, two = (replace(random_tally(seed), observed={"a": np.float64(seed), "b": np.ones(3)}) for seed in (4, 5))
     joined = one + two
@@ -68,11 +59,6 @@ def test_running_sums_follow_each_other_without_a_gap():
     places = sorted(LAYOUT.values(), key=lambda place: place.start)
     assert [place.start for place in places] == [0, *(place.stop for place in places[:-1])]
     assert places[-1].stop == NUMBERS
-
-
-def test_every_row_of_the_table_is_in_the_docstring():
-    rows = [line.split() for line in (Tally.__doc__ or "").splitlines()]
-    assert [row[0] for row in rows if row and row[0] in TABLE] == list(TABLE)
 
 
 def test_terms_of_a_contact_stand_where_the_table_says():

@@ -8,7 +8,6 @@ import xarray as xr
 from drawn import caption, contour_lines, legend_texts, write_without_drawing
 from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
@@ -185,12 +184,6 @@ def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> No
     assert "no value" in legend_texts(figure)
 
 
-def test_caption_names_the_run_and_the_theory() -> None:
-    text = caption(theory_errors(theory_dataset()))
-    for words in ("N=256", "2 seeds", r"3\times 10^{-4}", "midpoint activation", "(a) = (b) × (c)"):
-        assert words in text
-
-
 @pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
 def test_bad_status_is_ringed_in_every_plane(draw) -> None:
     data = theory_dataset()
@@ -201,12 +194,6 @@ def test_bad_status_is_ringed_in_every_plane(draw) -> None:
         np.testing.assert_allclose(rings(axes), [[1.0 - data.restitution[3], data.packing_fraction[2]]])
     assert "status not ok" in legend_texts(figure)
     assert "Status not ok: not steady (1)" in caption(figure)
-
-
-@pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1)])
-def test_theory_needs_a_plane(alphas: int, nus: int) -> None:
-    with pytest.raises(ValueError, match="at least two restitutions"):
-        theory_errors(theory_dataset(alphas, nus))
 
 
 # ---------------------------------------------------------------------------------------------- factors
@@ -251,21 +238,6 @@ def test_shares_stand_at_their_excess_with_errors_in_both_directions() -> None:
         np.testing.assert_allclose(np.ptp(along[..., 1], axis=-1), 0.06)
         left, right = axes.get_xlim()
         assert left < drawn[..., 0].min() and drawn[..., 0].max() < right
-
-
-def test_restitutions_have_lines_and_packing_fractions_symbols() -> None:
-    data = theory_dataset()
-    figure = cluster_shares(data)
-    axes = panel(figure, "p")
-    symbols = [artist for artist in axes.collections if isinstance(artist, PathCollection)]
-    assert len({artist.get_paths()[0].vertices.tobytes() for artist in symbols}) == 6
-    for artist, excess in zip(symbols, data.force_ratio.values - 1.0, strict=True):
-        np.testing.assert_allclose(artist.get_offsets()[:, 0], excess)
-    alphas, nus = ([f"{x:.4g}" for x in data[name].values] for name in ("restitution", "packing_fraction"))
-    texts = [text.get_text() for text in figure.legends[-1].get_texts()]
-    assert texts[:5] == alphas and "packing" in texts[5] and texts[6:] == nus[::-1]
-    lines = [container.lines[0] for container in axes.containers]
-    assert len({str(line._dash_pattern) for line in lines}) == len({str(line.get_color()) for line in lines}) == 5
 
 
 def test_share_of_the_pressure_lies_on_its_isolines() -> None:

@@ -70,11 +70,7 @@ def test_the_page_shows_the_file_and_what_the_fit_prints(folder: Path) -> None:
     assert FILE.read_text(encoding="utf-8").startswith(shown[1])
 
 
-@pytest.mark.parametrize(
-    "row",
-    [row for row in FITS if row[0] in ("fit positions.csv", "fit tracked_discs.csv --every 4")],
-    ids=lambda row: row[0],
-)
+@pytest.mark.parametrize("row", FITS, ids=lambda row: row[0])
 def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -> None:
     command, *shown = row
     printed = rows_of(jaxgran(folder, *command.split()).out)
@@ -83,10 +79,6 @@ def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -
     same_fit(dict(zip(names, shown, strict=True)), printed | {"collisions, rejected": used})
     low, high = numbers_of(shown[1])
     assert low <= RESTITUTION <= high
-
-
-def test_all_fits_of_the_page_are_tested() -> None:
-    assert len(FITS) == 5
 
 
 def test_the_page_shows_the_fits_of_dumps_of_lammps() -> None:

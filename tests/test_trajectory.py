@@ -400,19 +400,6 @@ def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Pat
     assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_damaged_file_is_read_or_refused_in_one_sentence(seed: int, recorded, tmp_path: Path) -> None:
-    rng = np.random.default_rng(seed)
-    content = bytearray(recorded[0].read_bytes())
-    for place in rng.integers(len(content), size=30):
-        content[place] = rng.integers(256)
-    (tmp_path / "damaged.gsd").write_bytes(content)
-    try:
-        read_trajectory(tmp_path / "damaged.gsd")
-    except InputError as mistake:
-        assert str(mistake).endswith(".") and "\n" not in str(mistake)
-
-
 # Interruptions
 
 

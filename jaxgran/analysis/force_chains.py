@@ -18,25 +18,14 @@ _DIRECTIONS = 12  # bins of 15° on the half circle, for the mean force at an an
 
 
 class Loaded(NamedTuple):
-    """The loaded contacts of all snapshots, as one list.
+    """The loaded contacts of all snapshots, as one list."""
 
-    ==========  =============  =====  ========================================
-    field       shape          unit   meaning
-    ==========  =============  =====  ========================================
-    time        (loaded,)      –      number of the snapshot
-    i, j        (loaded,)      –      grains in contact
-    force       (loaded,)      mσγ̇²   p/dt
-    normals     (loaded, 2)    –      from grain j to grain i
-    distances   (loaded,)      σ      distance of the centres
-    ==========  =============  =====  ========================================
-    """
-
-    time: Int[np.ndarray, " loaded"]
+    time: Int[np.ndarray, " loaded"]  # number of the snapshot
     i: Int[np.ndarray, " loaded"]
     j: Int[np.ndarray, " loaded"]
-    force: Float[np.ndarray, " loaded"]
-    normals: Float[np.ndarray, "loaded 2"]
-    distances: Float[np.ndarray, " loaded"]
+    force: Float[np.ndarray, " loaded"]  # p/dt, in mσγ̇²
+    normals: Float[np.ndarray, "loaded 2"]  # from grain j to grain i
+    distances: Float[np.ndarray, " loaded"]  # of the centres, in σ
 
     def moments(self) -> Float[np.ndarray, "loaded 2 2"]:
         """σ^a F^b of each contact, in mσ²γ̇². The contact stress is their sum divided by the area of the cell."""
@@ -44,36 +33,19 @@ class Loaded(NamedTuple):
 
 
 class PairForces(NamedTuple):
-    """Pairs of grains in loaded contact at any time of a series, and their mean forces over the series.
-
-    =============  ========  =====  ===================================================================
-    field          shape     unit   meaning
-    =============  ========  =====  ===================================================================
-    i, j           (pairs,)  –      grains, i < j
-    force          (pairs,)  mσγ̇²   mean of p/dt over all snapshots, loaded or not
-    cluster_share  (pairs,)  –      share of the force that acts within clusters of three or more grains
-    =============  ========  =====  ===================================================================
-    """
+    """Pairs of grains in loaded contact at any time of a series, and their mean forces over the series."""
 
     i: Int[np.ndarray, " pairs"]
-    j: Int[np.ndarray, " pairs"]
-    force: Float[np.ndarray, " pairs"]
-    cluster_share: Float[np.ndarray, " pairs"]
+    j: Int[np.ndarray, " pairs"]  # > i
+    force: Float[np.ndarray, " pairs"]  # mean of p/dt over all snapshots, loaded or not, in mσγ̇²
+    cluster_share: Float[np.ndarray, " pairs"]  # share of it that acts within clusters of three or more grains
 
 
 class Clusters(NamedTuple):
-    """Clusters at each time; labels are unique over all times.
+    """The cluster of each grain at each time."""
 
-    ======  ===============  ====  ==================================================================
-    field   shape            unit  meaning
-    ======  ===============  ====  ==================================================================
-    labels  (times, grains)  –     label of the cluster of each grain
-    sizes   (times, grains)  –     size of the cluster of each grain; 1 without loaded contacts
-    ======  ===============  ====  ==================================================================
-    """
-
-    labels: Int[np.ndarray, "times grains"]
-    sizes: Int[np.ndarray, "times grains"]
+    labels: Int[np.ndarray, "times grains"]  # unique over all times
+    sizes: Int[np.ndarray, "times grains"]  # 1 without loaded contacts
 
 
 class ClusterShare(NamedTuple):

@@ -14,32 +14,17 @@ from jaxgran.model.cell import centred
 
 
 class Instant(NamedTuple):
-    """The grains of a flow at one time, and the forces between them averaged over a short strain around it.
+    """The grains of a flow at one time, and the forces between them averaged over a short strain around it."""
 
-    =========  ===========  ======  ============================================================
-    field      shape        unit    meaning
-    =========  ===========  ======  ============================================================
-    positions  (grains, 2)  σ       centres, in the sheared cell whose centre is the origin
-    radii      (grains,)    σ       radii
-    speed      (grains,)    σγ̇      |c|, the peculiar speed
-    pairs      (pairs, 2)   –       indices i < j of each pair in loaded contact
-    force      (pairs,)     mσγ̇²    mean over the window
-    clustered  (pairs,)     –       whether most of it acts in clusters of three or more
-    side       ()           σ       side of the cell
-    tilt       ()           –       offset of the image row above, in sides of the cell
-    window     ()           strain  over which forces are averaged
-    =========  ===========  ======  ============================================================
-    """
-
-    positions: Float[np.ndarray, "grains 2"]
+    positions: Float[np.ndarray, "grains 2"]  # in σ, in the sheared cell whose centre is the origin
     radii: Float[np.ndarray, " grains"]
-    speed: Float[np.ndarray, " grains"]
-    pairs: Int[np.ndarray, "pairs 2"]
-    force: Float[np.ndarray, " pairs"]
-    clustered: Bool[np.ndarray, " pairs"]
+    speed: Float[np.ndarray, " grains"]  # |c|, the peculiar speed, in σγ̇
+    pairs: Int[np.ndarray, "pairs 2"]  # indices i < j of each pair in loaded contact
+    force: Float[np.ndarray, " pairs"]  # mean over the window, in mσγ̇²
+    clustered: Bool[np.ndarray, " pairs"]  # whether most of it acts in clusters of three or more
     side: float
     tilt: float
-    window: float
+    window: float  # strain over which forces are averaged
 
 
 def instant_of(frame: Snapshot) -> Instant:

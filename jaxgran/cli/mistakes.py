@@ -28,7 +28,6 @@ _COMMON_MISTAKES = {
     "-j": "--workers",
     "--gif": "--movie",
     "--out": "--output",
-    "--like": "--from-map",
     "--force": "--overwrite",
     "-f": "--overwrite",
 }

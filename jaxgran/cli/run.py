@@ -14,7 +14,7 @@ from jaxgran.cli.terminal import configured_jax, say
 from jaxgran.maps.parameters import Option
 from jaxgran.maps.progress import counted
 from jaxgran.model.checks import InputError, require_number, short_repr
-from jaxgran.model.display import with_error
+from jaxgran.model.display import unit_text, with_error
 
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
@@ -180,11 +180,10 @@ def _summary_table(data) -> Table:
         table.rows.append([group])
         for name in names:
             value = with_error(number(path_of(name)), number(f"{path_of(name)}_stderr"))
-            unit = OBSERVABLES[name][1].replace("sigma", "σ").replace("^2", "²").replace(" ", "")
             samples = strain / correlated.get(name, math.nan)
             theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.rows.append([name.replace("_", " "), value, "" if unit == "1" else unit, *texts])
+            table.rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name][1]), *texts])
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 table.rows.append(["shear-stress ratio", ratio, "", "", ""])

@@ -36,23 +36,15 @@ def cell_list_pairs(
     The grid is static: it serves a cutoff within which a homogeneous flow has up to 1.2 × ``capacity`` pairs, and any
     smaller one. Up to 2 × ``capacity`` pairs are found, with up to 128 grains in a cell; beyond that ``missed`` is set.
 
-    =========  ===========  ====  ===========================================================
-    argument   shape        unit  meaning
-    =========  ===========  ====  ===========================================================
-    positions  (grains, 2)  σ     centres
-    side       ()           σ     side L of the cell
-    tilt       ()           –     tilt of the cell, in [−½, ½)
-    cutoff     ()           σ     largest distance (nearest image) of a pair
-    capacity   static       –     number of pairs to expect at most in a homogeneous flow
-    =========  ===========  ====  ===========================================================
+    Args:
+      positions: (grains, 2), centres in σ.
+      side, tilt: of the cell, in σ and in [−½, ½).
+      cutoff: largest distance, in σ, to the nearest image.
+      capacity: number of pairs to expect at most in a homogeneous flow; static.
 
-    ======  ==============  ====================================================================
-    result  shape           meaning
-    ======  ==============  ====================================================================
-    i, j    (2·capacity,)   grains of the pair, i < j; i = j in an empty slot
-    missed  ()              True where pairs may be missing: the cutoff is too large for the
-                            grid, or a cell or the list of pairs is full
-    ======  ==============  ====================================================================
+    Returns:
+      Grains i < j of each pair (2·capacity,), with i = j in an empty slot; and whether pairs may be missing, since the
+      cutoff is too large for the grid, or a cell or the list of pairs is full.
     """
     positions, side, tilt, cutoff = lax.stop_gradient((positions, side, tilt, cutoff))  # pairs are whole numbers
     cells = _cells_per_side(positions.shape[0], capacity)

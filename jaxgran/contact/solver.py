@@ -41,24 +41,13 @@ _DERIVATIVE_ITERATIONS = 50  # at most, for each slot of a contact
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Solution:
-    """Result of one contact solve.
+    """Result of one contact solve."""
 
-    ==========  ===========  ====  ======================================================
-    field       shape        unit  meaning
-    ==========  ===========  ====  ======================================================
-    impulses    (contacts,)  mσγ̇   impulses p₀ at restitution zero, never negative
-    response    (contacts,)  σγ̇    velocity change W p₀ of the contacts
-    residual    ()           –     ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
-    iterations  ()           –     products with W
-    status      ()           –     ok, iteration_limit, infeasible or nonfinite
-    ==========  ===========  ====  ======================================================
-    """
-
-    impulses: Float[Array, " contacts"]
-    response: Float[Array, " contacts"]
-    residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-    status: Int[Array, ""]
+    impulses: Float[Array, " contacts"]  # p₀ at restitution zero, never negative
+    response: Float[Array, " contacts"]  # velocity change W p₀ of the contacts
+    residual: Float[Array, ""]  # ‖min(diag(W) p, W p + u⁻)‖ over ‖min(u⁻, 0)‖
+    iterations: Int[Array, ""]  # products with W
+    status: Int[Array, ""]  # ok, iteration_limit, infeasible or nonfinite
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))

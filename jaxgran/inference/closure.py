@@ -120,13 +120,13 @@ class Prediction:
 def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> Prediction:
     """Predict force ratio and stresses; supports ``jit``, ``vmap`` and differentiation.
 
-    ================  ==========  ==================================================================
-    closure           Closure     as :func:`fit_closure` returns
-    restitution       (*flows)    0 ≤ α < 1; as α → 1 the stresses are those of theory, which diverge
-    packing_fraction  (*flows)    0 < ν ≤ 0.83, of a shape that broadcasts with that of α
-    returns           Prediction  with ``extrapolated`` set outside the fitted ranges
-    raises            InputError  a number is out of range; traced numbers are not checked
-    ================  ==========  ==================================================================
+    Args:
+      closure: as :func:`fit_closure` returns it.
+      restitution: 0 ≤ α < 1; as α → 1 the stresses are those of theory, which diverge.
+      packing_fraction: 0 < ν ≤ 0.83, of a shape that broadcasts with that of α.
+
+    Raises:
+      InputError: (a ValueError) a number is out of range; traced numbers are not checked.
     """
     require_closure(closure)
     require("restitution", restitution, lambda x: (x >= 0) & (x < 1), "at least 0 and below 1")

@@ -36,16 +36,13 @@ def fit_closure(data: MapData, jamming_fraction: float = JAMMING) -> Closure:
     Weights combine the standard errors of the points with a scatter about each law, such that χ² equals the number
     of degrees of freedom, or zero if χ² is smaller without it.
 
-    ================  ===============================  ==============================================================
-    data              (packing_fraction, restitution)  `pressure`, `macroscopic_friction` and `force_ratio` with
-                                                       `_stderr`, and `status`; fitted are points with status ok
-                                                       and α < 1, at the largest of several numbers of
-                                                       grains and the shortest of several time steps
-    jamming_fraction  ()                               ν_J, above 0.83; by default that of a random quench of the
-                                                       size distribution of maps
-    returns           Closure
-    raises            InputError                       fewer than 12 points, or than 3 values of α or of ν
-    ================  ===============================  ==============================================================
+    Args:
+      data: a map with `pressure`, `macroscopic_friction` and `force_ratio`, with `_stderr`, and `status`. Points with
+        status ok and α < 1 are fitted, at the largest of several numbers of grains and the shortest time step.
+      jamming_fraction: ν_J, above 0.83; by default that of a random quench of the size distribution of maps.
+
+    Raises:
+      InputError: (a ValueError) fewer than 12 points, or than 3 values of α or of ν.
 
     Source: scatter by R. C. Paule and J. Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
     """
@@ -55,26 +52,15 @@ def fit_closure(data: MapData, jamming_fraction: float = JAMMING) -> Closure:
 
 
 class Points(NamedTuple):
-    """Points of a map to which a closure is fitted.
+    """Points of a map to which a closure is fitted."""
 
-    =============================  ===========  ==================================================================
-    field                          shape        meaning
-    =============================  ===========  ==================================================================
-    place                          (points,)    index in the flattened map, ν before α
-    restitution, packing_fraction  (points,)    α and ν
-    logs, errors                   (points, 3)  logarithms of the quantities in ``LAWS`` and their standard errors
-    theory                         (points, 2)  logarithms of the pressure and the friction of theory
-    timestep                       float        dt in 1/γ̇, NaN if unknown
-    =============================  ===========  ==================================================================
-    """
-
-    place: np.ndarray
-    restitution: np.ndarray
-    packing_fraction: np.ndarray
-    logs: np.ndarray
-    errors: np.ndarray
-    theory: np.ndarray
-    timestep: float
+    place: np.ndarray  # (points,), index in the flattened map, ν before α
+    restitution: np.ndarray  # (points,)
+    packing_fraction: np.ndarray  # (points,)
+    logs: np.ndarray  # (points, 3), logarithms of the quantities in ``LAWS``
+    errors: np.ndarray  # (points, 3), their standard errors
+    theory: np.ndarray  # (points, 2), logarithms of the pressure and the friction of theory
+    timestep: float  # dt in 1/γ̇, NaN if unknown
 
     def chosen(self, which: np.ndarray) -> Points:
         """The points that a mask or an index array selects."""

@@ -45,64 +45,34 @@ class Noise(NamedTuple):
 
 
 class Flights(NamedTuple):
-    """Unwrapped tracks, in the units of the fit.
+    """Unwrapped tracks, in the units of the fit."""
 
-    ==========  ===================  =====================================================================
-    time        (frames,)            of each frame
-    positions   (frames, grains, 2)  on a straight line between collisions; NaN if missing
-    velocities  (frames, grains, 2)  along that line; NaN if unknown
-    places      (frames, grains, 2)  observed positions, in the cell
-    cell        (frames, 3)          as in ``Tracks``
-    shear_rate  ()                   γ̇
-    diameters   (grains,)
-    masses      (grains,)            NaN if unknown
-    ==========  ===================  =====================================================================
-    """
-
-    time: np.ndarray
-    positions: np.ndarray
-    velocities: np.ndarray
-    places: np.ndarray
-    cell: np.ndarray
+    time: Float[np.ndarray, " frames"]
+    positions: Float[np.ndarray, "frames grains 2"]  # on a straight line between collisions; NaN if missing
+    velocities: Float[np.ndarray, "frames grains 2"]  # along that line; NaN if unknown
+    places: Float[np.ndarray, "frames grains 2"]  # observed positions, in the cell
+    cell: Float[np.ndarray, "frames 3"]  # as in ``Tracks``
     shear_rate: float
-    diameters: np.ndarray
-    masses: np.ndarray
+    diameters: Float[np.ndarray, " grains"]
+    masses: Float[np.ndarray, " grains"]  # NaN if unknown
 
 
 class Candidates(NamedTuple):
-    """Pairs that may have collided in a window, with the observations before and after.
+    """Pairs that may have collided in a window, with the observations in the frames around it."""
 
-    =================  ==================  ====================================================================
-    field              shape               meaning
-    =================  ==================  ====================================================================
-    window             (pairs,)            frame before the collision
-    grains             (pairs, 2)          the discs i and j
-    reach              (pairs,)            contact distance from the diameters
-    time               (pairs, frames)     of the frames around the window, from its start
-    separation         (pairs, frames, 2)  of disc i from the image of disc j
-    velocity           (pairs, frames, 2)  its rate of change; 0 if unknown
-    has_velocity       (pairs, frames)     whether it is known
-    before, after      (pairs, frames)     which frames belong to the flights
-    duration           (pairs,)            of the window
-    guess              (pairs, 5)          separation at contact (2), time of contact, velocity before (2)
-    drift              (pairs,)            χ² of a straight flight of the centre of mass
-    drift_freedom      (pairs,)            its degrees of freedom
-    =================  ==================  ====================================================================
-    """
-
-    window: Int[np.ndarray, " pairs"]
-    grains: Int[np.ndarray, "pairs 2"]
-    reach: Float[np.ndarray, " pairs"]
-    time: Float[np.ndarray, "pairs frames"]
-    separation: Float[np.ndarray, "pairs frames 2"]
-    velocity: Float[np.ndarray, "pairs frames 2"]
+    window: Int[np.ndarray, " pairs"]  # frame before the collision
+    grains: Int[np.ndarray, "pairs 2"]  # the discs i and j
+    reach: Float[np.ndarray, " pairs"]  # contact distance from the diameters
+    time: Float[np.ndarray, "pairs frames"]  # from the start of the window
+    separation: Float[np.ndarray, "pairs frames 2"]  # of disc i from the image of disc j
+    velocity: Float[np.ndarray, "pairs frames 2"]  # its rate of change; 0 if unknown
     has_velocity: Bool[np.ndarray, "pairs frames"]
-    before: Bool[np.ndarray, "pairs frames"]
+    before: Bool[np.ndarray, "pairs frames"]  # whether a frame belongs to the flight before the collision
     after: Bool[np.ndarray, "pairs frames"]
-    duration: Float[np.ndarray, " pairs"]
-    guess: Float[np.ndarray, "pairs 5"]
-    drift: Float[np.ndarray, " pairs"]
-    drift_freedom: Float[np.ndarray, " pairs"]
+    duration: Float[np.ndarray, " pairs"]  # of the window
+    guess: Float[np.ndarray, "pairs 5"]  # separation at contact (2), time of contact, velocity before (2)
+    drift: Float[np.ndarray, " pairs"]  # χ² of a straight flight of the centre of mass
+    drift_freedom: Float[np.ndarray, " pairs"]  # its degrees of freedom
 
 
 def flights_of(tracks: Tracks) -> tuple[Flights, float, float]:

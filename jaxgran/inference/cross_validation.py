@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from jaxgran.inference.closure import NEEDED, broadcast, require_jamming
+from jaxgran.inference.closure import NEEDED, broadcast
 from jaxgran.inference.closure import prediction as closure_prediction
 from jaxgran.inference.closure_fit import (
     FEWEST_POINTS,
@@ -21,16 +21,17 @@ from jaxgran.maps.schema import MapData, finest, require_map
 from jaxgran.sampling.timestep import JAMMING
 
 
-def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Dataset:
+def leave_one_out(data: MapData) -> xr.Dataset:
     """Predict every point of a map by the closure fitted to all others.
 
-    ================  ===============================  ==============================================================
-    data              (packing_fraction, restitution)  as for :func:`fit_closure`, and `shear_stress` with `_stderr`
-    jamming_fraction  ()                               ν_J
-    returns           (packing_fraction, restitution)  the variables below; NaN where a point is not fitted
-    raises            InputError                       fewer than 13 points, or fewer than 3 values of α or of ν
-                                                       when one point is left out
-    ================  ===============================  ==============================================================
+    Args:
+      data: as for :func:`fit_closure`, and `shear_stress` with `_stderr`.
+
+    Returns:
+      A dataset of the variables below, by packing fraction and restitution; NaN where a point is not fitted.
+
+    Raises:
+      InputError: (a ValueError) fewer than 13 points, or than 3 values of α or of ν when one point is left out.
 
     ==================  =============================================================================================
     variable            meaning; NAME is pressure, shear_stress or force_ratio
@@ -45,13 +46,12 @@ def leave_one_out(data: MapData, jamming_fraction: float = JAMMING) -> xr.Datase
     ==================  =============================================================================================
     """
     require_map(data, *NEEDED, "shear_stress", "shear_stress_stderr")
-    require_jamming(jamming_fraction)
     points = closure_points(data, FEWEST_POINTS + 1)
     indices, closures = np.arange(len(points.place)), []
     for k in indices:
         others = points.chosen(indices != k)
         require_enough(others.restitution, others.packing_fraction, FEWEST_POINTS)
-        closures.append(fit_points(others, jamming_fraction))
+        closures.append(fit_points(others, JAMMING))
     batch = jax.tree.map(lambda *x: np.stack(x), *closures)
     alpha, nu = broadcast(restitution=points.restitution, packing_fraction=points.packing_fraction)
     predicted = _batch_predictions(batch, alpha, nu)

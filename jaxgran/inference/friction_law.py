@@ -98,19 +98,14 @@ def friction_law(
     the squared slope of the law, less twice the slope times their covariance. It is found by iteration. A map without
     `diagnostics/friction_error_correlation` is fitted as if the errors of μ and I were independent.
 
-    =========================  ===============================  =====================================================
-    data                       (packing_fraction, restitution)  `macroscopic_friction` and `inertial_number` with
-                                                                `_stderr`, and `status`; the largest of several
-                                                                numbers of grains and the shortest of several time
-                                                                steps are fitted
-    largest_inertial_number    ()                               of a dense point
-    smallest_packing_fraction  ()                               of a dense point; it excludes nearly elastic flows,
-                                                                which have a small I because they are hot, although
-                                                                they are not dense
-    returns                    FrictionLaw
-    raises                     ValueError                       fewer than four dense points with status ok, or at
-                                                                fewer than three packing fractions
-    =========================  ===============================  =====================================================
+    Args:
+      data: a map with `macroscopic_friction` and `inertial_number`, with `_stderr`, and `status`. The largest of
+        several numbers of grains and the shortest of several time steps are fitted.
+      largest_inertial_number: of a dense point.
+      smallest_packing_fraction: of a dense point; it excludes nearly elastic flows, whose small I is due to heat.
+
+    Raises:
+      InputError: (a ValueError) fewer than four dense points with status ok, or at fewer than three packing fractions.
     """
     require_map(data, *NEEDED)
     for name, limit in (

@@ -63,18 +63,19 @@ def restitution_from_stresses(
     weighted by the inverse of the covariance of measurement plus closure. The best α of a grid is refined by
     Gauss–Newton steps.
 
-    ===================  ===================  =====================================================================
-    closure              Closure              as :func:`fit_closure` returns
-    packing_fraction     (*flows)             0 < ν ≤ 0.83
-    pressure             (*flows)             total, in units of m = σ = γ̇ = 1
-    shear_stress         (*flows)             the same, positive
-    pressure_stderr      (*flows)             standard error, in the same units
-    shear_stress_stderr  (*flows)             standard error, in the same units
-    correlation          (*flows)             of the two errors, −1 to 1; about 0.95 for averages of one run, whose
-                                              quotient, the friction, is then far more precise
-    returns              RestitutionEstimate  of the broadcast shape of all arguments
-    raises               InputError           a number is out of range
-    ===================  ===================  =====================================================================
+    Args:
+      closure: as :func:`fit_closure` returns it.
+      packing_fraction: 0 < ν ≤ 0.83.
+      pressure, shear_stress: total and positive, in units of m = σ = γ̇ = 1.
+      pressure_stderr, shear_stress_stderr: standard errors, in the same units.
+      correlation: of the two errors, −1 to 1; about 0.95 for averages of one run, whose quotient, the friction, is then
+        far more precise.
+
+    Returns:
+      An estimate of the broadcast shape of all numbers.
+
+    Raises:
+      InputError: (a ValueError) a number is out of range.
     """
     require_closure(closure)
     require_fraction(packing_fraction)

@@ -285,4 +285,3 @@ _READERS: dict[str, Callable[[Path], Table]] = {
     **dict.fromkeys((".lammpstrj", ".dump"), _lammps_table),
     ".gsd": _gsd_table,
 }
-TRACK_ENDINGS = tuple(_READERS)

@@ -49,33 +49,19 @@ class Tracks:
 
 
 class Table(NamedTuple):
-    """Content of a file: a row for each disc in each frame.
+    """Content of a file: a row for each disc in each frame."""
 
-    ==========  =========  ==============================================================================
-    columns     (rows,)    by name: frame or time, id, x, y; optionally diameter, mass, vx, vy
-    cells       (frames,3) as in ``Tracks``, in the order of the frames; None without a periodic cell
-    ==========  =========  ==============================================================================
-    """
-
-    columns: dict[str, np.ndarray]
-    cells: np.ndarray | None = None
+    columns: dict[str, np.ndarray]  # (rows,) by name: frame or time, id, x, y; optionally diameter, mass, vx, vy
+    cells: np.ndarray | None = None  # (frames, 3) as in ``Tracks``, by frame; None without a periodic cell
 
 
 class Observation(NamedTuple):
-    """What the user specifies about a file; None to infer it.
+    """What the user specifies about a file; None to infer it."""
 
-    ===========  ====  ==========================================================================
-    interval     t     time between frames whose numbers differ by the smallest difference
-    shear_rate   1/t   γ̇
-    peculiar     –     whether velocities are relative to the mean flow γ̇ y x̂
-    diameter     ℓ     of all discs
-    ===========  ====  ==========================================================================
-    """
-
-    interval: float | None = None
+    interval: float | None = None  # time between frames whose numbers differ by the smallest difference
     shear_rate: float | None = None
-    peculiar: bool = False
-    diameter: float | None = None
+    peculiar: bool = False  # whether velocities are relative to the mean flow γ̇ y x̂
+    diameter: float | None = None  # of all discs
 
 
 def tracks_of_states(strain: Float[np.ndarray, " frames"], states: State, shear_rate: float = 1.0) -> Tracks:

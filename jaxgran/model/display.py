@@ -91,6 +91,13 @@ def with_error(value: float, error: float) -> str:
     return f"({text})e{shared:+03d}" if shared else text
 
 
+def unit_text(unit: str) -> str:
+    """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for a pure number."""
+    for word, sign in (("shear rate", "γ̇"), ("m sigma", "mσ"), ("sigma", "σ"), ("^2", "²"), (" / ", "/")):
+        unit = unit.replace(word, sign)
+    return "" if unit == "1" else unit
+
+
 def _plain_text(row: Row) -> str:
     return row.value if isinstance(row.value, str) else value_text(row.value, row.error)
 

@@ -1,6 +1,6 @@
 """A flow as a page that plays: its grains and forces frame by frame, and the averages up to each frame."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array
@@ -9,10 +9,12 @@ from jaxgran.analysis.instant import Instant, instant_of
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.dynamics.tally import Tally
+from jaxgran.model.display import unit_text
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.page.document import Page, document
 from jaxgran.page.grain_data import ENCODING, grain_data, scale_of
+from jaxgran.page.map_data import numbers
 from jaxgran.plotting.movie import Frames
 from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper
 from jaxgran.sampling.observables import OBSERVABLES, averages
@@ -78,14 +80,14 @@ class Film:
             "A frame shows the forces of one time step. Averages are those from the first frame to the one shown.",
             "strain": strains,
             "frames": [grain_data(**one.instant._asdict(), scale=scale) for one in seen],
-            "averages": [_average(name, [one.averages[name] for one in seen]) for name in AVERAGES],
+            "averages": [
+                {
+                    "name": name.replace("_", " "),
+                    "unit": unit_text(OBSERVABLES[name][1]),
+                    "values": numbers(np.array([one.averages[name] for one in seen])),
+                }
+                for name in AVERAGES
+            ],
             "encoding": ENCODING,
         }
         return document("flow", _SCRIPTS, data["title"], data)
-
-
-def _average(name: str, values: list[float]) -> dict[str, Any]:
-    """The course of an average, in types of JSON."""
-    unit = OBSERVABLES[name][1].replace("sigma", "σ").replace("^2", "²")
-    known = [float(f"{x:.7g}") if np.isfinite(x) else None for x in values]
-    return {"name": name.replace("_", " "), "unit": "" if unit == "1" else unit, "values": known}

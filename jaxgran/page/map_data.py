@@ -10,6 +10,7 @@ import xarray as xr
 from jaxgran.maps.parameters import options
 from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, require_map
 from jaxgran.model.checks import InputError
+from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
 from jaxgran.plotting.encoding import EXCESS_LEVELS
@@ -31,7 +32,6 @@ _COMPANIONS = ("_stderr", "_ci95")
 _GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
 _LEFT_OUT = ("status", "point_grains")
 _NAMED = {name: one.kind for name, one in options("map").items() if isinstance(one.kind, tuple)}  # choices of a run
-_SIGNS = {"shear rate": "γ̇", "sigma": "σ", "^2": "²", " / ": "/", "t²": "t²"}
 
 
 def map_data(data: MapData) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def map_data(data: MapData) -> dict[str, Any]:
         "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
         "observables": observables,
         "status": _statuses(data, dims),
-        "grains": _numbers(_column(data.point_grains, data, dims)) if "point_grains" in data else None,
+        "grains": numbers(_column(data.point_grains, data, dims)) if "point_grains" in data else None,
         "meanings": MEANINGS,
         "excessLevels": list(EXCESS_LEVELS),
         "instants": instants,
@@ -122,8 +122,8 @@ def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> It
         yield {
             "name": _text(label + component),
             "meaning": _text(about.get("long_name", label.replace("_", " "))) + component.replace("_", ", "),
-            "unit": _unit(about.get("reduced_unit", about.get("units", ""))),
-            **{part: _numbers(values) for part, values in columns.items()},
+            "unit": unit_text(_text(about.get("reduced_unit", about.get("units", "")))),
+            **{part: numbers(values) for part, values in columns.items()},
         }
 
 
@@ -221,7 +221,7 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
         return None
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
     strain = _column(data["seeds/strain"].mean("seed"), data, dims)
-    return {"seeds": seeds, "options": " ".join(words), "strain": _numbers(strain)}
+    return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
 
 
 def _about(data: xr.Dataset) -> str:
@@ -238,19 +238,11 @@ def _axis(data: xr.Dataset, name: str) -> list[float]:
     return [value[0].item()] if value.size == 1 and value.dtype.kind in "iuf" else []
 
 
-def _unit(units: Any) -> str:
-    """A unit with its signs; nothing for a pure number."""
-    text = _text(units)
-    for word, sign in _SIGNS.items():
-        text = text.replace(word, sign)
-    return "" if text == "1" else text
-
-
 def _text(value: Any) -> str:
     """An attribute or a name as a short line."""
     return " ".join(str(value).split())[:_LONGEST_TEXT]
 
 
-def _numbers(values: np.ndarray) -> list[float | None]:
+def numbers(values: np.ndarray) -> list[float | None]:
     """Numbers to a few digits, or None where they are not finite."""
     return [float(f"{x:.{_DIGITS}g}") if np.isfinite(x) else None for x in values.tolist()]

@@ -182,14 +182,9 @@ def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside uppe
 def force_lines(
     starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray, widths: np.ndarray, **style: Any
 ) -> LineCollection:
-    """Return lines from centre to centre, and their images.
+    """Return lines from ``starts`` (pairs, 2) along ``branches`` (pairs, 2), of given widths (pairs,) in points.
 
-    ========  ==============  ======  ==================================================
-    starts    (pairs, 2)      σ       one end of each line
-    branches  (pairs, 2)      σ       vector from there to the other end
-    shifts    (images, 2)     σ       lattice vectors of the images, the cell included
-    widths    (pairs,)        points  widths of the lines
-    ========  ==============  ======  ==================================================
+    They are repeated at each of the ``shifts`` (images, 2), lattice vectors that include zero.
     """
     segments = np.stack([starts, starts + branches], axis=1)
     images = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)

@@ -57,13 +57,12 @@ def enskog_factors(data: MapData, stress: Literal["pressure", "shear_stress"] = 
     one. In dotted areas it differs from one by less than its standard error. Green contours show the excess of the
     force ratio.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `theory/enskog_factor_...` of the stress, with `_stderr`,
-                                             `force_ratio` and `status`
-    stress   text                            "pressure" or "shear_stress"
-    returns  Figure
-    raises   ValueError                      fewer than two restitutions or two packing fractions
-    ======== =============================== =====================================================
+    Args:
+      data: a map with `theory/enskog_factor_...` of the stress and `force_ratio`, with `_stderr`, and `status`.
+      stress: "pressure" or "shear_stress".
+
+    Raises:
+      InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
     data = require_map(data, *RATIO, *_needed(stress))
     require_plane(data)

@@ -44,14 +44,15 @@ def has_errors(data: xr.Dataset) -> bool:
 def dominating_errors(data: MapData) -> Figure:
     """Return the whole error of each point of a map, and which of its parts is the largest.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `force_ratio`, `pressure` and `granular_temperature`
-                                             with `_stderr` and `_ci95`; of several sizes or
-                                             time steps, the largest and the shortest
-    returns  Figure                          a mark for each point: its shape is the largest part,
-                                             its area grows with the whole error, in per cent
-    raises   ValueError                      the data are not a map, or have no error budget
-    ======== =============================== =====================================================
+    Args:
+      data: a map with `force_ratio`, `pressure` and `granular_temperature`, with `_stderr` and `_ci95`; of several
+        sizes or time steps, the largest and the shortest are drawn.
+
+    Returns:
+      A mark for each point: its shape is the largest part, its area grows with the whole error, in per cent.
+
+    Raises:
+      InputError: (a ValueError) the data are not a map, or have no error budget.
     """
     data = require_map(data, *RATIO, *_NEEDED)
     data = finest(ordered(data, *_NEEDED))

@@ -55,43 +55,23 @@ _LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]  # the cell and its 
 
 
 class Scene(NamedTuple):
-    """What a picture shows of a flow; the cell is centred at the origin.
+    """What a picture shows of a flow, in units of σ, m and 1/γ̇; the cell is centred at the origin."""
 
-    =================  ===========  =====  =======================================================
-    field              shape        unit   meaning
-    =================  ===========  =====  =======================================================
-    centres            (grains, 2)  σ      positions of the grains, within the cell
-    radii              (grains,)    σ      radii of the grains
-    speed              (grains,)    σγ̇     |c|, the peculiar speed
-    pressure           (grains,)    mγ̇²    Σ F r/2πr² over the contacts of each grain
-    starts             (pairs, 2)   σ      centre of one grain of each loaded pair
-    branches           (pairs, 2)   σ      from there to the centre of the other grain
-    force              (pairs,)     mσγ̇²   mean over the times of the window
-    clustered          (pairs,)     –      whether most of it acts within clusters of three or more
-    side, tilt         ()           σ, –   side and tilt of the cell
-    restitution        ()           –      α
-    packing_fraction   ()           –      ν
-    timestep           ()           1/γ̇    dt
-    times              ()           –      number of snapshots in the window
-    window             ()           –      strain of the window; whole numbers between snapshots are not counted
-    =================  ===========  =====  =======================================================
-    """
-
-    centres: Float[np.ndarray, "grains 2"]
+    centres: Float[np.ndarray, "grains 2"]  # within the cell
     radii: Float[np.ndarray, " grains"]
-    speed: Float[np.ndarray, " grains"]
-    pressure: Float[np.ndarray, " grains"]
-    starts: Float[np.ndarray, "pairs 2"]
-    branches: Float[np.ndarray, "pairs 2"]
-    force: Float[np.ndarray, " pairs"]
-    clustered: Bool[np.ndarray, " pairs"]
+    speed: Float[np.ndarray, " grains"]  # |c|, without the shear
+    pressure: Float[np.ndarray, " grains"]  # Σ F r/2πr² over the contacts of each grain
+    starts: Float[np.ndarray, "pairs 2"]  # centre of one grain of each loaded pair
+    branches: Float[np.ndarray, "pairs 2"]  # from there to the centre of the other grain
+    force: Float[np.ndarray, " pairs"]  # mean over the times of the window
+    clustered: Bool[np.ndarray, " pairs"]  # whether most of it acts within clusters of three or more
     side: float
     tilt: float
     restitution: float
     packing_fraction: float
     timestep: float
-    times: int
-    window: float
+    times: int  # number of snapshots in the window
+    window: float  # strain of the window; whole numbers between snapshots are not counted
 
 
 class Scale(NamedTuple):

@@ -54,12 +54,14 @@ def has_friction_law(data: xr.Dataset) -> bool:
 def friction_figure(data: MapData) -> Figure:
     """Return friction and packing fraction against the inertial number, with the laws of dense flow.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) as in :func:`jaxgran.inference.friction_law.friction_law`
-    returns  Figure                          fitted points are filled, other points are open; the
-                                             parameters of the laws are in the legends
-    raises   ValueError                      too few dense points
-    ======== =============================== =====================================================
+    Args:
+      data: as in :func:`jaxgran.inference.friction_law.friction_law`.
+
+    Returns:
+      Fitted points are filled, other points are open; the parameters of the laws are in the legends.
+
+    Raises:
+      InputError: (a ValueError) too few dense points.
     """
     data = require_map(data, *RATIO, *NEEDED)
     law = friction_law(data)

@@ -38,16 +38,15 @@ def save_figures(
     `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
     ======================= ==================================================================
 
-    ======== ============= =====================================================================
-    data     Dataset       as in :func:`ratio_curves` or :func:`ratio_against_timestep`
-    stem     path          folder and beginning of the names; the folder must exist
-    format   text          "png", "pdf" or "svg", which is also the ending of the names
-    dpi      int           dots per inch of a PNG, 50 to 1200; the other formats have none
-    caption  bool          whether the parameters of the run and the notes stand under the axes
-    returns  list of Path  the files written, in the order above
-    raises   ValueError    the data are not a map, a choice is not one of these, or no files can be
-                           written there
-    ======== ============= =====================================================================
+    Args:
+      data: as in :func:`ratio_curves` or :func:`ratio_against_timestep`.
+      stem: folder, which must exist, and beginning of the names.
+      format: "png", "pdf" or "svg", which is also the ending of the names.
+      dpi: dots per inch of a PNG, 50 to 1200; the other formats have none.
+      caption: whether the parameters of the run and the notes stand under the axes.
+
+    Raises:
+      InputError: (a ValueError) the data are not a map, a choice is not one of these, or no files can be written there.
     """
     data = require_map(data, *RATIO)
     require_file(format, dpi)

@@ -21,7 +21,7 @@ from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.encoding import BINARY_COLOUR
-from jaxgran.plotting.flow import COLOURS, Colour, common_scale, draw_picture, scene_of
+from jaxgran.plotting.flow import COLOURS, common_scale, draw_picture, scene_of
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
 _WIDTH = 5.6  # inches
@@ -71,22 +71,21 @@ def check_movie(path: Path) -> None:
     require_place(path, "movie", path.suffix)
 
 
-def write_movie(path: Path, frames: Frames, colour: Colour = "speed", follow: _Follow = iter) -> None:
-    """Write a movie, whole or not at all.
+def write_movie(path: Path, frames: Frames, follow: _Follow = iter) -> None:
+    """Write a movie, whole or not at all; the grains have the colour of their speed.
 
     Args:
       path: GIF or MP4 file. An existing file is replaced.
       frames: one or more frames of one flow.
-      colour: "speed" or "pressure" of the grains.
       follow: passes the frames on as they are drawn, and may report how many are done.
     """
     figure = empty_figure(_WIDTH, _HEIGHT)
     figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
-    drawings = _drawings(figure, frames, colour, follow)
+    drawings = _drawings(figure, frames, follow)
     with atomic_write(path) as temporary:
         if path.suffix == ".gif":
-            palette = _palette(colour)
+            palette = _palette()
             nearest = _nearest(palette)
             first, *others = [_picture(figure, palette, nearest) for _ in drawings]
             first.save(temporary, save_all=True, append_images=others, duration=1000 // _FRAMES_PER_SECOND, loop=0)
@@ -97,13 +96,13 @@ def write_movie(path: Path, frames: Frames, colour: Colour = "speed", follow: _F
                     writer.grab_frame()
 
 
-def _drawings(figure: Figure, frames: Frames, colour: Colour, follow: _Follow) -> Iterator[None]:
+def _drawings(figure: Figure, frames: Frames, follow: _Follow) -> Iterator[None]:
     """Draw the frames one after the other in the same figure; yields after each."""
-    scale = common_scale(frames.scenes, colour)
+    scale = common_scale(frames.scenes, "speed")
     for scene, strain in follow(list(zip(frames.scenes, frames.strains, strict=True))):
         figure.clear()
         axes = figure.add_axes(_AXES_PLACE)
-        draw_picture(axes, scene, colour, scale, strain)
+        draw_picture(axes, scene, "speed", scale, strain)
         axes.set_xlim(-_HALF_WIDTH * scene.side, _HALF_WIDTH * scene.side)
         yield
 
@@ -118,12 +117,12 @@ def _picture(figure: Figure, palette: np.ndarray, nearest: np.ndarray) -> Image.
     return picture
 
 
-def _palette(colour: Colour) -> np.ndarray:
+def _palette() -> np.ndarray:
     """The colours (shades, 3) of grains, lines and text, fixed for all frames so that rare colours are kept."""
     ramps = (
         LinearSegmentedColormap.from_list("grey", ["white", "black"]),
-        COLOURS[colour],
-        *(LinearSegmentedColormap.from_list("line", [BINARY_COLOUR, end]) for end in ("white", COLOURS[colour](1.0))),
+        COLOURS["speed"],
+        *(LinearSegmentedColormap.from_list("line", [BINARY_COLOUR, end]) for end in ("white", COLOURS["speed"](1.0))),
     )
     shades = np.concatenate([ramp(np.linspace(0, 1, n))[:, :3] for ramp, n in zip(ramps, _SHADES, strict=True)])
     return np.round(255 * shades).astype(np.uint8)

@@ -67,17 +67,17 @@ _LEAST_CONTOURED = 0.02  # excess above which the error of interpolation is quot
 def ratio_curves(data: MapData) -> Figure:
     """Return force ratio and shear-stress ratio against the packing fraction, one curve per restitution (Figure 1).
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `force_ratio`, `force_ratio_stderr` (dimensionless)
-                                             and, where present, the CF flag variable `status` and
-                                             `stress_ratio`, `stress_ratio_stderr`; the largest of
-                                             several numbers of grains and the shortest of several
-                                             time steps are drawn
-    returns  Figure                          two panels with one scale; a map without
-                                             `stress_ratio` has the panel of the force ratio alone;
-                                             error bars are one standard error; a point whose
-                                             status is not `ok` is an open symbol in a ring
-    ======== =============================== =====================================================
+    Args:
+      data: a map with `force_ratio`, `force_ratio_stderr` and, where present, `status`, `stress_ratio` and
+        `stress_ratio_stderr`. The largest of several numbers of grains and the shortest of several time steps are
+        drawn.
+
+    Returns:
+      Two panels with one scale, or one where the map has no `stress_ratio`. Error bars are one standard error; a point
+      whose status is not `ok` is an open symbol in a ring.
+
+    Raises:
+      InputError: (a ValueError) the data are not a map.
     """
     data = require_map(data, *RATIO)
     data = _with_shear_stress_ratio(finest(ordered(data, "stress_ratio")))
@@ -115,12 +115,14 @@ def ratio_contours(data: MapData) -> Figure:
     most the interpolated standard error, and of those where it differs by at most the error of interpolation, as
     estimated from points that are left out.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) as in :func:`ratio_curves`
-    returns  Figure                          each level of `EXCESS_LEVELS` that the map reaches is
-                                             drawn and labelled; the others are named under the axes
-    raises   ValueError                      fewer than two restitutions or two packing fractions
-    ======== =============================== =====================================================
+    Args:
+      data: as in :func:`ratio_curves`.
+
+    Returns:
+      The levels of `EXCESS_LEVELS` that the map reaches, labelled; the others are named under the axes.
+
+    Raises:
+      InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
     data = require_map(data, *RATIO)
     require_plane(data)
@@ -155,14 +157,14 @@ def ratio_against_timestep(data: MapData) -> Figure:
 
     Up to eight curves share one panel. With more, each packing fraction has a panel with its own force-ratio axis.
 
-    ======== ========================================= =============================================
-    data     (timestep, packing_fraction, restitution) as in :func:`ratio_curves`; `timestep` in
-                                                       units of 1/γ̇
-    returns  Figure                                    error bars are one standard error; a point
-                                                       whose status is not `ok` is an open symbol in
-                                                       a ring
-    raises   ValueError                                fewer than two time steps
-    ======== ========================================= =============================================
+    Args:
+      data: as in :func:`ratio_curves`, with a dimension `timestep` in units of 1/γ̇.
+
+    Returns:
+      Error bars are one standard error; a point whose status is not `ok` is an open symbol in a ring.
+
+    Raises:
+      InputError: (a ValueError) fewer than two time steps.
     """
     data = require_map(data, *RATIO)
     if data.sizes.get("timestep", 1) < 2:

@@ -44,15 +44,16 @@ def averages_against_grains(data: MapData) -> Figure:
     curve. Up to eight curves share the panels. With more, each packing fraction has a row of panels, with at most eight
     restitutions, evenly chosen.
 
-    ======== ======================================= =====================================================
-    data     (grains, packing_fraction, restitution) `force_ratio` and any of `pressure`, `shear_stress`
-                                                     and `granular_temperature`, with `_stderr`, and
-                                                     `status`; the shortest of several time steps is drawn
-    returns  Figure                                  error bars are one standard error of the value at
-                                                     each N; a point whose status is not `ok` is an open
-                                                     symbol in a ring
-    raises   ValueError                              fewer than two numbers of grains
-    ======== ======================================= =====================================================
+    Args:
+      data: a map with a dimension `grains`, with `force_ratio` and any of `pressure`, `shear_stress` and
+        `granular_temperature`, their `_stderr`, and `status`. The shortest of several time steps is drawn.
+
+    Returns:
+      Error bars are one standard error of the value at each N; a point whose status is not `ok` is an open symbol in a
+      ring.
+
+    Raises:
+      InputError: (a ValueError) fewer than two numbers of grains.
     """
     data = require_map(data, *RATIO)
     sizes = data.sizes.get("grains", 1)

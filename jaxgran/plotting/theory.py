@@ -134,12 +134,11 @@ def theory_errors(data: MapData) -> Figure:
     the force ratio. The theory is the Enskog balance of the second moments of anisotropic Gaussian velocities, for each
     size class.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) what :func:`error_parts` needs, `force_ratio` and
-                                             `status`
-    returns  Figure
-    raises   ValueError                      fewer than two restitutions or two packing fractions
-    ======== =============================== =====================================================
+    Args:
+      data: a map with what :func:`error_parts` needs, `force_ratio` and `status`.
+
+    Raises:
+      InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
     data = require_map(data, *RATIO, *_STRESSES_NEEDED)
     require_plane(data)
@@ -205,12 +204,12 @@ def cluster_shares(data: MapData) -> Figure:
     symbol per packing fraction. Right, if the map is a plane: contours of the share of the pressure, and in green those
     of the excess.
 
-    ======== =============================== =====================================================
-    data     (packing_fraction, restitution) `cluster_pressure_share` and `cluster_shear_share` in
-                                             `stresses`,
-                                             `force_ratio`, with `_stderr`, and `status`
-    returns  Figure                          error bars are one standard error, in both directions
-    ======== =============================== =====================================================
+    Args:
+      data: a map with `stresses/cluster_pressure_share`, `stresses/cluster_shear_share` and `force_ratio`, with
+        `_stderr`, and `status`.
+
+    Returns:
+      Error bars are one standard error, in both directions.
     """
     data = require_map(data, *RATIO, *SHARES)
     data = finest(ordered(data, "stresses/cluster_pressure_share", "stresses/cluster_shear_share"))

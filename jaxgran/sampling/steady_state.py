@@ -211,7 +211,7 @@ def sample_batch(
     longest = np.maximum(LONGEST_STRAIN, LONGEST_MEMORIES * batch.memory)
     batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, drive)
     while error is not None:
-        worst = np.array([relative_error(one) for one in _split(_as_sample(batch, tally))])
+        worst = np.array([relative_error(one) for one in _as_sample(batch, tally)])
         extended = (worst > error) & (2 * strains <= longest) & (batch.status < Status.nonfinite)
         if not extended.any():
             break
@@ -337,11 +337,6 @@ def _as_sample(batch: Batch, tally: Tally) -> Sample:
     """The sample of a batch from its tallies, (replicas, blocks)."""
     side, shear_rate = np.asarray(batch.state.side), np.asarray(batch.flow.shear_rate)
     return Sample(tally, side**2, shear_rate, batch.flow.grains)
-
-
-def _split(sample: Sample) -> list[Sample]:
-    """The samples of the single replicas of a batch."""
-    return [sample[k] for k in range(len(sample.area))]
 
 
 def _sheared(batch: Batch, strain: np.ndarray, drive: AdvanceBatch, measure: bool = False) -> Batch:

@@ -15,16 +15,10 @@ from jaxgran.theory.steady_shear import Scalar, as_floats
 
 
 class MomentumTransfer(NamedTuple):
-    """Momentum transferred by collisions per unit area and time; both are symmetric.
+    """Momentum transferred by collisions per unit area and time; both are symmetric."""
 
-    ============  =======  ==============================================================================
-    stress        m/t²     Σ d n ⊗ n p over the collisions, the collisional stress
-    speed_stress  mσ/t³    the same, each collision times its speed of approach w
-    ============  =======  ==============================================================================
-    """
-
-    stress: Float[Array, "*replicas 2 2"]
-    speed_stress: Float[Array, "*replicas 2 2"]
+    stress: Float[Array, "*replicas 2 2"]  # Σ d n ⊗ n p over the collisions, the collisional stress
+    speed_stress: Float[Array, "*replicas 2 2"]  # the same, each collision times its speed of approach w
 
 
 @partial(jax.jit, static_argnames="size_classes")

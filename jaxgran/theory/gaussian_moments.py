@@ -107,20 +107,12 @@ def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, g
 
 
 class _Collisions(NamedTuple):
-    """Effects of collisions at unit shear rate; components in the order xx, yy, xy.
+    """Effects of collisions at unit shear rate; components in the order xx, yy, xy."""
 
-    ===========  ============  =====  =================================================
-    source       (3, classes)  mσ²γ̇³  rate of change of the temperature tensor of a class
-    stress       (3,)          mγ̇²    collisional stress
-    dissipation  ()            mγ̇³    energy lost per unit area and time
-    rate         ()            –      collisions per grain and unit strain
-    ===========  ============  =====  =================================================
-    """
-
-    source: Float[Array, "3 classes"]
-    stress: Float[Array, "3"]
-    dissipation: Float[Array, ""]
-    rate: Float[Array, ""]
+    source: Float[Array, "3 classes"]  # rate of change of the temperature tensor of a class
+    stress: Float[Array, "3"]  # collisional
+    dissipation: Float[Array, ""]  # energy lost per unit area and time
+    rate: Float[Array, ""]  # collisions per grain and unit strain
 
 
 def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: Mixture) -> _Collisions:

@@ -11,20 +11,12 @@ ANGLES = 32  # contact directions on the half circle; the integrand is smooth an
 
 
 class Mixture(NamedTuple):
-    """A size distribution represented by a few classes.
-
-    ================  ==================  ====  ==================================================================
-    diameters         (classes,)          σ     diameters of the grains
-    masses            (classes,)          m     masses of the grains
-    number_densities  (classes,)          1/σ²  grains per unit area
-    encounters        (classes, classes)  1/σ   number density of the second class times the contact diameter and χ
-    ================  ==================  ====  ==================================================================
-    """
+    """A size distribution represented by a few classes."""
 
     diameters: Float[Array, " classes"]
     masses: Float[Array, " classes"]
-    number_densities: Float[Array, " classes"]
-    encounters: Float[Array, "classes classes"]
+    number_densities: Float[Array, " classes"]  # grains per unit area
+    encounters: Float[Array, "classes classes"]  # number density of the second class times the contact diameter and χ
 
     @property
     def contact_diameters(self) -> Float[Array, "classes classes"]:
