@@ -1,6 +1,6 @@
 """``python -m jaxgran`` is the command ``jaxgran``."""
 
-from jaxgran.cli.app import main
+from jaxgran.cli.app import program
 
 if __name__ == "__main__":
-    main()
+    program()

@@ -53,7 +53,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
 
 def in_a_process(folder: Path, *arguments: str) -> Outcome:
     """Run a command as its user would, in a process of its own."""
-    command = [sys.executable, "-c", "from jaxgran.cli.app import main; main()", *arguments]
+    command = [sys.executable, "-c", "from jaxgran.cli.app import program; program()", *arguments]
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}  # set by JAX
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     return Outcome(done.returncode, done.stdout, done.stderr)

@@ -34,8 +34,8 @@ if FAULT == "disc full":
     resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000))  # more than the parameters, less than a batch
 
 if __name__ == "__main__":
-    from jaxgran.cli.app import main
+    from jaxgran.cli.app import program
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what it runs in the background
 
-    main()
+    program()

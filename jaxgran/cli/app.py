@@ -97,16 +97,21 @@ def command_line(
     """Options before the command."""
 
 
-def main() -> None:
-    """Entry point: a mistake in the input ends with one sentence and exit status 2."""
-    use_plain_letters()
+def program() -> None:
+    """The program ``jaxgran``: the command in a process of its own, which does not wait for threads that compile."""
     gc.set_threshold(50_000, 20, 100)  # raise the garbage collector's thresholds: the process is short-lived
     try:
-        with sigterm_interrupts():
-            _run()
+        main()
     except SystemExit as end:
         end_without_threads(int(end.code or 0))
         raise
+
+
+def main() -> None:
+    """Run the command that is given; a mistake in the input ends with one sentence and exit status 2."""
+    use_plain_letters()
+    with sigterm_interrupts():
+        _run()
 
 
 def _run() -> NoReturn:
