@@ -174,7 +174,7 @@ def test_what_cannot_be_observed_is_refused_in_one_sentence(flowing, changed: di
 
 
 def test_callback_is_refused_under_a_transformation(flowing) -> None:
-    with pytest.raises(InputError, match="callback must be None where"):
+    with pytest.raises(InputError, match="callback must be None for a batch, and where"):
         jax.jit(lambda state: sample(FLOW, state, STRAIN, callback=print))(flowing(0.7))
 
 
