@@ -222,7 +222,7 @@ def _capacity(pairs_per_grain: int, count: int) -> int:
 def _select(gaps: Float[Array, " m"], largest_skin: Array, capacity: int):
     """Indices of the pairs with a gap within the largest skin that the buffer allows, that skin, and overflow."""
     skins = largest_skin * jnp.asarray(_SKIN_SHARES, gaps.dtype)
-    counts = jnp.sum(gaps[None, :] <= skins[:, None], axis=1, dtype=jnp.int32)
+    counts = jnp.sum(gaps[:, None] <= skins[None, :], axis=0, dtype=jnp.int32)
     fits = counts <= capacity
     skin = skins[jnp.argmax(fits)]
     index = first_true(gaps <= skin, capacity)

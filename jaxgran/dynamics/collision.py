@@ -43,11 +43,11 @@ class AdvanceOptions(NamedTuple):
 
 
 def contact_capacities(grains: int) -> tuple[int, ...]:
-    """Sizes of the contact buffers, smallest first: for dilute, dense and near-jammed flows, and for any packing.
+    """Sizes of the contact buffers, smallest first: for dilute and for dense flows, and for any packing.
 
     The contacts of discs form a planar graph, so there are at most 3 N of them.
     """
-    return tuple(sorted({max(4, grains // 12), grains // 2, 3 * grains // 2, 3 * grains}))
+    return tuple(sorted({max(4, grains // 12), grains // 3, grains, 3 * grains}))
 
 
 def contacts_now(flow: ShearFlow, state: State) -> Contacts:
@@ -114,7 +114,8 @@ def collide(
         apart = jnp.where(_alone(near, contact, grains), delays, 0)
         x, y = x + apart * pairs.ux, y + apart * pairs.uy
     distance = jnp.sqrt(x * x + y * y)
-    nx, ny = (jnp.where(contact, component / distance, 0) for component in (x, y))
+    over = jnp.where(contact, 1 / distance, 0)
+    nx, ny = over * x, over * y
     inverse_masses = 1 / grains.masses
     masses = inverse_masses[near.i], inverse_masses[near.j]
     touching = Touching(near.i, near.j, near.reach, contact, nx, ny, distance, nx * pairs.ux + ny * pairs.uy, *masses)
