@@ -4,8 +4,8 @@ Sixteen replicas of 64 grains are advanced by 200 steps of dt = 1e-3, at three p
 and the gradient of a mean over the replicas is taken through 20 steps. Times are those of the processor, so that other
 work on the machine counts little.
 
-    python -m benchmarks many_replicas            # 8 minutes
-    python -m benchmarks many_replicas --quick    # two replicas, one point, no gradient: 3 minutes
+    python -m benchmarks many_replicas            # 2 minutes
+    python -m benchmarks many_replicas --quick    # two replicas, one point, no gradient: 1 minute
 """
 
 import time

@@ -152,7 +152,7 @@ BENCHMARKS = (
     Benchmark(
         "many_replicas",
         "Which way to advance many replicas is the fastest, and what does it take to compile and to hold?",
-        (8, 3),
+        (2, 1),
         ("many_replicas.json",),
     ),
     Benchmark(
