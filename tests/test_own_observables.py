@@ -12,7 +12,8 @@ from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba, Pallas
 from jaxgran.maps import journal
 from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.own_observables import RESERVED, identity_of
+from jaxgran.maps.own_names import RESERVED
+from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.results import choices_of, read_dataset
 from jaxgran.maps.settings import MapSettings

@@ -1,17 +1,16 @@
-"""Observables of the user's in a map: the check of their function before the run, and their variables."""
+"""Observables of the user's in a map: what identifies their function, and their variables."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from jaxgran.maps.schema import ERROR_SOURCES, GROUPS
-from jaxgran.model.checks import InputError, refused, short_repr
+from jaxgran.maps.own_names import dimensions_of
+from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import digest_of, observed_shapes
 from jaxgran.sampling.sample import observed_estimates
 
@@ -21,41 +20,7 @@ if TYPE_CHECKING:
     from jaxgran.maps.points import PointGrid
     from jaxgran.maps.replica import Key, Replica
     from jaxgran.maps.settings import MapSettings
-    from jaxgran.model.flow import ShearFlow
     from jaxgran.sampling.sample import Sample
-
-_ENDINGS = ("stderr", "ci95", "converged")
-RESERVED = frozenset(
-    [
-        *(name for one in OBSERVABLES for name in (one, *(f"{one}_{ending}" for ending in _ENDINGS))),
-        *("status", "correlation_strain", "friction_error_correlation"),
-        *("strain", "equilibration_strain", "sample_timestep"),
-        *("grains", "timestep", "packing_fraction", "restitution", "point_grains", "seed", "observable"),
-        *("error_source", "axis_a", "axis_b", "grain", "pair"),
-        *(*GROUPS, "theory", "seeds", "snapshots", "large_system"),
-    ]
-)
-"""Names of the variables, coordinates, dimensions and groups of a map."""
-
-
-def require_observe(observe: Any, flow: ShearFlow) -> None:
-    """Raise an InputError unless a function returns numbers or arrays, summed over contacts, by names that are free."""
-    if not callable(observe):
-        raise refused("observe", observe, "must be a function that is passed to `ratio_map`, or None")
-    try:
-        hash(observe)
-    except TypeError:
-        raise refused("observe", observe, "must be hashable") from None
-    shapes = observed_shapes(observe, flow)
-    names = list(shapes) if isinstance(shapes, dict) else []
-    if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
-        raise InputError("observe must return a dictionary of numbers or arrays by name.", field="observe")
-    if not all(isinstance(name, str) and name.isidentifier() for name in names):
-        raise InputError(f"observe must return names without spaces and signs, not {short_repr(names)}.")
-    made = [one for name, shape in shapes.items() for one in (*_names(name), *_dims(name, shape.shape))]
-    taken = [name for name in made if name in RESERVED or made.count(name) > 1]
-    if taken:
-        raise InputError(f"observe must return names that a map does not have, not {short_repr(taken[0])}.")
 
 
 def sums_by_name(settings: MapSettings) -> dict[str, jax.ShapeDtypeStruct] | None:
@@ -86,7 +51,7 @@ def own_variables(
     variables = {}
     found = {point: observed_estimates(seeds) for point, seeds in samples.items()}
     for name, sums in (sums_by_name(settings) or {}).items():
-        dims = _dims(name, sums.shape)
+        dims = dimensions_of(name, sums.shape)
         value, stderr = (np.full((len(grid.flows), *sums.shape), np.nan) for _ in range(2))
         for point, (values, stderrs) in found.items():
             value[point], stderr[point] = values[name], stderrs[name]
@@ -114,14 +79,5 @@ def own_seed_variables(
         for key, total in totals.items():
             value[key] = np.asarray(total.observed[name]) / np.maximum(total.steps, 1)
         about = {"long_name": f"mean of {name} over all time steps", "cell_methods": "time: mean"}
-        variables[name] = grid.variable(value, about, "seed", *_dims(name, sums.shape))
+        variables[name] = grid.variable(value, about, "seed", *dimensions_of(name, sums.shape))
     return variables
-
-
-def _names(name: str) -> tuple[str, str, str]:
-    return name, f"{name}_stderr", f"{name}_ci95"
-
-
-def _dims(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """The dimensions of an array at one point."""
-    return tuple(f"{name}_dim_{k}" for k in range(len(shape)))

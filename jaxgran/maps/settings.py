@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
-from jaxgran.maps.own_observables import require_observe
+from jaxgran.maps.own_names import require_observe
 from jaxgran.maps.parameters import MapParameters
 from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
