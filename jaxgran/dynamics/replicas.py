@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 
 from jaxgran.dynamics.engine import Jax, Numerics, in_lockstep, select_engine
 from jaxgran.dynamics.interruption import waited
-from jaxgran.model.checks import InputError
+from jaxgran.model.batches import in_numpy
+from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -49,10 +49,8 @@ def batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
 
 def replicas_to_check(batch: Arguments) -> Iterator[Any]:
     """The arguments of each replica; the first ones stand for all where JAX traces them."""
-    leaves = jax.tree.leaves(batch)
-    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-    known = batch if traced else jax.tree.map(np.asarray, batch)
-    for k in range(1 if traced else len(leaves[0])):
+    known = in_numpy(batch)
+    for k in range(1 if is_traced(batch) else len(jax.tree.leaves(batch)[0])):
         yield jax.tree.map(lambda x, k=k: x[k], known)
 
 
@@ -77,7 +75,7 @@ def compiled_for_few_sizes(program: Callable[..., Any], numerics: Numerics, batc
     """
     count = len(batch[-1])
     size = 1 << (count - 1).bit_length()
-    if size == count or in_lockstep(numerics.engine) or any(isinstance(x, Tracer) for x in jax.tree.leaves(batch)):
+    if size == count or in_lockstep(numerics.engine) or is_traced(batch):
         return waited(program(*batch))
     *others, number = jax.tree.map(lambda x: np.asarray(x)[np.minimum(np.arange(size), count - 1)], batch)
     filled = waited(program(*others, np.where(np.arange(size) < count, number, 0)))

@@ -4,9 +4,8 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jax.core import Tracer
 
-from jaxgran.model.checks import InputError
+from jaxgran.model.checks import InputError, is_traced
 
 T = TypeVar("T")
 
@@ -20,12 +19,11 @@ def replica_of(batch: T, place: Any, replicas: tuple[int, ...]) -> T:
     """
     if not replicas:
         raise InputError(f"an index takes a replica of a batch, and this is one {type(batch).__name__}, not a batch.")
-    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(place)):
+    if not is_traced(place):
         np.broadcast_to(0, replicas)[place]  # JAX would take the last replica in place of one that is not there
     return jax.tree.map(lambda leaf: leaf[place], batch)
 
 
 def in_numpy(tree: T) -> T:
     """The same with NumPy arrays, whose small sums need no compilation; unchanged where JAX traces part of it."""
-    leaves = jax.tree.leaves(tree)
-    return tree if any(isinstance(leaf, Tracer) for leaf in leaves) else jax.tree.map(np.asarray, tree)
+    return tree if is_traced(tree) else jax.tree.map(np.asarray, tree)

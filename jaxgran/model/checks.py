@@ -116,12 +116,17 @@ def require_flag(name: str, value: Any) -> None:
         raise refused(name, value, "must be True or False")
 
 
-def require_untraced(name: str, instead: str, *values: Any) -> None:
-    """Raise an InputError if JAX traces a value that is needed in Python; ``instead`` says what to do."""
+def is_traced(*values: Any) -> bool:
+    """Whether JAX traces a part of these pytrees, whose numbers are then unknown in Python."""
     import jax
     from jax.core import Tracer
 
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values)):
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def require_untraced(name: str, instead: str, *values: Any) -> None:
+    """Raise an InputError if JAX traces a value that is needed in Python; ``instead`` says what to do."""
+    if is_traced(*values):
         raise InputError(f"{name} cannot be transformed by jax.jit, jax.vmap or jax.grad: {instead}.")
 
 

@@ -10,7 +10,15 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxgran.model.batches import replica_of
-from jaxgran.model.checks import InputError, concrete_or_none, require, require_number, require_whole, short_repr
+from jaxgran.model.checks import (
+    InputError,
+    concrete_or_none,
+    is_traced,
+    require,
+    require_number,
+    require_whole,
+    short_repr,
+)
 from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS, Activation
 from jaxgran.model.display import Row, display_methods
 
@@ -146,7 +154,7 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
     """Raise an InputError unless the strain has at least one time step a part and at most ``MAX_STEPS`` in all."""
     require_sheared(flow)
     require_number("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    if not any(isinstance(x, Tracer) for x in (strain, flow.shear_rate, flow.timestep)):
+    if not is_traced(strain, flow.shear_rate, flow.timestep):
         step = float(np.asarray(flow.shear_rate) * np.asarray(flow.timestep))
         least, most = parts * step, MAX_STEPS * step
         require("strain", strain, lambda x: x >= 0.99 * least, f"at least {parts} time steps, {least:g}")

@@ -14,7 +14,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import JaxprTracer
 
-from jaxgran.model.checks import InputError
+from jaxgran.model.checks import InputError, is_traced
 
 T = TypeVar("T")
 
@@ -26,8 +26,7 @@ def forward_only(values: T, words: str) -> T:
         real = isinstance(leaf, Tracer) and jnp.issubdtype(leaf.dtype, jnp.floating)
         return _gate.bind(leaf, words=words) if real else leaf
 
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
-    return jax.tree.map(gated, values) if traced else values
+    return jax.tree.map(gated, values) if is_traced(values) else values
 
 
 def _refuse(*_: Any, words: str) -> Any:

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import replica_of
-from jaxgran.model.checks import InputError
+from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.display import Row, arrays, display_methods, rounded
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
@@ -88,7 +87,7 @@ def require_match(flow: ShearFlow, state: State) -> None:
 
     The engines take both from the state. Sizes other than those of ``polydisperse`` belong to no polydispersity.
     """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((flow, state))):
+    if is_traced(flow, state):
         return
     radii = np.sort(np.asarray(state.grains.radii, float))
     of_state = {"packing_fraction": float(np.pi * np.sum(radii**2) / np.asarray(state.side, float) ** 2)}

@@ -24,7 +24,7 @@ from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, as_array, require, two_digits
+from jaxgran.model.checks import InputError, as_array, is_traced, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State, require_match, require_state
@@ -156,7 +156,7 @@ def _require_times(flow: ShearFlow, times: Any) -> Array:
 
 def _require_slow(flow: ShearFlow, state: State) -> None:
     """Raise an InputError if a grain of thermal speed moves too far or too little in one step."""
-    if any(isinstance(x, Tracer) for x in (flow.timestep, *jax.tree.leaves(state))):
+    if is_traced(flow.timestep, state):
         return
     diameters, masses = 2 * np.asarray(state.grains.radii), np.asarray(state.grains.masses)
     temperature = np.sum(masses[:, None] * np.asarray(state.velocities) ** 2) / (2 * masses.size)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.near_pairs import (
@@ -25,7 +24,7 @@ from jaxgran.contact.near_pairs import (
     widest_skin,
 )
 from jaxgran.model.cell import cell_side
-from jaxgran.model.checks import InputError, require_key
+from jaxgran.model.checks import InputError, is_traced, require_key
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.forward_mode import forward_only
@@ -121,7 +120,7 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
     numbers are not checked here: ``pack`` then returns that no packing was found.
     """
     require_grains(grains, flow.grains)
-    if any(isinstance(x, Tracer) for x in (grains.radii, flow.packing_fraction)):
+    if is_traced(grains.radii, flow.packing_fraction):
         return
     radii = np.asarray(grains.radii, float)
     with jax.ensure_compile_time_eval():  # the grains are known, also inside of ``jax.jit``

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
@@ -18,7 +17,7 @@ from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.replicas import batch_of, compiled_for_few_sizes, over_replicas, replicas_to_check
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import in_numpy, replica_of
-from jaxgran.model.checks import InputError, require, require_untraced, require_whole, short_repr, two_digits
+from jaxgran.model.checks import InputError, is_traced, require, require_untraced, require_whole, short_repr, two_digits
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
@@ -338,7 +337,7 @@ def sample(
             return waited(_sample(flow, numerics, state, strain, blocks, observe))
         program = partial(_sample_replicas, blocks, observe, numerics)
         return compiled_for_few_sizes(program, numerics, batch)
-    if batch or any(isinstance(x, Tracer) for x in jax.tree.leaves((flow, numerics, state, strain))):
+    if batch or is_traced(flow, numerics, state, strain):
         raise InputError("callback must be None for a batch, and where a sample is transformed, as by jax.jit.")
     return _sample_with_callback(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe, callback)
 
@@ -426,7 +425,7 @@ def check_precision(flow: ShearFlow, state: State) -> None:
     wrong only if a step moves a pair by less than the rounding of its separation, 1e-7 σ. But summed times drift by
     1e-3, and programs that compare the positions of two states see their rounding. So the limit is that of positions.
     """
-    if any(isinstance(x, Tracer) for x in (flow.timestep, flow.shear_rate, state.side)):
+    if is_traced(flow.timestep, flow.shear_rate, state.side):
         return
     rounding = np.finfo(state.positions.dtype).eps * float(np.asarray(state.side).max())
     least = _SMALLEST_MOTION * rounding

@@ -24,13 +24,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics, in_lockstep
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, key_shape, require, require_key, require_number
+from jaxgran.model.checks import InputError, is_traced, key_shape, require, require_key, require_number
 from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -132,7 +131,7 @@ def prepare(
         ``jax.jit`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
     """
-    if _is_traced(flow, key, grains):
+    if is_traced(flow, key, grains):
 
         def of_batch(flow: ShearFlow, key: Array, grains: Grains | None) -> State:
             return prepare(flow, key, equilibrate, grains, solver=solver, engine=engine)
@@ -242,7 +241,7 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
         function stands within ``jax.jit`` or a derivative.
       RuntimeError: no packing was found.
     """
-    if _is_traced(flow, key, temperature, grains):
+    if is_traced(flow, key, temperature, grains):
         return vmapped_in_python(heated, _UNCOMPILED.format("heated"), flow, key, temperature, grains)
     flows, keys, discs, single = _replicas("heated", flow, key, grains)
 
@@ -257,10 +256,6 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
     return jax.tree.map(lambda x: jnp.asarray(x[0] if single else x), state)
 
 
-def _is_traced(*values: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
-
-
 def _replicas(
     name: str, flow: ShearFlow, key: Array, grains: Grains | None
 ) -> tuple[ShearFlow, Array, Grains | None, bool]:
@@ -268,7 +263,7 @@ def _replicas(
 
     InputError if the key is not one or several, if the others do not suit it, or if JAX compiles the function.
     """
-    if _is_traced(jnp.zeros(())):  # inside of ``jax.jit``, whatever the arguments are
+    if is_traced(jnp.zeros(())):  # inside of ``jax.jit``, whatever the arguments are
         raise InputError(_UNCOMPILED.format(name))
     shape = key_shape(key)
     if shape is None or len(shape) > 1 or shape == (0,):
