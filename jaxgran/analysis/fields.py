@@ -27,9 +27,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.analysis.coarse_graining import CoarseGraining
+from jaxgran.cache.folder import use_cache
 from jaxgran.dynamics.snapshots import Snapshot, collided
+from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
-from jaxgran.model.checks import InputError, require, short_repr
+from jaxgran.model.checks import InputError, as_array, require, short_repr
 from jaxgran.model.state import State
 
 _POINTS_AT_ONCE = 128  # points in one matrix product
@@ -64,6 +66,8 @@ class Fields:
     contact_stress: Float[Array, "points 2 2"]
     heat_flux: Float[Array, "points 2"]
     dissipation: Float[Array, " points"]
+
+    __eq__ = equal_values
 
     @property
     def momentum(self) -> Float[Array, "points 2"]:
@@ -135,14 +139,13 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: Co
         fallen to e⁻¹⁸ = 1.5e-8 of its peak.
     """
     if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
-        raise InputError(
-            "snapshot must be a single Snapshot; take one of a series by jax.tree.map(lambda x: x[k], series)."
-        )
+        raise InputError("snapshot must be a single Snapshot; series[-1] is the last one of a series.")
     if not isinstance(graining, CoarseGraining):
         raise InputError(f"graining must come from gaussian, lucy or heaviside, not {short_repr(graining)}.")
-    accepted = "an array (points, 2) of finite numbers"
+    points, accepted = as_array(points), "an array (points, 2) of finite numbers"
     require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted)
     _check(graining, snapshot.state)
+    use_cache()
     return _fields_at(snapshot, points, graining)
 
 

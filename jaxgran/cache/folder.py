@@ -4,7 +4,9 @@ import os
 import stat
 import tempfile
 import warnings
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from platformdirs import user_cache_path
 
@@ -13,27 +15,48 @@ from jaxgran.environment import processor_kind
 _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 
 
-def enable_cache() -> Path | None:
-    """Cache compiled programs on disk, so that later processes need not compile them again.
+@cache
+def use_cache() -> None:
+    """Cache compiled programs on disk from now on, unless the user has chosen otherwise; once in a process.
 
-    Call it first, best before JAX is imported; the command line does so itself. The cache is in the user's cache
-    folder, which ``XDG_CACHE_HOME`` may set and ``jaxgran info`` prints. Each kind of processor has its own folder
-    there, since several machines may share a home folder. If the folder is not writable, a temporary one is used and
-    a warning names it.
-
-    Returns:
-      The cache folder of this processor; None if no folder is writable.
+    The functions that compile call it first. A folder of the user's in ``jax_compilation_cache_dir``, and a cache that
+    ``jax_enable_compilation_cache`` turns off, are left as they are. Each kind of processor has a folder of its own,
+    since several machines may share a home folder. If the user's cache folder is not writable, a temporary one is used
+    and a warning names it.
     """
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA logs a long, harmless error when it loads a cached program
     import jax
 
+    if jax.config.values["jax_compilation_cache_dir"] or not jax.config.values["jax_enable_compilation_cache"]:
+        return
     if message := fallback_message():
-        warnings.warn(message, stacklevel=2)
+        warnings.warn(message, stacklevel=3)
     folder = cache_folder()
-    programs = None if folder is None else folder / processor_kind()
-    jax.config.update("jax_compilation_cache_dir", None if programs is None else str(programs))
+    if folder is None:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder / processor_kind()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
-    return programs
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and jax.default_backend() == "cpu":  # JAX itself sets 1
+        _silence_loader(jax.config)
+
+
+def programs_folder() -> Path | None:
+    """The folder where JAX caches compiled programs; None if it caches none."""
+    import jax
+
+    values = jax.config.values
+    folder = values["jax_enable_compilation_cache"] and values["jax_compilation_cache_dir"]
+    return Path(folder) if folder else None
+
+
+def _silence_loader(config: Any) -> None:
+    """Keep XLA from logging a long, harmless error for each program that it loads: it takes tuning hints for features.
+
+    JAX sets the level of XLA's log together with that of its own, but sets back only its own.
+    """
+    before = config.values["jax_logging_level"]
+    if before in (None, "NOTSET"):
+        config.update("jax_logging_level", "CRITICAL")
+        config.update("jax_logging_level", before)
 
 
 def fallback_message() -> str:

@@ -23,6 +23,7 @@ from jax import monitoring
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
+from jaxgran.cache.folder import programs_folder, use_cache
 from jaxgran.environment import processor_features
 from jaxgran.files import file_lock, read_cached, write_cached
 
@@ -35,7 +36,7 @@ _SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX 
 
 
 def persistent_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
-    """``jax.jit`` of a function, with its compiled programs cached on disk if JAX has a cache folder.
+    """``jax.jit`` of a function, with its compiled programs cached on disk, see ``use_cache``.
 
     Args:
       function: a function of pytrees of arrays, without static arguments. JAX's flags are read at the first call with
@@ -67,9 +68,9 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
 
 def _folder() -> Path | None:
     """The folder of cached programs; None if programs are not cached."""
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    single = folder and jax.default_backend() == "cpu" and jax.device_count() == 1
-    return Path(folder) / "programs" if single else None
+    use_cache()
+    folder = programs_folder()
+    return folder / "programs" if folder and jax.default_backend() == "cpu" and jax.device_count() == 1 else None
 
 
 def _has_foreign_class(structure: Any) -> bool:

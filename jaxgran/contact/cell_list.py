@@ -110,16 +110,10 @@ def _search(fractional: Array, tilt: Array, reach: Array, cells_per_side: int, c
 
 
 def set_bit(bits: Array, rank: Array) -> Array:
-    """Place of the set bit of the given rank (from 0) in words of 32 bits, found by halving."""
-    place = jnp.zeros_like(rank)
-    for half in (16, 8, 4, 2, 1):
-        low = bits & jnp.uint32((1 << half) - 1)
-        below = lax.population_count(low).astype(rank.dtype)
-        upper = rank >= below
-        rank = jnp.where(upper, rank - below, rank)
-        bits = jnp.where(upper, bits >> half, low)
-        place = jnp.where(upper, place + half, place)
-    return place
+    """Place of the set bit of the given rank (from 0) in words of 32 bits: that of the first with more set bits."""
+    up_to = np.uint32(2) * (np.uint32(1) << np.arange(_WORD, dtype=np.uint32)) - np.uint32(1)
+    set_up_to = lax.population_count(bits[:, None] & up_to[None, :]).astype(rank.dtype)
+    return jnp.sum(set_up_to <= rank[:, None], axis=1, dtype=rank.dtype)
 
 
 def _cell_list(fractional: Array, cells_per_side: int, cell_capacity: int):

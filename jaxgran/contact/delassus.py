@@ -24,11 +24,12 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.problem import DelassusProblem, entries, is_sparse
+from jaxgran.model.indexing import added_at, taken
 
 Operator = Contacts | DelassusProblem  # what has the four functions product, diagonal and bounds
 
@@ -39,11 +40,18 @@ def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grai
     return _gathered(contacts, along, -along, grains)
 
 
+def contact_numbers(contacts: Contacts, counted: Bool[Array, " contacts"], grains: int) -> Float[Array, " grains"]:
+    """How many of the counted contacts every grain has."""
+    one = counted.astype(contacts.normals.dtype)[:, None]
+    return _gathered(contacts, one, one, grains)[:, 0]
+
+
 @singledispatch
 def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, " contacts"]:
     """Change W p of the relative normal velocities that the impulses cause."""
     total = grain_impulses(contacts, impulses, grains)
-    change = total[contacts.i] * contacts.inverse_mass_i[:, None] - total[contacts.j] * contacts.inverse_mass_j[:, None]
+    change = taken(total, contacts.i) * contacts.inverse_mass_i[:, None]
+    change -= taken(total, contacts.j) * contacts.inverse_mass_j[:, None]
     return jnp.sum(contacts.normals * change, axis=-1)
 
 
@@ -56,9 +64,8 @@ def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
 @singledispatch
 def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     """Diagonal D with W ⪯ D from the numbers of contacts of the grains."""
-    one = contacts.used.astype(contacts.normals.dtype)[:, None]
-    count = _gathered(contacts, one, one, grains)[:, 0]
-    bound = count[contacts.i] * contacts.inverse_mass_i + count[contacts.j] * contacts.inverse_mass_j
+    count = contact_numbers(contacts, contacts.used, grains)
+    bound = taken(count, contacts.i) * contacts.inverse_mass_i + taken(count, contacts.j) * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
 
 
@@ -70,7 +77,7 @@ def spectral_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]
     total = _gathered(contacts, outer, outer, grains)
     xx, xy, yy = total[:, 0], total[:, 1], total[:, 2]
     largest = largest_eigenvalue(xx, xy, yy)
-    bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j
+    bound = taken(largest, contacts.i) * contacts.inverse_mass_i + taken(largest, contacts.j) * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
 
 
@@ -131,4 +138,4 @@ def _gathered(
     """Sums over the contacts of every grain: one scatter over all ends costs less than one for each."""
     ends: Int[Array, " two_contacts"] = jnp.concatenate([contacts.i, contacts.j])
     total = jnp.zeros((grains, at_i.shape[1]), at_i.dtype)
-    return total.at[ends].add(jnp.concatenate([at_i, at_j]))
+    return added_at(total, ends, jnp.concatenate([at_i, at_j]))

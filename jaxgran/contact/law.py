@@ -163,4 +163,5 @@ def contact_terms(
         binary_speed * xx,
         binary_speed * xy,
         binary_speed * yy,
+        (1 - one_plus_alpha / 2) * binary_speed,
     )

@@ -26,6 +26,7 @@ from jaxgran.contact.cell_list import cell_list_pairs, largest_cutoff, set_bit
 from jaxgran.model.cell import displacement, remap_tilt, sheared, wrap
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.grains import Grains
+from jaxgran.model.indexing import taken
 
 ALL_PAIRS_LIMIT = 512  # above this number of grains the search uses a cell list
 NEAR_PAIRS_PER_GRAIN = 4
@@ -95,7 +96,7 @@ class PairLists:
 
 def separations_now(pairs: PairList, frame: Frame) -> Float[Array, "pairs 2"]:
     """Separations r_i − r_j of the pairs after the motion of the frame."""
-    d = pairs.separations + frame.displacements[pairs.i] - frame.displacements[pairs.j]
+    d = pairs.separations + taken(frame.displacements, pairs.i) - taken(frame.displacements, pairs.j)
     return sheared(d, frame.strain)
 
 
@@ -196,7 +197,7 @@ def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Arra
         running = jnp.cumsum(set_in_word, dtype=jnp.int32)
         word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
     found = jnp.minimum(word, count - 1)
-    place = set_bit(words[found], wanted - (running - set_in_word)[found])
+    place = set_bit(taken(words, found), wanted - taken(running - set_in_word, found))
     return jnp.where(word < count, found * _WORD + place, length)
 
 
@@ -220,25 +221,25 @@ def _capacity(pairs_per_grain: int, count: int) -> int:
 
 
 def _select(gaps: Float[Array, " m"], largest_skin: Array, capacity: int):
-    """Indices of the pairs with a gap within the largest skin that the buffer allows, that skin, and overflow."""
+    """Pairs with a gap within the largest skin that a buffer allows: where they stand, which slots of the buffer they
+    fill, that skin, and whether the buffer overflows."""
     skins = largest_skin * jnp.asarray(_SKIN_SHARES, gaps.dtype)
     counts = jnp.sum(gaps[:, None] <= skins[None, :], axis=0, dtype=jnp.int32)
     fits = counts <= capacity
     skin = skins[jnp.argmax(fits)]
     index = first_true(gaps <= skin, capacity)
-    return index, skin, ~jnp.any(fits)
+    filled = index < gaps.size
+    return jnp.where(filled, index, 0), filled, skin, ~jnp.any(fits)
 
 
-def _pair_list(i, j, separations, index, grains: Grains, skin, overflow) -> PairList:
-    """The pairs at ``index``; an index past the end is an empty slot."""
-    filled = index < separations.shape[0]
-    index = jnp.where(filled, index, 0)
-    i, j = jnp.where(filled, i(index), 0), jnp.where(filled, j(index), 0)
+def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> PairList:
+    """The pairs i, j with their separations; a slot that is not filled is empty."""
+    i, j = jnp.where(filled, i, 0), jnp.where(filled, j, 0)
     return PairList(
         i=i,
         j=j,
-        separations=jnp.where(filled[:, None], separations[index], jnp.asarray([[1e6, 0]], separations.dtype)),
-        reach=jnp.where(filled, grains.radii[i] + grains.radii[j], 0),
+        separations=jnp.where(filled[:, None], separations, jnp.asarray([[1e6, 0]], separations.dtype)),
+        reach=jnp.where(filled, taken(grains.radii, i) + taken(grains.radii, j), 0),
         skin=skin,
         overflow=overflow,
     )
@@ -249,9 +250,9 @@ def _near_pairs(outer: PairList, frame: Frame, skin_left: Array, grains: Grains,
     distance = jnp.sqrt(jnp.sum(separations_now(outer, frame) ** 2, axis=-1))
     largest = jnp.minimum(_nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side), skin_left)
     capacity = _capacity(NEAR_PAIRS_PER_GRAIN, grains.radii.size)
-    index, skin, overflow = _select(distance - outer.reach, largest, capacity)
-    near = _pair_list(lambda k: outer.i[k], lambda k: outer.j[k], outer.separations, index, grains, skin, overflow)
-    return PairList(near.i, near.j, near.separations, near.reach, skin, overflow | outer.overflow)
+    at, filled, skin, overflow = _select(distance - outer.reach, largest, capacity)
+    i, j, separations = taken(outer.i, at), taken(outer.j, at), taken(outer.separations, at)
+    return _pair_list(i, j, separations, filled, grains, skin, overflow | outer.overflow)
 
 
 def _outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairList:
@@ -261,14 +262,15 @@ def _outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Arra
     largest = _nominal_skin(OUTER_PAIRS_PER_GRAIN, grains, side)
     if count > ALL_PAIRS_LIMIT:
         i, j, missed = cell_list_pairs(positions, side, tilt, largest + 2 * jnp.max(grains.radii), capacity)
-        separations = displacement(positions[i], positions[j], side, tilt)
-        reach = jnp.where(i == j, -jnp.inf, grains.radii[i] + grains.radii[j])
-        gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach
-        index, skin, overflow = _select(gaps, largest, capacity)
-        return _pair_list(lambda k: i[k], lambda k: j[k], separations, index, grains, skin, overflow | missed)
-    separations = displacement(positions[:, None], positions[None, :], side, tilt)
-    gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - grains.radii[:, None] - grains.radii[None, :]
-    gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
-    index, skin, overflow = _select(gaps, largest, capacity)
-    flat = separations.reshape(-1, 2)
-    return _pair_list(lambda k: k // count, lambda k: k % count, flat, index, grains, skin, overflow)
+        separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
+        reach = jnp.where(i == j, -jnp.inf, taken(grains.radii, i) + taken(grains.radii, j))
+        at, filled, skin, overflow = _select(jnp.sqrt(jnp.sum(separations**2, axis=-1)) - reach, largest, capacity)
+        i, j, overflow = taken(i, at), taken(j, at), overflow | missed
+    else:
+        separations = displacement(positions[:, None], positions[None, :], side, tilt)
+        gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - grains.radii[:, None] - grains.radii[None, :]
+        gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
+        at, filled, skin, overflow = _select(gaps, largest, capacity)
+        i, j = at // count, at % count
+    separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
+    return _pair_list(i, j, separations, filled, grains, skin, overflow)

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.law import gap_coefficients, overlaps_within, time_to_touch
-from jaxgran.contact.near_pairs import PairList
+from jaxgran.model.batches import equal_values
 from jaxgran.model.grains import Grains
+from jaxgran.model.indexing import taken
 
 
 @jax.tree_util.register_dataclass
@@ -37,6 +38,8 @@ class Contacts:
     inverse_mass_i: Float[Array, " contacts"]
     inverse_mass_j: Float[Array, " contacts"]
     used: Bool[Array, " contacts"]
+
+    __eq__ = equal_values
 
 
 def is_contact(
@@ -89,34 +92,27 @@ def _gaps(separations: Array, velocities: Array, reach: Array) -> tuple[Array, A
 
 
 def contact_network(
-    index: Int[Array, " contacts"],
-    pairs: PairList,
-    separations: Float[Array, "pairs 2"],
-    velocities: Float[Array, "pairs 2"],
+    used: Bool[Array, " contacts"],
+    i: Int[Array, " contacts"],
+    j: Int[Array, " contacts"],
+    separations: Float[Array, "contacts 2"],
+    velocities: Float[Array, "contacts 2"],
     grains: Grains,
 ) -> Contacts:
-    """The network of the pairs at ``index``; an index past the end of the pairs is an unused slot."""
-    used = index < pairs.reach.size
-    index = jnp.where(used, index, 0)
-    i, j = pairs.i[index], pairs.j[index]
-    separation, velocity = (_picked(vectors, index) for vectors in (separations, velocities))
-    distances = jnp.sqrt(_dot(separation, separation))
-    normals = jnp.where(used[:, None], separation / distances[:, None], 0)
+    """The network of the pairs of grains i and j that are contacts (``used``), a slot for each pair."""
+    distances = jnp.sqrt(_dot(separations, separations))
+    normals = jnp.where(used, 1 / distances, 0)[:, None] * separations
+    inverse_masses = 1 / grains.masses
     return Contacts(
         i=i,
         j=j,
         normals=normals,
         distances=distances,
-        approach=_dot(normals, velocity),
-        inverse_mass_i=jnp.where(used, 1 / grains.masses[i], 0),
-        inverse_mass_j=jnp.where(used, 1 / grains.masses[j], 0),
+        approach=_dot(normals, velocities),
+        inverse_mass_i=jnp.where(used, taken(inverse_masses, i), 0),
+        inverse_mass_j=jnp.where(used, taken(inverse_masses, j), 0),
         used=used,
     )
-
-
-def _picked(vectors: Float[Array, "pairs 2"], index: Int[Array, " contacts"]) -> Float[Array, "contacts 2"]:
-    """The vectors at ``index``, by component: vectors that a caller has put together need not exist in full."""
-    return jnp.stack([vectors[:, 0][index], vectors[:, 1][index]], axis=-1)
 
 
 def _dot(a: Float[Array, "n 2"], b: Float[Array, "n 2"]) -> Float[Array, " n"]:

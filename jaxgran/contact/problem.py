@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.network import Contacts
+from jaxgran.model.batches import equal_values
 
 
 @jax.tree_util.register_dataclass
@@ -47,6 +48,8 @@ class ContactNetwork:
     masses: Float[Array, " grains"]
     approach: Float[Array, " contacts"]
 
+    __eq__ = equal_values
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class DelassusProblem:
 
     matrix: Any
     approach: Float[Array, " contacts"]
+
+    __eq__ = equal_values
 
     def __post_init__(self) -> None:
         if hasattr(self.matrix, "tocoo"):  # a matrix of SciPy is no array for JAX

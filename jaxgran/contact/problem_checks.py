@@ -12,7 +12,7 @@ import numpy as np
 import scipy  # its parts are loaded when they are used
 
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, DelassusProblem, entries, is_sparse
-from jaxgran.model.checks import InputError, concrete_or_none, require, short_repr
+from jaxgran.model.checks import InputError, as_array, concrete_or_none, require, short_repr
 
 LARGEST_FACTORED = 2048  # contacts of a matrix whose eigenvalues are judged; Cholesky's factor of it takes 0.1 s
 _UNIT_LENGTH = 1e-5  # by which the length of a normal may differ from one; float32 and typed digits pass
@@ -28,11 +28,15 @@ def judged(problem: Any) -> ContactProblem:
         ``solve_contacts``.
     """
     if isinstance(problem, ContactNetwork):
+        ends: Any = np.asarray(problem.ends) if isinstance(problem.ends, (list, tuple)) else problem.ends
+        numbers = map(as_array, (problem.normals, problem.masses, problem.approach))
+        problem = ContactNetwork(ends, *numbers)
         _require_network(problem)
         kind = _precision(problem.normals, problem.masses, problem.approach)
         normals, masses, approach = (jnp.asarray(x, kind) for x in (problem.normals, problem.masses, problem.approach))
         return ContactNetwork(jnp.asarray(problem.ends, jnp.int32), normals, masses, approach)
     if isinstance(problem, DelassusProblem):
+        problem = DelassusProblem(as_array(problem.matrix), as_array(problem.approach))
         _require_delassus(problem)
         matrix = problem.matrix
         kind = _precision(matrix, problem.approach)
@@ -43,6 +47,7 @@ def judged(problem: Any) -> ContactProblem:
 
 def require_impulses(problem: ContactProblem, impulses: Any) -> jax.Array:
     """The impulses in the precision of the problem; an InputError unless there is one for each contact."""
+    impulses = as_array(impulses)
     _require_shape("impulses", impulses, problem.approach.shape, "a number for each contact")
     return jnp.asarray(impulses, problem.approach.dtype)
 

@@ -17,6 +17,7 @@ from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
 from jaxgran.contact.problem_checks import judged, require_impulses
 from jaxgran.contact.projected_methods import dot
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import require_number
 from jaxgran.model.flow import RANGES
 
@@ -46,6 +47,8 @@ class ContactResiduals:
     energy: Float[Array, ""]
     approach: Float[Array, ""]
     tension: Float[Array, ""]
+
+    __eq__ = equal_values
 
 
 def contact_residuals(problem: ContactProblem, impulses: Any, restitution: float | Array = 0.0) -> ContactResiduals:

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgran.cache.folder import use_cache
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
 from jaxgran.contact.problem_checks import judged
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
 from jaxgran.contact.residuals import ContactResiduals, residuals_of
 from jaxgran.contact.solver import solve
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import require_number
 from jaxgran.model.flow import RANGES
 
@@ -40,6 +42,8 @@ class ContactSolution:
     residuals: ContactResiduals
     iterations: Int[Array, ""]
     status: Int[Array, ""]
+
+    __eq__ = equal_values
 
 
 def solve_contacts(
@@ -79,6 +83,7 @@ def solve_contacts(
       >>> solution.impulses.round(3).tolist(), solution.velocities.round(3).tolist()
       ([1.333, 0.667], [1.0, 0.0])
     """
+    use_cache()
     problem = judged(problem)
     require_number("restitution", restitution, *RANGES["restitution"])
     require_solver(solver)

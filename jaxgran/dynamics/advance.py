@@ -16,7 +16,7 @@ from jaxtyping import Array, Int
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Jax, Numba, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, advance_by_jax, ended, require_advance
-from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
+from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
@@ -76,15 +76,12 @@ def advance(
     numerics = checked_numerics(solver, engine)
     options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
     option = " and ".join(name for name, given in options.items() if given)
-    if batch := batch_of(flow, state, steps):
-        for one in replicas_to_check(batch):
-            require_advance(*one)
+    if batch := checked_batch(require_advance, flow, state, steps):
 
         def advance_one(flow: ShearFlow, state: State, steps: Array) -> tuple[State, Tally]:
             return advance(flow, state, steps, free_flight, events, moving_contacts, solver=solver, engine=engine)
 
         return over_replicas(advance_one, numerics, batch, option)
-    require_advance(flow, state, steps)
     if events is None:
         flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
     selected = select_engine(flow, numerics, state, option)

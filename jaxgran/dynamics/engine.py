@@ -25,6 +25,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from jaxgran.cache.folder import use_cache
 from jaxgran.contact.projected_methods import (
     DEFAULT_SOLVER,
     BarzilaiBorwein,
@@ -134,6 +135,7 @@ DEFAULT_NUMERICS = Numerics()
 
 def checked_numerics(solver: Any, engine: Any) -> Numerics:
     """Solver and engine as one value; InputError unless they are a projected method, and an engine or None."""
+    use_cache()  # what is checked here is compiled next
     require_solver(solver)
     if engine is not None and not isinstance(engine, Engine):
         raise InputError(f"engine must be jg.Jax(), jg.Numba(), jg.Pallas() or None, not {short_repr(engine)}.")

@@ -25,7 +25,7 @@ from jaxtyping import Array, Int
 from jaxgran.contact.near_pairs import PairLists, no_lists, present
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
-from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_capacities, shifted
+from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_buffers, shifted
 from jaxgran.dynamics.flight import (
     LONGEST_FLIGHT,
     Carry,
@@ -75,10 +75,8 @@ def advance_by_jax(
 
     Arguments, derivatives and results are those of ``dynamics.advance``.
     """
-    capacities = contact_capacities(flow.grains)
-    if events is not None or moving_contacts:  # derivatives of each size would be compiled
-        capacities = capacities[-1:]
-    options = AdvanceOptions(solver, capacities, moving_contacts)
+    derivatives = events is not None or moving_contacts  # those of a solve of each size would be compiled
+    options = AdvanceOptions(solver, () if derivatives else contact_buffers(flow.grains), moving_contacts)
     loop = _event_loop(flow, state, steps, free_flight, options)
     if events is None:
         end = loop.end()
@@ -93,7 +91,7 @@ def observe_by_jax(
 ) -> tuple[State, Tally, Any]:
     """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
     flow, solver, state = forward_only((flow, solver, state), NEEDS_EVENTS)
-    options = AdvanceOptions(solver, contact_capacities(flow.grains), observe=observe)
+    options = AdvanceOptions(solver, contact_buffers(flow.grains), observe=observe)
     loop = _event_loop(flow, state, steps, True, options)
     end = loop.end()
     return *_ended(state, end, loop.unfinished), end.sums.user_sums.sums
@@ -136,7 +134,7 @@ def count_events(
     require_solver(solver)
     words = "count_events returns a whole number, which has no derivative."
     flow, solver, state = forward_only((flow, solver, state), words)
-    options = AdvanceOptions(solver, contact_capacities(flow.grains)[-1:])  # as in the loop of fixed length
+    options = AdvanceOptions(solver)  # as in the loop of fixed length
     return _event_loop(flow, state, steps, free_flight, options).length()
 
 
@@ -247,9 +245,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     sums = sums._replace(status=status_if_finite(state.positions, state.velocities))
     observe_now = observer_at(lists, state.velocities)
     if observe_now is not None:
-        sums = sums._replace(
-            user_sums=nothing_observed(observe_now, contact_capacities(flow.grains)[-1], state.positions.dtype)
-        )
+        sums = sums._replace(user_sums=nothing_observed(observe_now, lists.near.reach.size, state.positions.dtype))
     loss = jnp.full_like(side, jnp.inf)  # there is no list yet
     start = Carry(lists, pairs, lists.near.skin, loss, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
     return EventLoop(start, event, listed, unfinished, stale)

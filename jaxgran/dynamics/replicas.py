@@ -20,12 +20,22 @@ Arguments = tuple[Any, ...]  # a flow, a state and numbers
 _DIMENSIONS = (1, 1, 2, 2, 0, 0)  # of the arrays of one state, in the order of its leaves
 
 
-def batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
+def checked_batch(check: Callable[..., Any], flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     """The arguments of a batch, broadcast to a leading (replicas,) axis; None where flow and state are single ones.
 
+    Args:
+      check: called with the arguments of each replica, or of the first where JAX traces them; raises an InputError.
+
     Raises:
-      InputError: the axes differ in length, or there are several.
+      InputError: the axes differ in length, or there are several, or the arguments of a replica do not pass.
     """
+    batch = _batch_of(flow, state, *numbers)
+    for one in _replicas(batch) if batch else [(flow, state, *numbers)]:
+        check(*one)
+    return batch
+
+
+def _batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     if not (isinstance(flow, ShearFlow) and isinstance(state, State)):
         return None
     shapes = {*map(np.shape, jax.tree.leaves(flow)), np.shape(state.side)} - {()}
@@ -47,8 +57,7 @@ def batch_of(flow: Any, state: Any, *numbers: Any) -> Arguments | None:
     return jax.tree.map(with_axis, flow), states, *map(with_axis, numbers)
 
 
-def replicas_to_check(batch: Arguments) -> Iterator[Any]:
-    """The arguments of each replica; the first ones stand for all where JAX traces them."""
+def _replicas(batch: Arguments) -> Iterator[Any]:
     known = in_numpy(batch)
     for k in range(1 if is_traced(batch) else len(jax.tree.leaves(batch)[0])):
         yield jax.tree.map(lambda x, k=k: x[k], known)

@@ -21,9 +21,10 @@ from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.collision import contacts_now
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
-from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
+from jaxgran.dynamics.replicas import checked_batch, over_replicas
+from jaxgran.model.batches import equal_values, length_of, replica_of
 from jaxgran.model.cell import remap_tilt, wrap
-from jaxgran.model.checks import require, require_whole
+from jaxgran.model.checks import as_array, require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_state
 
@@ -55,6 +56,19 @@ class Snapshot:
     shear_rate: Float[Array, "*times"]
     restitution: Float[Array, "*times"]
     status: Int[Array, "*times"]
+
+    __eq__ = equal_values
+
+    def __getitem__(self, time: Any) -> "Snapshot":
+        """The snapshot of one time of a series, or of several by a slice or a list; that of a replica in a batch."""
+        return replica_of(self, time, np.shape(self.state.side), "a series")
+
+    def __len__(self) -> int:
+        """Number of times of a series; of replicas in a batch."""
+        return length_of(self, np.shape(self.state.side), "a series")
+
+    def __bool__(self) -> bool:
+        return True  # one has no length
 
 
 def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
@@ -101,12 +115,10 @@ def snapshot_series(
         time step a snapshot, or is longer than 2**31 - 1 time steps; or the engine cannot do this.
     """
     numerics = checked_numerics(solver, engine)
+    strain = as_array(strain)
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    if batch := batch_of(flow, state, strain):
-        for one in replicas_to_check(batch):
-            _require_series(count, *one)
+    if batch := checked_batch(partial(_require_series, count), flow, state, strain):
         return _snapshot_series_of_replicas(count, numerics, *batch)
-    _require_series(count, flow, state, strain)
     return _snapshot_series(flow, numerics, state, strain, count)
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxgran.model.batches import equal_values
 from jaxgran.model.status import DEEP_SHARE, Status
 
 RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
@@ -71,6 +72,9 @@ class Tally:
     binary_speed_moment: Float[Array, "*b 2 2"] = _sum(
         CONTACT, "mσ³γ̇²", "the binary moment, each contact times its speed of approach max(0, −u⁻)", _TENSOR
     )
+    binary_dissipation: Float[Array, "*b"] = _sum(
+        CONTACT, "mσ²γ̇²", "½ (1−α²) μ₁₂ max(0, −u⁻)², the energy lost if every collision were binary"
+    )
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
     local_kinetic: Float[Array, "*b"] = _sum(
@@ -82,6 +86,8 @@ class Tally:
     momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
     observed: Any = None  # sums of what a user's function observes, a pytree; None without one
+
+    __eq__ = equal_values
 
     @property
     def outcome(self) -> Int[Array | np.ndarray, "*b"]:

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxgran.model.indexing import taken
+
 
 def cell_side(radii: Float[Array, " grains"], packing_fraction: float | Array) -> Float[Array, ""]:
     """Side L of the square cell in which the discs have the given packing fraction.
@@ -70,7 +72,7 @@ def relative_velocity(
     shear_rate: float | Array,
 ) -> Float[Array, "pairs 2"]:
     """Velocity of grain i relative to the nearest image of grain j, in the laboratory frame: c_i − c_j + γ̇ Δy x̂."""
-    peculiar = velocities[i] - velocities[j]
+    peculiar = taken(velocities, i) - taken(velocities, j)
     return jnp.stack([peculiar[:, 0] + shear_rate * separations[:, 1], peculiar[:, 1]], axis=-1)
 
 

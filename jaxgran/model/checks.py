@@ -89,8 +89,19 @@ def require(name: str, value: Any, accepts: Callable, accepted: str) -> None:
 
 
 def as_array(values: Any) -> Any:
-    """A list or tuple of numbers as an array; any other value unchanged, for the check that follows."""
-    numbers = isinstance(values, (list, tuple)) and all(
+    """A list or tuple of numbers, or of equally long ones, as an array of floats; any other value unchanged.
+
+    Examples:
+      >>> as_array([[1, 0], (0, 1)]).tolist(), as_array(["a"])
+      ([[1.0, 0.0], [0.0, 1.0]], ['a'])
+    """
+    if not isinstance(values, (list, tuple)):
+        return values
+    if any(isinstance(x, (list, tuple)) for x in values):
+        rows = [as_array(x) for x in values]
+        alike = all(isinstance(x, np.ndarray) and x.shape == np.shape(rows[0]) for x in rows)
+        return np.stack(rows) if alike else values
+    numbers = all(
         isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and abs(x) < 1e300
         for x in values
     )

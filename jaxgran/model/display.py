@@ -93,7 +93,7 @@ def with_error(value: float, error: float) -> str:
 
 def unit_text(unit: str) -> str:
     """A unit of the tables with its signs, such as ``mσ²/t²`` for ``m sigma^2 / t^2``; nothing for a pure number."""
-    for word, sign in (("shear rate", "γ̇"), ("m sigma", "mσ"), ("sigma", "σ"), ("^2", "²"), (" / ", "/")):
+    for word, sign in (("shear rate", "γ̇"), ("m sigma", "mσ"), ("sigma", "σ"), ("^2", "²"), ("^3", "³"), (" / ", "/")):
         unit = unit.replace(word, sign)
     return "" if unit == "1" else unit
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.model.batches import replica_of
+from jaxgran.model.batches import equal_values, hash_of_values, length_of, replica_of
 from jaxgran.model.checks import (
     InputError,
+    as_array,
     concrete_or_none,
     is_traced,
     require,
@@ -36,10 +37,10 @@ class ShearFlow:
 
     The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
     ``grains`` is static. All other fields are traced: changing them recompiles nothing. A batch of flows is one
-    ``ShearFlow`` whose numbers have a leading ``(replicas,)`` axis; numbers that are the same for all are broadcast,
-    and ``flows[0]`` is the first of them. JAX traces the number θ of ``activation``, so a batch, and the flow that a
-    transformed function receives, have θ in that field. How a flow is solved is no part of it: see the arguments
-    ``solver`` and ``engine`` of ``sample``.
+    ``ShearFlow`` whose numbers are lists or arrays with a leading ``(replicas,)`` axis; numbers that are the same for
+    all are broadcast, and ``flows[0]`` is the first of them. JAX traces the number θ of ``activation``, so a batch, and
+    the flow that a transformed function receives, have θ in that field. How a flow is solved is no part of it: see the
+    arguments ``solver`` and ``engine`` of ``sample``.
 
     ================  =================  ===============================================================
     field             unit               meaning
@@ -59,7 +60,7 @@ class ShearFlow:
         are not checked.
 
     Examples:
-      >>> flows = ShearFlow(grains=64, restitution=np.array([0.5, 0.9]), packing_fraction=0.6, timestep=1e-3)
+      >>> flows = ShearFlow(grains=64, restitution=[0.5, 0.9], packing_fraction=0.6, timestep=1e-3)
       >>> flows.packing_fraction.tolist(), float(flows[1].restitution)
       ([0.6, 0.6], 0.9)
     """
@@ -72,6 +73,7 @@ class ShearFlow:
     polydispersity: float | jax.Array = 0.26
     activation: Activation | float | jax.Array = "midpoint"
 
+    __eq__, __hash__ = equal_values, hash_of_values
     __repr__, _repr_html_ = display_methods("ShearFlow", _rows)
 
     def __post_init__(self):
@@ -79,6 +81,7 @@ class ShearFlow:
         if not isinstance(self.activation, str) or self.activation not in _LOOK_AHEAD:
             require("activation", self.activation, lambda x: (x == 0.5) | (x == 0), " or ".join(_LOOK_AHEAD))
         for name, (accepts, words) in RANGES.items():
+            object.__setattr__(self, name, as_array(getattr(self, name)))
             require(name, getattr(self, name), accepts, words)
         shapes = sorted({np.shape(getattr(self, name)) for name in _TRACED_FIELDS} - {()})
         if len(shapes) > 1:
@@ -94,6 +97,13 @@ class ShearFlow:
     def __getitem__(self, replica: Any) -> "ShearFlow":
         """The flow of one replica of a batch, or of several by a slice or a list."""
         return replica_of(self, replica, np.shape(self.restitution))
+
+    def __len__(self) -> int:
+        """Number of flows of a batch."""
+        return length_of(self, np.shape(self.restitution))
+
+    def __bool__(self) -> bool:
+        return True  # one has no length
 
     @property
     def activation_fraction(self) -> float | jax.Array:

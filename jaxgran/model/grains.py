@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, as_array, require, require_key, require_number, require_whole, short_repr
 from jaxgran.model.choices import MAX_GRAINS
 
@@ -33,6 +34,8 @@ class Grains:
 
     radii: Float[Array, " grains"]
     masses: Float[Array, " grains"]
+
+    __eq__ = equal_values
 
 
 def polydisperse(count: int, polydispersity: float | Array, key: Array) -> Grains:

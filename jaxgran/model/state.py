@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.batches import replica_of
+from jaxgran.model.batches import equal_values, length_of, replica_of
 from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.display import Row, arrays, display_methods, rounded
 from jaxgran.model.flow import ShearFlow, require_flow
@@ -59,11 +59,19 @@ class State:
     side: Float[Array, ""]
     tilt: Float[Array, ""]
 
+    __eq__ = equal_values
     __repr__, _repr_html_ = display_methods("State", _rows)
 
     def __getitem__(self, replica: Any) -> "State":
         """The state of one replica of a batch, or of several by a slice or a list."""
         return replica_of(self, replica, np.shape(self.side))
+
+    def __len__(self) -> int:
+        """Number of states of a batch."""
+        return length_of(self, np.shape(self.side))
+
+    def __bool__(self) -> bool:
+        return True  # one has no length
 
 
 def require_state(flow: ShearFlow, state: State) -> None:

@@ -22,6 +22,7 @@ class Status(IntEnum):
     failed = 8  # workers of a cluster died of it, and it was given up
 
 
+GIVEN_UP = Status.infeasible  # from here on a replica is advanced no further, and has no averages
 DEEP_OVERLAP = 1e-2  # σ
 DEEP_SHARE = 0.1  # of the contacts; up to twice this share, stresses change by less than 2 %
 
@@ -30,7 +31,7 @@ MEANINGS = {
     "short_sample": "the sample lasts only a few correlation strains, so its errors may be too small",
     "not_steady": "temperature or pressure still drifted, sample longer, or prepare longer by `equilibrate`",
     "deep_overlap": "more than a tenth of the contacts overlap by more than 1e-2 diameters, take a shorter time step",
-    "infeasible": "no impulses satisfy the contact law, the packing is jammed",
+    "infeasible": "no impulses satisfy the contact law, the packing is jammed, lower the packing fraction",
     "capacity": "more pairs or contacts than the buffers hold, take a shorter time step",
     "nonfinite": "a position, velocity or impulse is not a finite number",
     "failed": "workers of a cluster died of it, perhaps for lack of memory; pass `resume=True` to try once more",
