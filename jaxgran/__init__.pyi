@@ -3,7 +3,6 @@
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
 from .analysis.jax_md_space import JaxMdSpace, jax_md_space
-from .cache.folder import enable_cache
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
     BarzilaiBorwein,
@@ -29,7 +28,9 @@ from .inference.stress_inversion import restitution_from_stresses
 from .io.track_files import read_tracks
 from .io.tracks import Tracks, tracks_of_states
 from .io.trajectory import Trajectory, read_trajectory, write_trajectory
+from .maps.merge import merge_maps
 from .maps.ratio_map import ratio_map
+from .maps.results import open_map
 from .model.checks import InputError
 from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
@@ -90,7 +91,6 @@ __all__ = [
     "cooling",
     "count_events",
     "dominating_errors",
-    "enable_cache",
     "enskog_factors",
     "explore",
     "fields_at",
@@ -106,6 +106,8 @@ __all__ = [
     "heaviside",
     "jax_md_space",
     "lucy",
+    "merge_maps",
+    "open_map",
     "own_grains",
     "pack",
     "polydisperse",

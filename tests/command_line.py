@@ -17,9 +17,9 @@ import typer.main
 from made_up_maps import with_variables
 from synthetic import random_replica
 
-from jaxgran.cli import app, fit, info, measure, run
-from jaxgran.cli import map as map_module
+from jaxgran.cli import app, fit, info, measure, merge, run
 from jaxgran.maps import results
+from jaxgran.maps.replica import Advance
 from jaxgran.model.status import Status
 
 POINTS = ["--restitution", "0.5,0.9", "--packing-fraction", "0.6"]
@@ -45,7 +45,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
         patch.setattr(typer.main, "get_command", commands)
-        for module in (fit, info, map_module, measure, run):
+        for module in (fit, info, measure, merge, run):
             patch.setattr(module, "configured_jax", lambda: jax)
         app.main()
     return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())
@@ -65,7 +65,7 @@ def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseExce
     def replicas(settings, batch, workers, report, checkpoint, warn, scheduler, record) -> Iterator:
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
-            report(100.0)
+            report(Advance([key], [1e-3], [100.0]))
             replica = random_replica(rng, settings, status, key[0])
             if checkpoint is not None:
                 checkpoint.add({key: replica})

@@ -18,11 +18,11 @@ os.environ.pop("COLUMNS", None)  # pytest-xdist sets it, and tables would take t
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
 
-import jaxgran  # noqa: E402
+from jaxgran.cache.folder import use_cache  # noqa: E402
 
 pytest_plugins = ["shared_flows"]
 
-jaxgran.enable_cache()
+use_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")

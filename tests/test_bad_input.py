@@ -20,7 +20,7 @@ import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_maps import ratio_dataset, with_timesteps
+from made_up_maps import known_closure, ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
 from synthetic import one_sentence, snapshot_of
 
@@ -36,6 +36,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import map_figures, theory
 from jaxgran.sampling import free_cooling, sample, steady_state
+from jaxgran.sampling.observe import observed_shapes
 
 GRAINS = 32
 FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep": 1e-3}
@@ -53,7 +54,7 @@ def would_run(*_, **__):
     raise WouldRun
 
 
-def cold(flows: jg.ShearFlow) -> np.ndarray:
+def cold(_: Any, flows: jg.ShearFlow) -> np.ndarray:
     """A temperature in place of the theory's, which is compiled for every number of points."""
     return np.full(np.shape(flows.restitution), 0.1)
 
@@ -232,6 +233,35 @@ def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> No
             assert verdict(function, value)
 
 
+def test_lists_of_numbers_stand_for_arrays() -> None:
+    flows = jg.ShearFlow(GRAINS, [0, 0.5], (0.5, 0.6), 1e-3)
+    assert flows == jg.ShearFlow(GRAINS, np.array([0.0, 0.5]), np.array([0.5, 0.6]), 1e-3)
+    row = jg.DelassusProblem([[2, -1.0], [-1, 2]], [-1, 0])
+    assert jg.solve_contacts(row, 1.0).impulses.tolist() == pytest.approx([4 / 3, 2 / 3], rel=1e-3)
+    pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
+    assert jg.contact_residuals(pair, [0.5]).natural_map == 0
+    points = jg.predict(known_closure(), [0.5, 0.6], [0.7, 0.6])
+    assert points.pressure[1] == jg.predict(known_closure(), 0.6, 0.6).pressure
+    with pytest.raises(WouldRun):
+        jg.fields_at(SEEN, [[1.0, 2.0]], jg.lucy(1.0))
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        lambda seen: np.histogram(seen.impulses)[0],
+        lambda seen: float(seen.impulses.sum()),
+        lambda seen: 1.0 if seen.impulses.sum() > 0 else 0.0,
+        lambda seen: jnp.sum(seen.impulses[seen.impulses > 0]),
+    ],
+    ids=["NumPy", "float", "if", "index"],
+)
+def test_what_jax_cannot_trace_in_observe_is_refused_with_its_line(number: Callable) -> None:
+    line = number.__code__.co_firstlineno
+    refusal = verdict(lambda x: observed_shapes(x, flow()), number)
+    assert refusal.startswith("observe must compute with jax.numpy") and f"line {line}, 'lambda seen" in refusal
+
+
 @pytest.mark.parametrize("argument", NUMBERS)
 @few(max_examples=25)
 @given(value=anything)
@@ -267,7 +297,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         r"single ones or arrays \(1,\), one for each key",
     ),
     "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
-    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "take one of a series by"),
+    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "is the last one of a series"),
     "fields at a point": (lambda: jg.fields_at(SEEN, np.zeros(2), jg.lucy(1.0)), r"\(points, 2\) of finite numbers"),
     "width beyond the cell": (lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)), "positive and at most 3.25"),
     "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),

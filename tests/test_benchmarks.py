@@ -9,12 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 from observed import RESTITUTION, noisy, tracks
 
 from benchmarks import __main__ as door
-from benchmarks import fit_rivals, output, speed_vs_accuracy, timestep_study
+from benchmarks import coverage, fit_methods, fit_rivals, output, speed_vs_accuracy, stability, timestep_study
 from benchmarks.output import Output
+from benchmarks.peers import front
 from benchmarks.registry import BENCHMARKS
+from benchmarks.solvers import charts
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,6 +38,25 @@ def test_every_result_is_named_by_one_benchmark_and_every_name_is_there() -> Non
     named = [file for one in BENCHMARKS for file in one.files]
     assert sorted(named) == sorted(committed())
     assert all((output.RESULTS / file).is_file() for file in named)
+
+
+PICTURES = {
+    "coverage": lambda result: coverage.draw(result["over_flows"]),
+    "fit_methods": lambda result: fit_methods.draw(result["rows"]),
+    "peers": lambda result: front.draw(result["flows"]),
+    "solvers": lambda result: charts.draw_times(result["summary"]),
+    "speed_vs_accuracy": lambda result: speed_vs_accuracy.draw(result["flows"]),
+    "stability": lambda result: stability.draw(result["cells"]),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_picture_of_a_result_has_the_width_of_a_page_and_text_that_can_be_read(name: str) -> None:
+    figure = PICTURES[name](json.loads((output.RESULTS / f"{name}.json").read_text()))
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() * 2.54 == pytest.approx(17, abs=0.1)
+    texts = [text for text in figure.findobj(Text) if text.get_text().strip() and text.get_visible()]
+    assert min(text.get_fontsize() for text in texts) >= 6.99
 
 
 def test_names_are_unique_and_no_result_looks_like_that_of_a_quick_run() -> None:
@@ -96,6 +118,35 @@ def test_a_full_run_is_refused_from_a_changed_tree(
     monkeypatch.setattr(output, "uncommitted", list)
     door.main(words)
     assert not runs[2].hardware["commit"].endswith("-dirty")
+
+
+def test_all_go_on_after_what_is_done_and_repeat_what_failed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    started: list[list[str]] = []
+    failing = {BENCHMARKS[1].name}
+
+    def run(command: list[str], cwd: Path) -> subprocess.CompletedProcess:
+        started.append(command[3:])
+        return subprocess.CompletedProcess(command, int(command[3] in failing))
+
+    monkeypatch.setattr(door, "set_up", lambda one_core: None)
+    monkeypatch.setattr(door.subprocess, "run", run)
+    monkeypatch.setattr(output, "hardware", lambda: {"commit": "abc"})
+
+    def started_by_all(status: int) -> list[str]:
+        started.clear()
+        with pytest.raises(SystemExit) as end:
+            door.main(["all", "--quick", "--output", str(tmp_path)])
+        assert end.value.code == status
+        assert all(words == ["--output", str(tmp_path), "--quick"] for _, *words in started)
+        return [name for name, *_ in started]
+
+    assert started_by_all(1) == [one.name for one in BENCHMARKS]
+    failed = failing.pop()
+    assert started_by_all(0) == [failed]
+    assert started_by_all(0) == []
+    assert f"{failed}: status 1" in capsys.readouterr().out
 
 
 def test_results_say_what_they_were_measured_with_and_quick_ones_have_names_of_their_own(tmp_path: Path) -> None:

@@ -69,22 +69,50 @@ def test_a_command_says_once_where_programs_are_kept(nothing_for_the_user: Path,
         assert Path(kept.rstrip(",")) in {*folder.iterdir()} and works == "works"
 
 
-def test_python_keeps_programs_where_the_command_line_does(tmp_path: Path) -> None:
-    code = """
+FIRST_CALL = """
+import jax
 import jaxgran as jg
-folder = jg.enable_cache()
-import jax, os
-print(str(folder) == jax.config.values["jax_compilation_cache_dir"], folder.parent)
-print(os.environ["TF_CPP_MIN_LOG_LEVEL"], jax.config.jax_enable_x64)
+
+def folder():
+    return jax.config.values["jax_compilation_cache_dir"]
+
+before = jax.config.values | {}
+pair = jg.DelassusProblem([[1.0]], [-1.0])
+assert jax.config.values == before, "importing changes flags"
+print(folder())
+assert float(jg.solve_contacts(pair).impulses[0]) == 1
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # whatever the speed of the machine
+assert float(jax.jit(lambda x: 2 * x + 1)(1.0)) == 3
+print(folder())
 """
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
-    environment.pop("TF_CPP_MIN_LOG_LEVEL", None)
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, env=environment)
-    assert done.stdout.split() == ["True", str(tmp_path / "jaxgran"), "3", "False"], done.stderr
+
+
+def first_call(**variables: str) -> subprocess.CompletedProcess:
+    """A script that solves a contact problem, in a process of its own with these environment variables."""
+    set_here = ("TF_CPP_MIN_LOG_LEVEL", "XLA_FLAGS")
+    environment = {x: y for x, y in os.environ.items() if x not in set_here} | variables
+    command = [sys.executable, "-W", "error", "-c", FIRST_CALL]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+def test_a_script_keeps_programs_where_the_command_line_does_from_its_first_compilation(tmp_path: Path) -> None:
+    first, second = (first_call(XDG_CACHE_HOME=str(tmp_path)) for _ in range(2))
+    imported, called = first.stdout.split()
+    assert imported == "None" and Path(called).parent == tmp_path / "jaxgran"
+    assert any(path.name.startswith("jit__lambda") for path in Path(called).iterdir())
+    assert second.stdout == first.stdout and first.stderr == second.stderr == ""  # XLA's log is silent, too
+
+
+def test_what_the_user_sets_in_jax_stays(tmp_path: Path) -> None:
+    for name, value, folder in (
+        ("JAX_COMPILATION_CACHE_DIR", str(tmp_path), str(tmp_path)),
+        ("JAX_ENABLE_COMPILATION_CACHE", "false", "None"),
+    ):
+        done = first_call(**{name: value})
+        assert done.stdout.split() == [folder] * 2, done.stderr
 
 
 def test_python_is_warned_where_programs_are_kept_elsewhere(nothing_for_the_user: Path) -> None:
     """In a process of its own, as JAX keeps the folder."""
-    command = [sys.executable, "-W", "error", "-c", "import jaxgran as jg; jg.enable_cache()"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = first_call()
     assert "UserWarning: the cache folder" in done.stderr and str(nothing_for_the_user) in done.stderr

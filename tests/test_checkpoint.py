@@ -94,6 +94,16 @@ def test_another_version_is_refused_and_named(output: Path, monkeypatch: pytest.
         Checkpoint(output, SETTINGS, resume=True)
 
 
+def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut_off(output)
+    folder = output.with_name("map.nc.unfinished")
+    there = sorted(folder.iterdir())
+    monkeypatch.setattr("jaxgran.io.atomic.FORMAT_VERSION", 2)
+    with pytest.raises(InputError, match="has format_version 1, and this version of jaxgran reads") as no:
+        Checkpoint(output, SETTINGS, resume=True)
+    assert one_sentence(str(no.value)) and sorted(folder.iterdir()) == there
+
+
 @pytest.mark.parametrize("how", ["torn", "flipped", "empty"])
 def test_a_damaged_file_costs_its_own_batch_alone(output: Path, how: str) -> None:
     kept = cut_off(output)

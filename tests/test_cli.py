@@ -1,8 +1,12 @@
 """The command line does what it says, and says in one sentence what it cannot do."""
 
+import json
 import math
+import os
 import re
 import shlex
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import redirect_stdout
@@ -10,7 +14,7 @@ from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NoReturn
+from typing import Any, NoReturn
 from unittest.mock import Mock
 
 import jax
@@ -38,6 +42,7 @@ from synthetic import one_sentence, random_replica
 
 from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
+from jaxgran.cli.json_output import Entry, print_json
 from jaxgran.cli.tables import print_table
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
@@ -45,6 +50,7 @@ from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import NOT_RUN
+from jaxgran.maps.presets import combined
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.model.checks import InputError
@@ -54,6 +60,7 @@ from jaxgran.plotting import map_figures, movie
 from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
+from jaxgran.sampling.observables import OBSERVABLES
 
 SMALL_MAP = (
     "map --restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 32 --seeds 1 --timestep 1e-3 "
@@ -116,7 +123,10 @@ MISTAKES = {  # one for each kind of option, check and file
     "map --grains auto": "--grains auto requires --error",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.01": "--timestep must be at most",
     "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "--strain must be at least 160 time steps",
-    "map --tolerance 1e-3,1e-4": "--tolerance must be auto, a number, not '1e-3,1e-4'",
+    "map --timestep abc": "--timestep must be auto, a number or a list",
+    f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
+    f"{FLOW} --timestep -1": "--timestep must be auto or a positive number, not -1.0",
+    "map --tolerance 1e-3,1e-4": "--tolerance must be auto or a number, not '1e-3,1e-4'",
     "map --error 0.02 --strain 5": "--strain and --error exclude each other",
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
@@ -178,7 +188,8 @@ def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder
         option = parameter.opts[0]
         if option.startswith("--") and parameter.name not in ("help", "scheduler"):
             wrong = f"{option}=" if getattr(parameter, "is_flag", False) else f"{option}=no\nsuch"
-            needed = {"run": FLOW.split()[1:], "map": [], "info": []}.get(name, ["text.nc"])
+            needed = {"run": FLOW.split()[1:], "map": [], "info": [], "merge": ["text.nc", "-o", "a.nc"]}
+            needed = needed.get(name, ["text.nc"])
             outcome = jaxgran(folder, name, *needed, wrong)
             assert outcome.status == 2 and "Traceback" not in outcome.err, outcome
             of_files = ("output", "trajectory", "movie", "page", "from_map")  # read after what is required
@@ -246,6 +257,7 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
         assert f"wrote {name}" in err
 
 
+@pytest.mark.filterwarnings("always:differs from")
 def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     small_data, no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,7 +304,7 @@ def test_resolution_and_format_of_plot_are_judged_before_a_folder_is_made(small_
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("run")
-    return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--movie", "flow.gif")
+    return folder, jaxgran(folder, *SMALL_RUN, *FRAMES, "--all", "--movie", "flow.gif")
 
 
 def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
@@ -301,7 +313,7 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
     assert files(folder) == {"flow.nc", "flow.gsd", "flow.gif"}
     strain = read_trajectory(folder / "flow.gsd").strain
     frames = len(strain)
-    assert 10 <= frames <= 11  # blocks are of whole time steps
+    assert frames == 11
     np.testing.assert_allclose(strain, 0.1 * np.arange(frames), atol=2.5e-3)
     assert f"wrote flow.gsd: {frames} frames\n" in outcome.err and f"wrote flow.gif: {frames} frames\n" in outcome.err
     with Image.open(folder / "flow.gif") as film:
@@ -338,6 +350,63 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data['theory/pressure']):.3g}"]
 
 
+def parsed(text: str) -> dict[str, Any]:
+    """The JSON that a command prints: one object, in which every name has the same four keys."""
+
+    def no_constant(name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    found = json.loads(text, parse_constant=no_constant)
+    assert all(list(entry) == ["value", "stderr", "unit", "meaning"] for entry in found.values())
+    assert all(entry["meaning"] for entry in found.values())
+    return found
+
+
+def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> None:
+    folder, _ = small_run
+    short, as_json = (jaxgran(folder, *SMALL_RUN, "--resume", *more) for more in ((), ("--json",)))
+    table, budget = short.out.split("Relative error, 95 %")
+    assert budget and table.count("±") == 1 + 10  # the heading, and a row for each
+    assert "shear-stress ratio" in table and "iterations" not in table and "Quality" not in table
+    found, data = (
+        parsed(as_json.out),
+        flattened(read_dataset(folder / "flow.nc")).isel(restitution=0, packing_fraction=0),
+    )
+    assert as_json.status == short.status and set(OBSERVABLES) < set(found)
+    for name, (meaning, unit) in OBSERVABLES.items():
+        value, stderr = (np.asarray(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))
+        np.testing.assert_array_equal(np.array(found[name]["value"], float), value)  # null is NaN
+        np.testing.assert_array_equal(np.array(found[name]["stderr"], float), stderr)
+        assert (found[name]["meaning"], found[name]["unit"]) == (meaning, unit)
+    assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
+    assert (
+        found["theory/pressure"]["value"] == float(data["theory/pressure"]) and not found["theory/pressure"]["stderr"]
+    )
+
+
+def test_json_has_null_in_place_of_nan(capsys: pytest.CaptureFixture) -> None:
+    print_json(
+        {"x": Entry(np.array([1.0, np.nan]), "numbers", "m", np.inf), "n": Entry(np.bool_(True), "a flag", None)}
+    )
+    assert parsed(capsys.readouterr().out) == {
+        "x": {"value": [1.0, None], "stderr": None, "unit": "m", "meaning": "numbers"},
+        "n": {"value": True, "stderr": None, "unit": None, "meaning": "a flag"},
+    }
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
+@pytest.mark.parametrize("words", ["--help", "--version", "info", "run --restitution 0.5"])
+def test_a_reader_that_has_gone_changes_no_exit_status(words: str, tmp_path: Path) -> None:
+    """As in ``jaxgran info | head -2``: the command does its work, and ends as it would."""
+    ends = []
+    for closed in (False, True):
+        command = [sys.executable, "-c", "from jaxgran.cli.app import program; program()", *words.split()]
+        with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+            process.stdout.close() if closed else process.stdout.read()
+            ends.append(process.wait())
+    assert ends == [2 if "run" in words else 0] * 2
+
+
 def test_an_error_is_asked_for_in_place_of_a_strain(tmp_path: Path) -> None:
     words = "run --restitution 0.7 --packing-fraction 0.6 --grains 32 --error 0.1 --output flow.nc"
     outcome = jaxgran(tmp_path, *words.split())
@@ -363,6 +432,9 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     for name in ("cache folder", "compiled programs", "numba engine", "figures"):
         folder, _, state = lines[name].partition(", ")
         assert Path(folder).is_dir() and state == "works", name
+    found = parsed(jaxgran(tmp_path, "info", "--json").out)
+    assert {name.replace(" ", "_") for name in lines} == set(found)
+    assert found["python"]["value"] == lines["python"]
 
 
 def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -419,7 +491,10 @@ def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, mon
     assert rows["recorded restitution"] == "0.7"
     assert rows["collisions, rejected"] == "123, 4"
     assert rows["noise of the velocities"] == "none given"
-    ((tracks, noise),) = given
+    as_json = parsed(jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"), "--json").out)
+    assert as_json["restitution"]["value"] == 0.712 and as_json["restitution"]["stderr"] == 0.01
+    assert as_json["recorded_restitution"]["value"] == 0.7 and as_json["velocity_noise"]["value"] is None
+    tracks, noise = given[0]
     np.testing.assert_array_equal(tracks.time, recorded.strain)
     np.testing.assert_array_equal(tracks.positions, recorded.state.positions)
     assert noise == {"position_noise": None, "velocity_noise": 1e-3, "diameter_noise": None}
@@ -478,6 +553,8 @@ def test_fit_of_a_map_prints_how_well_a_law_describes_it(known_map: Path, known_
     for name in ("pressure", "shear stress", "force ratio"):
         (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
         assert row[len(name.split()) :] == ["2", "%", "2", "%", "1", "%"]
+    found = parsed(jaxgran(tmp_path, "fit", str(known_map), "--json").out)
+    assert found["pressure_rms_error"]["value"] == pytest.approx(0.02) and len(found) == 9
 
 
 @pytest.mark.parametrize(
@@ -498,7 +575,10 @@ def test_fit_of_a_map_finds_a_restitution_from_stresses_and_says_how_well(
     outcome = jaxgran(tmp_path, "fit", str(known_map), *STRESSES, "--relative-error", "0.1")
     assert (outcome.status, outcome.err) == (0, "")
     assert outcome.out.splitlines()[-1] == f"restitution 0.650 ± 0.020{words}"
-    assert given == [pytest.approx((0.7, 3.0, 1.0, 0.3, 0.1))]
+    as_json = parsed(jaxgran(tmp_path, "fit", str(known_map), *STRESSES, "--relative-error", "0.1", "--json").out)
+    assert as_json["restitution"] | {"meaning": ""} == {"value": 0.65, "stderr": 0.02, "unit": "1", "meaning": ""}
+    assert (as_json["determined"]["value"], as_json["chi_squared"]["value"]) == (determined, chi_squared)
+    assert given == [pytest.approx((0.7, 3.0, 1.0, 0.3, 0.1))] * 2
 
 
 def test_fit_of_a_map_without_such_a_flow_prints_no_table(known_map: Path, known_law, tmp_path: Path) -> None:
@@ -552,7 +632,7 @@ def test_completion_is_offered_and_its_script_calls_the_command(words: list[str]
 @pytest.mark.parametrize(
     ("line", "expected"),
     {
-        "jaxgran ": {"map", "plot", "explore", "run", "fit", "info"},
+        "jaxgran ": {"map", "merge", "plot", "explore", "run", "fit", "info"},
         "jaxgran p": {"plot"},
         "jaxgran run --m": {"--movie"},
         "jaxgran map --preset ": {"quick", "paper", "dense"},
@@ -612,15 +692,18 @@ def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeyp
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     """Grains by point hold for the points of the file only, and either a strain or an error holds."""
     chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1, "seeds": 1}
-    assert map_module.combined(chosen, {}) == chosen
-    assert map_module.combined(chosen, {"restitution": (0.2, 0.5)}) == {
+    assert combined(chosen, {}) == chosen
+    assert combined(chosen, {"restitution": (0.2, 0.5)}) == {
         **{name: value for name, value in chosen.items() if name != "grains_by_point"},
         "restitution": (0.2, 0.5),
         "grains": "auto",
     }
-    assert "grains_by_point" not in map_module.combined(chosen, {"grains": 256})
-    assert map_module.combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"} | {"strain"}
-    assert map_module.combined({"strain": 4.0, "seeds": 4}, {"error": 0.1, "grains": 400}) == {
+    assert "grains_by_point" not in combined(chosen, {"grains": 256})
+    by_point = {"restitution": (0.5, 0.9), "timestep": 1e-4, "timestep_by_point": (1e-3, 1e-4)}
+    assert combined(by_point, {"restitution": (0.2,)}) == {"restitution": (0.2,), "timestep": "auto"}
+    assert combined(by_point, {"timestep": 1e-3}) == {"restitution": (0.5, 0.9), "timestep": 1e-3}
+    assert combined(chosen, {"strain": 20.0}).keys() == chosen.keys() - {"error"} | {"strain"}
+    assert combined({"strain": 4.0, "seeds": 4}, {"error": 0.1, "grains": 400}) == {
         **dict.fromkeys(("timestep", "tolerance"), "auto"),
         "error": 0.1,
         "grains": 400,

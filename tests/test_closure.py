@@ -236,6 +236,11 @@ def test_restitution_is_not_determined_by_stresses_with_large_errors() -> None:
     assert 0.2 <= found.restitution <= 0.8
 
 
+def with_timesteps_by_point() -> xr.Dataset:
+    data = made_up_map()
+    return data.assign_coords(point_timestep=1e-3 / data.pressure)
+
+
 MISTAKES = {
     "no map": lambda: fit_closure({"pressure": 1}),
     "no variable": lambda: fit_closure(made_up_map().drop_vars("macroscopic_friction_stderr")),
@@ -243,6 +248,7 @@ MISTAKES = {
     "few points": lambda: fit_closure(made_up_map().isel(restitution=slice(2), packing_fraction=slice(3))),
     "few restitutions": lambda: fit_closure(made_up_map().isel(restitution=slice(2))),
     "none to spare": lambda: leave_one_out(made_up_map().isel(restitution=slice(3), packing_fraction=slice(4))),
+    "several time steps": lambda: fit_closure(with_timesteps_by_point()),
     "jamming": lambda: fit_closure(made_up_map(), 0.7),
     "no closure": lambda: predict(None, 0.5, 0.7),
     "restitution": lambda: predict(known_closure(), 1.0, 0.7),

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran.contact.near_pairs import PairList
 from jaxgran.contact.network import contact_network, first_contact_time, is_contact
 from jaxgran.model.grains import Grains
 
@@ -118,17 +117,14 @@ def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
 
 @pytest.mark.parametrize("slots", [4, 16])
 def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
-    separations, velocities, reach = flights(0)
+    separations, velocities, _ = flights(0)
     rng = np.random.default_rng(0)
     grains = Grains(jnp.asarray(rng.uniform(0.3, 0.7, 64)), jnp.asarray(rng.uniform(0.5, 2, 64)))
     i, j = rng.integers(0, 64, (2, PAIRS))
-    zero = jnp.asarray(0.0)
-    pairs = PairList(
-        jnp.asarray(i), jnp.asarray(j), jnp.asarray(separations), jnp.asarray(reach), zero, jnp.asarray(False)
-    )
     picked = np.array([200, 3, 77])
-    index = np.concatenate([picked, np.full(slots - 3, PAIRS)])
-    network = jax.tree.map(np.asarray, compiled_network(index, pairs, separations, velocities, grains))
+    index = np.concatenate([picked, np.zeros(slots - 3, int)])
+    slots_of = (x[index] for x in (i, j, separations, velocities))
+    network = jax.tree.map(np.asarray, compiled_network(np.arange(slots) < 3, *slots_of, grains))
     np.testing.assert_array_equal(network.used, np.arange(slots) < 3)
     np.testing.assert_array_equal(network.i[:3], i[picked])
     np.testing.assert_array_equal(network.j[:3], j[picked])

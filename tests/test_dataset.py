@@ -14,16 +14,16 @@ from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_dataset
-from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES, flattened, path_of
+from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES, flattened, has_one_timestep, path_of, timestep_text
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
-from jaxgran.maps.theory_variables import THEORY
+from jaxgran.maps.theory_variables import LENGTHS, THEORY
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
-from jaxgran.sampling.enskog_factors import FACTORS, stress_factors
-from jaxgran.sampling.enskog_factors import STRESSES as FACTOR_STRESSES
+from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
 from jaxgran.sampling.sample import BLOCKS
+from jaxgran.sampling.timestep import stress_error
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
 ALPHAS, NUS, SEEDS = (0.5, 0.9), (0.5, 0.6), 3
@@ -41,10 +41,10 @@ def settings() -> MapSettings:
 
 @pytest.fixture(scope="module")
 def results(settings) -> dict[Key, Replica]:
-    """All replicas but two of the last point, a bad one, and one that is not finite."""
+    """All replicas but two of the last point, a bad one, and one that is jammed."""
     rng = np.random.default_rng(0)
     keys = [(point, seed) for point in range(4) for seed in range(SEEDS)][:-2]
-    statuses = {(0, 1): Status.iteration_limit, (1, 2): Status.nonfinite}
+    statuses = {(0, 1): Status.iteration_limit, (1, 2): Status.infeasible}
     return {key: random_replica(rng, settings, statuses.get(key, Status.ok)) for key in keys}
 
 
@@ -134,27 +134,25 @@ def test_settings_that_ask_for_an_error_store_it_in_place_of_the_strain(settings
 def test_prediction_stands_beside_what_is_measured(data) -> None:
     for name in THEORY:
         predicted = data["theory"][name]
-        assert predicted.dims == data[name].dims
-        assert predicted.attrs.get("reduced_unit") == data[name].attrs.get("reduced_unit")
-        for there in predicted.stack(point=data[name].dims).transpose("point"):
+        measured = data[path_of(name)]
+        assert predicted.dims == measured.dims
+        assert predicted.attrs.get("reduced_unit") == measured.attrs.get("reduced_unit")
+        for there in predicted.stack(point=measured.dims).transpose("point"):
             theory = gaussian_moments(float(there.restitution), float(there.packing_fraction))
             assert float(there) == pytest.approx(float(getattr(theory, name)), rel=1e-9)
 
 
-def test_losses_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
+def test_factors_and_lengths_are_those_of_the_samples_of_a_point(settings, data, results) -> None:
     samples = [results[0, seed].sample for seed in range(SEEDS)]
-    value, error = stress_factors(settings.flows()[0], samples)
+    value, error = measured_over_enskog(settings.flows()[0], samples)
     here = data["theory"].sel(packing_fraction=NUS[0], restitution=ALPHAS[0])
-    for stress in FACTOR_STRESSES:
-        for stored, name in [(f"enskog_{stress}", f"enskog_{stress}")] + [
-            (f"enskog_factor_{stress}_{factor}", f"{stress}_{factor}") for factor in FACTORS
-        ]:
-            assert (
-                data["theory"][stored].dims
-                == data["theory"][f"{stored}_stderr"].dims
-                == ("packing_fraction", "restitution")
-            )
-            np.testing.assert_array_equal([here[stored], here[f"{stored}_stderr"]], [value[name], error[name]])
+    stored = {f"enskog_factor_{rate}_{factor}": f"{rate}_{factor}" for rate in RATES for factor in FACTORS}
+    stored |= {name: name for name in (*LENGTHS, *(f"enskog_{rate}" for rate in RATES))}
+    assert set(stored.values()) == set(value)
+    for there, name in stored.items():
+        for ending in ("", "_stderr"):
+            assert data["theory"][there + ending].dims == ("packing_fraction", "restitution")
+        np.testing.assert_array_equal([here[there], here[f"{there}_stderr"]], [value[name], error[name]])
 
 
 def test_elastic_flow_has_no_prediction() -> None:
@@ -168,13 +166,14 @@ def test_values_stand_at_their_point_and_seed(data, results) -> None:
     for (point, seed), replica in results.items():
         there = {"packing_fraction": NUS[point // 2], "restitution": ALPHAS[point % 2], "seed": seed}
         for name in ("force_ratio", "pressure", "kinetic_stress"):
-            np.testing.assert_allclose(data["seeds"][name].sel(there), replica.sample.averages[name], rtol=1e-12)
+            expected = np.nan if replica.status == Status.infeasible else replica.sample.averages[name]
+            np.testing.assert_allclose(data["seeds"][name].sel(there), expected, rtol=1e-12)
         assert data["seeds/equilibration_strain"].sel(there) == replica.strain
 
 
-def test_point_is_the_ratio_of_the_sums_of_its_finite_seeds(data, results) -> None:
+def test_point_is_the_ratio_of_the_sums_of_its_seeds_that_were_not_given_up(data, results) -> None:
     for point in range(4):
-        tallies = [r.sample.tally for (p, _), r in results.items() if p == point and r.status != Status.nonfinite]
+        tallies = [r.sample.tally for (p, _), r in results.items() if p == point and r.status != Status.infeasible]
         there = data.sel(packing_fraction=NUS[point // 2], restitution=ALPHAS[point % 2])
         ratio = sum(t.impulse.sum() for t in tallies) / sum(t.binary_impulse.sum() for t in tallies)
         assert there.force_ratio == pytest.approx(ratio)
@@ -194,7 +193,7 @@ def test_error_of_the_ratio_is_that_of_the_delta_method(data, results) -> None:
 
 
 def test_worst_status_wins_and_is_a_cf_flag(data) -> None:
-    np.testing.assert_array_equal(data.status, [[Status.iteration_limit, Status.nonfinite], [Status.ok, NOT_RUN]])
+    np.testing.assert_array_equal(data.status, [[Status.iteration_limit, Status.infeasible], [Status.ok, NOT_RUN]])
     for name in ("status", "seeds/status"):
         values, meanings = data[name].attrs["flag_values"], data[name].attrs["flag_meanings"].split()
         assert dict(zip(values.tolist(), meanings, strict=True)) == {-1: "not_run", **{s.value: s.name for s in Status}}
@@ -206,6 +205,14 @@ def test_replicas_that_were_given_up_have_failed(settings, results) -> None:
     assert given_up["seeds/status"][0, 0, 0] == given_up.status[0, 0] == Status.failed
     assert np.isnan(given_up["seeds/force_ratio"][0, 0, 0]) and np.isfinite(given_up.force_ratio[0, 0])
     assert not is_finished(given_up)
+
+
+def test_a_jammed_point_has_no_value(settings, results) -> None:
+    jammed = {key: one._replace(status=int(Status.infeasible)) if key[0] == 1 else one for key, one in results.items()}
+    here = map_dataset(settings, jammed, RUN).sel(packing_fraction=NUS[0], restitution=ALPHAS[1])
+    assert here.status == Status.infeasible
+    for name in ("force_ratio", "pressure_stderr", "pressure_ci95", "stresses/contact_stress", "seeds/force_ratio"):
+        assert np.isnan(here[name]).all()
 
 
 def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
@@ -352,6 +359,22 @@ def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:
                 assert total == pytest.approx(float(parts.error), nan_ok=True)
                 assert total == pytest.approx(np.sqrt(np.sum(np.square(others))), nan_ok=True)
                 assert f"{name}_ci95" in data[name].attrs["ancillary_variables"].split()
+
+
+def test_time_steps_chosen_by_point_are_in_the_file_and_in_the_error(tmp_path: Path) -> None:
+    timesteps = (5e-4, 1e-3, 1e-4, 2e-4)
+    chosen = MapSettings(ALPHAS, NUS, grains=(64, 128), seeds=1, timestep=1e-4, timestep_by_point=timesteps)
+    rng = np.random.default_rng(0)
+    found = map_dataset(chosen, {(point, 0): random_replica(rng, chosen, point=point) for point in range(8)}, RUN)
+    np.testing.assert_array_equal(found.point_timestep, [np.reshape(timesteps, (2, 2))] * 2)
+    assert "timestep" not in found.coords and found.point_timestep.attrs["reduced_unit"] == "1 / shear rate"
+    share = found.pressure_ci95.sel(error_source="timestep") / np.abs(found.pressure)
+    crossing = found.point_timestep * np.sqrt(found.granular_temperature)
+    np.testing.assert_allclose(share, stress_error(crossing, found.packing_fraction.values[:, None]))
+    assert timestep_text(found) == "0.0001 to 0.001"
+    write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
+    again = read_dataset(tmp_path / "map.nc")
+    assert MapSettings(**choices_of(again)) == chosen and not has_one_timestep(again)
 
 
 def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: Path) -> None:

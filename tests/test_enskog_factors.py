@@ -1,4 +1,4 @@
-"""The contact stress is Enskog's times four factors, each of which is one where its assumption holds."""
+"""Stresses and dissipation rate are Enskog's times five factors, each of which is one where its assumption holds."""
 
 from dataclasses import replace
 
@@ -10,21 +10,29 @@ from flows import flow_of
 import jaxgran as jg
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.tally import Tally, empty_tally
-from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
-from jaxgran.sampling.sample import BLOCKS, Sample
+from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
+from jaxgran.sampling.sample import BLOCKS, Sample, estimates
+from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.steady_shear import contact_value
 
 TENSOR = np.array([[1.3, -0.35], [-0.35, 0.8]])
 GRAINS, NU, ALPHA, AREA, DURATION, COLLISIONS = 400, 0.5, 0.6, 400 * np.pi / 4 / 0.5, 0.1, 2000
+MEASURED = {
+    "pressure": "contact_pressure",
+    "shear_stress": "contact_shear_stress",
+    "dissipation_rate": "dissipation_rate",
+}
 FLOW = jg.ShearFlow(GRAINS, ALPHA, NU, 1e-3, polydispersity=0.0)
 
 
-def chaotic_tally(rng: np.random.Generator, pairs: float = 1.0, speed: float = 1.0, impulse: float = 1.0) -> Tally:
+def chaotic_tally(
+    rng: np.random.Generator, waves: float = 1.0, pairs: float = 1.0, speed: float = 1.0, impulse: float = 1.0
+) -> Tally:
     """Sums of a block of collisions of equal discs at random, with independent velocities of a temperature tensor.
 
-    The pairs at contact are so many times those of the theory, their speeds of approach and impulses so many times
-    those of independent velocities and of binary collisions. Pairs are drawn, and each stands for the rate w at which
-    it collides.
+    The granular temperature is so many times the local one, which is that of the collisions. The pairs at contact are
+    so many times those of the theory, their speeds of approach and impulses so many times those of independent
+    velocities and of binary collisions. Pairs are drawn, and each stands for the rate w at which it collides.
     """
     angle = rng.uniform(0, 2 * np.pi, COLLISIONS)
     n = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -35,10 +43,13 @@ def chaotic_tally(rng: np.random.Generator, pairs: float = 1.0, speed: float = 1
     sums = {
         "binary_moment": np.einsum("c,cab->ab", rate * binary, moments) * DURATION,
         "binary_speed_moment": np.einsum("c,cab->ab", rate * binary * w, moments) * DURATION,
-        "kinetic_moment": GRAINS * TENSOR * DURATION,
+        "binary_dissipation": np.sum(rate * (1 - ALPHA) / 2 * binary * w) * DURATION,
+        "kinetic_moment": waves * GRAINS * TENSOR * DURATION,
+        "local_kinetic": np.trace(TENSOR) / 2 * DURATION,
         "duration": np.float64(DURATION),
     }
-    return replace(empty_tally(np.dtype(float)), contact_moment=impulse * sums["binary_moment"], **sums)
+    measured = {"contact_moment": sums["binary_moment"], "dissipation": sums["binary_dissipation"]}
+    return replace(empty_tally(np.dtype(float)), **{name: impulse * one for name, one in measured.items()}, **sums)
 
 
 def sample_of(tallies: list[Tally], grains: int = GRAINS, area: float = AREA) -> Sample:
@@ -51,51 +62,103 @@ def chaotic_sample(seed: int, **factors: float) -> Sample:
     return sample_of([chaotic_tally(rng, **factors) for _ in range(BLOCKS)])
 
 
-@pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
-def test_factors_times_enskog_are_the_measured_contact_stress(run, flowing, packing_fraction) -> None:
+def sheared(engines, flowing, packing_fraction: float, blocks: int) -> Sample:
     flow, state, tallies = flow_of(packing_fraction), flowing(packing_fraction), []
-    for _ in range(3):
-        state, tally = run(flow, state, 500, solver=BarzilaiBorwein())
+    for _ in range(blocks):
+        state, tally = engines["numba"](flow, state, 500, BarzilaiBorwein())
         tallies.append(tally)
-    sample = sample_of(tallies, flow.grains, float(state.side) ** 2)
-    value, error = stress_factors(flow, [sample])
-    for stress in STRESSES:
-        factors = [value[f"{stress}_{factor}"] for factor in FACTORS]
-        product = np.prod(factors) * value[f"enskog_{stress}"]
-        assert product == pytest.approx(float(sample.averages[f"contact_{stress}"]), rel=1e-12)
-        assert all(error[f"{stress}_{factor}"] > 0 for factor in ("anisotropy", "chaos", "pairs"))
+    return sample_of(tallies, flow.grains, float(state.side) ** 2)
+
+
+@pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
+def test_factors_times_enskog_are_what_is_measured(engines, flowing, packing_fraction) -> None:
+    sample = sheared(engines, flowing, packing_fraction, 3)
+    value, error = measured_over_enskog(flow_of(packing_fraction), [sample])
+    measured = {rate: float(sample.averages[name]) for rate, name in MEASURED.items()}
+    for rate in RATES:
+        factors = [value[f"{rate}_{factor}"] for factor in FACTORS]
+        assert np.prod(factors) * value[f"enskog_{rate}"] == pytest.approx(measured[rate], rel=1e-12)
+        assert all(error[f"{rate}_{factor}"] > 0 for factor in ("local_temperature", "anisotropy", "chaos", "pairs"))
+    chaotic = {
+        rate: value[f"enskog_{rate}"] * value[f"{rate}_local_temperature"] * value[f"{rate}_anisotropy"]
+        for rate in RATES
+    }
+    length = chaotic["dissipation_rate"] / measured["dissipation_rate"]
+    assert value["correlation_length"] == pytest.approx(length, rel=1e-12)
+    by_pressure = length * measured["pressure"] / chaotic["pressure"]
+    assert value["correlation_length_from_pressure"] == pytest.approx(by_pressure, rel=1e-12)
+
+
+def test_steady_flow_dissipates_the_power_of_its_shear(engines, flowing) -> None:
+    value, error = estimates([sheared(engines, flowing, 0.75, 600)])
+    off = value["dissipation_rate"] - value["shear_stress"]  # at a shear rate of one
+    assert abs(off) < 3 * np.hypot(error["dissipation_rate"], error["shear_stress"]) < 0.2 * value["shear_stress"]
 
 
 def test_factors_of_chaos_are_one() -> None:
-    value, error = stress_factors(FLOW, [chaotic_sample(0), chaotic_sample(1)])
-    for stress in STRESSES:
-        assert value[f"{stress}_binary"] == 1
+    value, error = measured_over_enskog(FLOW, [chaotic_sample(0), chaotic_sample(1)])
+    for rate in RATES:
+        assert value[f"{rate}_binary"] == 1
+        assert value[f"{rate}_local_temperature"] == pytest.approx(1, rel=1e-12)
+        assert value[f"{rate}_anisotropy"] > 1  # T_xy < 0 adds to the speeds along which the shear pushes
         for factor in ("chaos", "pairs"):
-            off = abs(value[f"{stress}_{factor}"] - 1)
-            assert off < 4 * error[f"{stress}_{factor}"] < 0.1
-    assert value["pressure_anisotropy"] > 1 and value["shear_stress_anisotropy"] > 1  # T_xy < 0 adds to the shear
+            off = abs(value[f"{rate}_{factor}"] - 1)
+            assert off < 4 * error[f"{rate}_{factor}"] < 0.1
+    for name in ("correlation_length", "correlation_length_from_pressure"):
+        assert abs(value[name] - 1) < 4 * error[name] < 0.1
 
 
-@pytest.mark.parametrize(("made", "times", "factor"), [("pairs", 3.0, "pairs"), ("impulse", 1.5, "binary")])
-def test_pairs_and_impulses_are_found_in_their_own_factor(made: str, times: float, factor: str) -> None:
-    assert_changed(made, times, {factor: times})
-
-
-def test_slower_approach_is_found_as_its_square() -> None:
-    assert_changed("speed", 0.5, {"chaos": 0.25})
-
-
-def assert_changed(made: str, times: float, expected: dict[str, float]) -> None:
-    """A change of the collisions changes these factors of both stresses and no other."""
-    chaotic, failing = (stress_factors(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times))
-    for stress in STRESSES:
+@pytest.mark.parametrize(
+    ("made", "times", "expected"),
+    [
+        ("pairs", 3.0, {"pairs": 3.0}),
+        ("impulse", 1.5, {"binary": 1.5}),
+        ("speed", 0.5, {"chaos": 0.25, "dissipation_rate_chaos": 0.125}),
+    ],
+)
+def test_a_change_of_collisions_is_found_in_its_own_factor(made: str, times: float, expected: dict) -> None:
+    chaotic, failing = (measured_over_enskog(FLOW, [chaotic_sample(2, **{made: x})])[0] for x in (1.0, times))
+    for rate in RATES:
         for factor in FACTORS:
-            change = failing[f"{stress}_{factor}"] / chaotic[f"{stress}_{factor}"]
-            assert change == pytest.approx(expected.get(factor, 1.0), rel=1e-9), (stress, factor)
+            change = failing[f"{rate}_{factor}"] / chaotic[f"{rate}_{factor}"]
+            found_in = expected.get(f"{rate}_{factor}", expected.get(factor, 1.0))
+            assert change == pytest.approx(found_in, rel=1e-9), (rate, factor)
 
 
-def test_stress_of_no_collisions_has_no_factors_but_an_enskog_stress() -> None:
-    nothing = replace(empty_tally(np.dtype(float)), kinetic_moment=GRAINS * TENSOR, duration=np.float64(1.0))
-    value, _ = stress_factors(FLOW, [sample_of([nothing] * 2)])
-    assert np.isnan([value[f"{stress}_{factor}"] for stress in STRESSES for factor in ("chaos", "pairs")]).all()
-    assert value["enskog_pressure"] > 0 and value["enskog_shear_stress"] > 0
+def test_long_waves_change_the_granular_temperature_alone() -> None:
+    calm, waving = (measured_over_enskog(FLOW, [chaotic_sample(2, waves=x)])[0] for x in (1.0, 2.0))
+    lengths = ("correlation_length", "correlation_length_from_pressure")
+    kept = [f"{rate}_{factor}" for rate in RATES for factor in FACTORS if factor != "local_temperature"]
+    for name in (*kept, *lengths):
+        assert waving[name] == pytest.approx(calm[name], rel=1e-9), name
+    enskog = momentum_and_energy(2 * np.trace(TENSOR) / 2), momentum_and_energy(np.trace(TENSOR) / 2)
+    for rate in RATES:
+        assert waving[f"enskog_{rate}"] == pytest.approx(enskog[0][rate], rel=1e-9)
+        assert waving[f"{rate}_local_temperature"] == pytest.approx(enskog[1][rate] / enskog[0][rate], rel=1e-9)
+
+
+def momentum_and_energy(temperature: float) -> dict[str, float]:
+    """Enskog's contact stresses and dissipation rate at an isotropic temperature."""
+    found = collisional_transfer(temperature * np.eye(2), ALPHA, NU, polydispersity=0.0)
+    stress = np.asarray(found.stress)
+    return {
+        "pressure": np.trace(stress) / 2,
+        "shear_stress": -stress[0, 1],
+        "dissipation_rate": float(found.dissipation_rate),
+    }
+
+
+def test_no_collisions_have_no_factors_but_enskogs_rates() -> None:
+    still = {"kinetic_moment": GRAINS * TENSOR, "local_kinetic": np.float64(1.0), "duration": np.float64(1.0)}
+    value, _ = measured_over_enskog(FLOW, [sample_of([replace(empty_tally(np.dtype(float)), **still)] * 2)])
+    missing = [f"{rate}_{factor}" for rate in RATES for factor in ("chaos", "pairs", "binary")]
+    assert np.isnan([value[name] for name in (*missing, "correlation_length")]).all()
+    assert all(value[f"enskog_{rate}"] > 0 for rate in RATES)
+
+
+def test_elastic_grains_have_no_correlation_length() -> None:
+    zero = {"dissipation": np.float64(0), "binary_dissipation": np.float64(0)}
+    elastic = replace(chaotic_tally(np.random.default_rng(0)), **zero)
+    value, _ = measured_over_enskog(replace(FLOW, restitution=1.0), [sample_of([elastic] * 2)])
+    assert np.isnan([value["correlation_length"], value["dissipation_rate_pairs"]]).all()
+    assert value["enskog_dissipation_rate"] == 0 and np.isfinite(value["pressure_pairs"])

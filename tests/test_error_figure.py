@@ -34,6 +34,8 @@ def test_each_point_has_the_mark_of_its_largest_part_and_its_whole_error(largest
     for axes in figure.axes:
         counts = [len(marks.get_offsets()) for marks in axes.collections]
         assert counts == [12 if k == shown else 0 for k in range(4)]
+        places = np.concatenate([marks.get_offsets() for marks in axes.collections])
+        assert set(places[:, 0]) == set(1 - with_budget(largest).restitution.values)
         assert {text.get_text() for text in axes.texts} == {"20"}
         assert "20 % (median), 20 % (largest)" in axes.get_title()
     assert legend_texts(figure) == ["sampling", "time step", "number of grains", "tolerance"]

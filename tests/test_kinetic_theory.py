@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxgran.theory import gaussian_moments as moments_module
-from jaxgran.theory.enskog import momentum_transfer
+from jaxgran.theory.enskog import collisional_transfer
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 from jaxgran.theory.steady_shear import SteadyShear, contact_value, maxwellian_collision_rate
@@ -91,7 +91,7 @@ def test_every_number_is_finite_and_positive_over_the_plane(theory):
 @pytest.mark.parametrize("theory", THEORIES)
 def test_shear_power_equals_dissipation(theory):
     predicted = batched(theory)(*PLANE)
-    np.testing.assert_allclose(predicted.shear_stress, predicted.dissipation, rtol=1e-12)
+    np.testing.assert_allclose(predicted.shear_stress, predicted.dissipation_rate, rtol=1e-12)
 
 
 def test_moments_hold_in_single_precision():
@@ -106,7 +106,7 @@ def test_stresses_grow_with_the_square_of_the_shear_rate(theory):
     slow, fast = theory(0.8, 0.5, 1.0), theory(0.8, 0.5, 3.0)
     np.testing.assert_allclose(temperature_and_stresses(fast), 9 * temperature_and_stresses(slow), rtol=1e-12)
     np.testing.assert_allclose(fast.collision_rate, slow.collision_rate, rtol=1e-12)
-    np.testing.assert_allclose(fast.dissipation, fast.shear_stress * 3.0, rtol=1e-12)
+    np.testing.assert_allclose(fast.dissipation_rate, fast.shear_stress * 3.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("packing_fraction", [0.05, 0.4, 0.8])
@@ -141,19 +141,26 @@ def test_contact_value_starts_from_the_second_virial_coefficient():
     np.testing.assert_allclose(jax.grad(contact_value)(0.0), 25 / 16)
 
 
-def test_momentum_transfer_is_the_stress_of_the_moments_at_equal_temperatures():
+def test_collisional_transfer_is_that_of_the_moments_at_equal_temperatures():
     tensor, alpha, nu = np.array([[0.5, -0.1], [-0.1, 0.3]]), jnp.asarray(0.6), jnp.asarray(0.5)
     mixture = moments_module.uniform_mixture(nu, jnp.asarray(0.26), 4)
     classes = np.repeat(np.array([0.5, 0.3, -0.1])[:, None], 4, axis=1)  # xx, yy, xy
-    xx, yy, xy = jax.jit(moments_module._collisions)(jnp.asarray(classes), alpha, mixture).stress
-    found = momentum_transfer(jnp.asarray(tensor), alpha, nu)
+    expected = jax.jit(moments_module._collisions)(jnp.asarray(classes), alpha, mixture)
+    xx, yy, xy = expected.stress
+    found = collisional_transfer(jnp.asarray(tensor), alpha, nu)
     np.testing.assert_allclose(found.stress, [[xx, xy], [xy, yy]], rtol=1e-12)
+    np.testing.assert_allclose(found.dissipation_rate, expected.dissipation, rtol=1e-12)
 
 
-def test_momentum_transfer_of_slow_shear_has_the_viscosity_of_isotropic_collisions():
+def test_enskogs_dissipation_vanishes_in_the_elastic_limit_as_one_minus_the_squared_restitution():
+    losses = [collisional_transfer(jnp.eye(2), alpha, 0.5).dissipation_rate for alpha in (1.0, 0.9, 0.0)]
+    np.testing.assert_allclose(losses, [0, 0.19 * losses[2], losses[2]], rtol=1e-12)
+
+
+def test_collisional_transfer_of_slow_shear_has_the_viscosity_of_isotropic_collisions():
     """Half of γ_b = (8/π) ν² χ (1 + α), in units of √(T/4π): V. Garzó and J. W. Dufty (1999) at vanishing shear."""
     alpha, nu, rate, temperature = 0.8, 0.5, 1e-4, 2.0
-    found = momentum_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
+    found = collisional_transfer(temperature * jnp.eye(2), alpha, nu, rate, 0.0)
     bulk = 8 / np.pi * nu**2 * float(contact_value(nu)) * (1 + alpha)
     np.testing.assert_allclose(-found.stress[0, 1] / rate, bulk / 2 * np.sqrt(temperature / (4 * np.pi)), rtol=1e-6)
     speed = found.speed_stress[0, 0] / found.stress[0, 0]  # ⟨w³⟩ / ⟨w²⟩ of a half-Gaussian of variance 2T

@@ -79,6 +79,13 @@ def test_sample_of_a_batch_is_the_sample_of_each(batch, measured) -> None:
     assert_agree(replica(both, 0), measured[1])
 
 
+def test_a_strain_that_its_blocks_do_not_divide_is_sampled_whole_alone_and_in_a_batch(batch, state) -> None:
+    _, both = sample_batch(batch, 0.753)
+    _, alone = sample(FLOWS[0], state, 0.753)
+    assert_agree(replica(both, 0), alone)
+    np.testing.assert_allclose(np.sum(both.tally.duration, axis=1), 0.75)  # 75 steps in 32 blocks
+
+
 def test_lax_map_applies_with_a_traced_strain(batch, measured) -> None:
     # What a map computes is in the test of the batch, which runs it; here it need only be traced.
     def shear(flow, state, strain):
@@ -145,7 +152,7 @@ def test_errors_of_a_batch_are_those_of_each_replica_which_an_index_takes() -> N
     np.testing.assert_array_equal(both[1:].pressure, both.pressure[1:])
     with pytest.raises(IndexError):
         both[2]
-    with pytest.raises(InputError, match=r"^an index takes a replica of a batch, and this is one Sample"):
+    with pytest.raises(InputError, match=r"^an index takes one of a batch, and this is one Sample, not a batch"):
         both[0][0]
 
 

@@ -1,7 +1,6 @@
 """The cell-list search finds the pairs that a search of all images finds, or says that it may have missed some."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
@@ -144,7 +143,8 @@ def test_whatever_may_be_missing_is_flagged():
 def test_set_bit_is_the_place_of_the_bit_of_that_rank():
     words = np.random.default_rng(0).integers(0, 2**32, 50, dtype=np.uint32)
     words[:3] = 1, 2**31, 2**32 - 1
-    found = jax.jit(set_bit)(jnp.asarray(words)[:, None], jnp.tile(jnp.arange(32, dtype=jnp.int32), (len(words), 1)))
+    ranks = np.tile(np.arange(32, dtype=np.int32), len(words))
+    found = jax.jit(set_bit)(np.repeat(words, 32), ranks).reshape(-1, 32)
     for word, row in zip(words, found, strict=True):
         places = [k for k in range(32) if int(word) >> k & 1]
         assert row[: len(places)].tolist() == places

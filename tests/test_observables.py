@@ -52,6 +52,7 @@ def tally(microscopic) -> Tally:
         wave_kinetic=np.float64(2.1 * steps * TIMESTEP),
         deep_contacts=np.float64(0),
         dissipation=np.float64(0.3),
+        binary_dissipation=np.float64(0.2),
         complementarity=np.float64(0.02),
         energy_change=np.float64(-0.1),
         contacts=np.float64(len(impulses)),
@@ -139,6 +140,11 @@ def test_counts_are_per_grain_and_step(microscopic, measured, tally) -> None:
     assert measured["max_overlap"] == tally.largest_overlap
     assert measured["worst_residual"] == tally.worst_residual
     assert measured["momentum_drift"] == tally.momentum_drift
+
+
+def test_dissipation_rates_are_per_area_and_time(tally, measured) -> None:
+    assert measured["dissipation_rate"] == pytest.approx(0.3 / AREA / tally.duration)
+    assert measured["binary_dissipation_rate"] == pytest.approx(0.2 / AREA / tally.duration)
 
 
 def test_powers_are_shares_of_the_shear_work(tally, measured) -> None:

@@ -176,8 +176,3 @@ def test_what_cannot_be_observed_is_refused_in_one_sentence(flowing, changed: di
 def test_callback_is_refused_under_a_transformation(flowing) -> None:
     with pytest.raises(InputError, match="callback must be None for a batch, and where"):
         jax.jit(lambda state: sample(FLOW, state, STRAIN, callback=print))(flowing(0.7))
-
-
-def test_what_was_not_observed_cannot_be_asked_for(plain_sample) -> None:
-    with pytest.raises(InputError, match="sampled with observe"):
-        plain_sample[1].observed()

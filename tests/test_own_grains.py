@@ -22,7 +22,7 @@ from jaxgran.model.grains import Grains, own_grains, polydisperse
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.packing import pack, require_room
-from jaxgran.sampling.prediction import _classes, predicted
+from jaxgran.sampling.prediction import predicted, size_classes
 from jaxgran.sampling.steady_state import heated, prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
@@ -143,7 +143,7 @@ def test_start_and_prepare_keep_the_grains_and_heat_them_alike():
 def test_theory_of_given_grains_is_that_of_their_law():
     """Eight classes of uniform diameters stand for the law as its quadrature does; masses are a unit."""
     grains = polydisperse(256, 0.26, jax.random.key(0))
-    diameters, masses = _classes(grains)
+    diameters, masses = size_classes(grains)
     given = mixture_moments(0.8, 0.6, 1.0, diameters, masses)
     law = gaussian_moments(0.8, 0.6, 1.0, 0.26)
     doubled = mixture_moments(0.8, 0.6, 1.0, diameters, 2 * masses)

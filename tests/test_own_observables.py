@@ -54,7 +54,10 @@ def assert_same_variables(data: xr.DataTree, other: xr.DataTree) -> None:
     """All variables of ``other`` are in ``data``, bit for bit."""
     for node in other.subtree:
         for name, variable in node.data_vars.items():
-            np.testing.assert_array_equal(data[node.path][name], variable, err_msg=f"{node.path} {name}")
+            there = data[node.path][name]
+            if name == "tally":  # the sums of the user's observables are behind the others
+                there = there.isel(quantity=slice(variable.sizes["quantity"]))
+            np.testing.assert_array_equal(there, variable, err_msg=f"{node.path} {name}")
 
 
 def test_observing_changes_no_bit_of_a_map(observed, plain) -> None:
@@ -96,7 +99,7 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
             raise RuntimeError("cut off")
 
     with pytest.raises(RuntimeError, match="cut off"):
-        ratio_map(**MAP, observe=observe, output=output, progress=cut_off)
+        ratio_map(**MAP, observe=observe, output=output, progress=cut_off, workers=1)
     assert list(folder.glob("done-*")) and list(folder.glob("journal-*"))
     for other in (None, lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS}):
         with pytest.raises(InputError, match=r"has observe 'contacts_per_grain, own_stress: \w{16}', not ") as caught:

@@ -1,8 +1,10 @@
 """Importing is light, and public names resolve."""
 
+import re
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -38,6 +40,27 @@ def test_public_names_resolve_and_are_documented(name: str) -> None:
     assert name in dir(jaxgran)
     assert getattr(jaxgran, name).__doc__
     assert getattr(jaxgran, name).__module__.startswith("jaxgran.")
+
+
+def test_editors_know_the_names_without_running_them(tmp_path: Path) -> None:
+    """Types of public names, of the averages of a sample and of a snapshot in a series, by the stub alone."""
+    code = """
+import jaxgran as jg
+def typed(flow: jg.ShearFlow, sample: jg.Sample, series: jg.Snapshot) -> None:
+    reveal_type(jg.prepare)
+    reveal_type(flow[0])
+    reveal_type(sample.macroscopic_friction)
+    reveal_type(series[3])
+    sample.presure
+    jg.smaple
+"""
+    (tmp_path / "typed.py").write_text(code)
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "typed.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    types = re.findall(r'Type of ".*" is "(.*)"', done.stdout)
+    assert types[0].startswith("(flow: ShearFlow, key: ") and types[1::2] == ["ShearFlow", "Snapshot"]
+    assert types[2].startswith("Array | ndarray")
+    assert [x for x in ("presure", "smaple") if f'"{x}" is' in done.stdout] == ["presure", "smaple"]
 
 
 def test_version_is_that_of_the_installed_package() -> None:

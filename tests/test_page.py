@@ -72,6 +72,14 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
     assert not [name for name in by_name if re.search("_stderr|_seed|ci95|snapshot|status", name)]
 
 
+def test_force_ratio_stands_first_and_then_its_excess_over_one(found) -> None:
+    ratio, excess = found["observables"][:2]
+    assert (ratio["name"], excess["name"], excess["meaning"]) == ("force_ratio", "excess", "force ratio − 1")
+    data = flattened(page_map()).sortby("timestep").force_ratio
+    assert_same_numbers(excess["value"], data.transpose("timestep", "packing_fraction", "restitution").values - 1)
+    assert excess["error"] == ratio["error"] and excess["whole"] == ratio["whole"]
+
+
 def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:
     """Point 8 of the settings was not run; the shorter time step comes first on a page."""
     assert found["status"] == ["ok", "deep_overlap", "not_run", *["ok"] * 9]
@@ -127,8 +135,16 @@ def test_several_numbers_of_grains_are_an_axis_and_an_estimate_without_them_is_s
 def test_number_of_grains_that_was_chosen_by_point_stands_at_its_point() -> None:
     data = ratio_dataset(2, 2)
     page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
-    assert page["grains"] == [64, 90, 128, 256] and [one["name"] for one in page["observables"]] == ["force_ratio"]
+    assert page["grains"] == [64, 90, 128, 256] and len(page["observables"]) == 2
     assert map_data(data)["grains"] is None
+
+
+def test_time_steps_that_were_chosen_by_point_stand_there_and_no_excess_is_contoured() -> None:
+    data = ratio_dataset(2, 2)
+    page = map_data(data.assign_coords(point_timestep=(data.force_ratio.dims, [[1e-3, 2e-3], [3e-4, 4e-4]])))
+    assert page["timesteps"] == [1e-3, 2e-3, 3e-4, 4e-4] and page["excessLevels"] == []
+    assert any("do not compare" in note for note in page["notes"])
+    assert map_data(data)["timesteps"] is None and map_data(data)["excessLevels"]
 
 
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
@@ -186,6 +202,8 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
     again = map_data(data)["again"]
     assert again["options"] == "--solver barzilai-borwein --activation midpoint --tolerance 0.0001"
     assert_same_numbers(again["strain"], flattened(data)["seeds/strain"].mean("seed").sortby("timestep").values)
+    jammed = flattened(data).assign(force_ratio=data.force_ratio.where(data.restitution > data.restitution.min()))
+    assert sum(strain is None for strain in map_data(jammed)["again"]["strain"]) > again["strain"].count(None)
     assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
 
 

@@ -59,6 +59,9 @@ def test_two_discs_rebound_with_the_coefficient_of_restitution(engine, engine_ru
         assert normal @ (places[0] - places[1]) > 0.5 * reach
         rebound = -(normal @ pair_velocity(after)) / (normal @ pair_velocity(before))
         assert rebound == pytest.approx(restitution, rel=0, abs=1e-10)
+        masses = np.asarray(before.grains.masses)[:2]
+        lost = (1 - restitution**2) / 2 * np.prod(masses) / np.sum(masses) * (normal @ pair_velocity(before)) ** 2
+        assert [tally.dissipation, tally.binary_dissipation] == pytest.approx([lost, lost], rel=1e-9, abs=1e-9)
         assert tally.status == Status.ok
 
 
@@ -207,6 +210,7 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
         "binary_speed_moment": 4,
         "squared_impulse": 4,
         "dissipation": 4,
+        "binary_dissipation": 4,
         "complementarity": 4,
         "energy_change": 4,
         "duration": 0.5,

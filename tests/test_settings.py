@@ -1,6 +1,6 @@
 """Every mistake in the parameters of a map is one sentence that names the accepted range, before anything runs."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 from typing import Any
 
@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from synthetic import one_sentence
 
+from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba, Pallas
-from jaxgran.maps.parameters import MapParameters
+from jaxgran.maps.parameters import MapParameters, RunParameters
+from jaxgran.maps.presets import PRESETS, with_start
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_GRAINS
@@ -28,8 +30,7 @@ GOOD: dict[str, Any] = {
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"restitution": (-0.1, 0.5)}, "between 0 and 1"),
     ({"restitution": (float("nan"),)}, "between 0 and 1"),
-    ({"restitution": (0.5, 0.1, 0.9)}, "sorted"),
-    ({"restitution": (0.5, 0.5)}, "without repetition"),
+    ({"restitution": (0.5, 0.9, 0.5)}, r"must be a list without repetition, in any order, not \[0.5, 0.9, 0.5\]"),
     ({"restitution": ((0.1, 0.5), (0.7, 0.9))}, "a list of numbers"),
     ({"packing_fraction": (0.0, 0.5)}, "above 0 and at most 0.83"),
     ({"grains": 15}, "at least 16"),
@@ -69,9 +70,14 @@ def test_a_mistake_is_one_sentence_with_the_accepted_range(mistake: dict[str, An
     assert caught.value.field in ("", next(iter(mistake)))
 
 
-def test_lists_may_fall_as_well_as_rise() -> None:
-    falling = {"restitution": (0.9, 0.5), "timestep": (1e-4, 1e-3)}
-    assert {name: MapSettings(**{**GOOD, **falling}).axes[name] for name in falling} == falling
+def test_a_plane_in_any_order_is_sorted_with_the_grains_of_its_points() -> None:
+    mixed = {"packing_fraction": (0.7, 0.6), "restitution": (0.9, 0.1, 0.5)}
+    grains = dict(zip(product((1e-3, 1e-4), *mixed.values()), range(16, 28), strict=True))
+    given = {**GOOD, **mixed, "timestep": (1e-3, 1e-4), "grains_by_point": list(grains.values())}
+    settings, _ = chosen(**given, tolerance="auto")
+    assert settings.axes == {"timestep": (1e-3, 1e-4), "packing_fraction": (0.6, 0.7), "restitution": (0.1, 0.5, 0.9)}
+    for flow in settings.flows():
+        assert grains[flow.timestep, flow.packing_fraction, flow.restitution] == flow.grains
 
 
 def test_flows_are_the_points_packing_fraction_first() -> None:
@@ -104,6 +110,27 @@ def chosen(**parameters: Any) -> tuple[MapSettings, str]:
 def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
     one, several = (chosen(**{**GOOD, "timestep": "auto", "grains": grains}) for grains in (64, (64, 1024)))
     assert several == (replace(one[0], grains=(64, 1024)), one[1])
+
+
+def test_each_point_has_its_own_automatic_time_step_which_is_that_of_its_own_map() -> None:
+    plane = {"restitution": (0.9, 0.2), "packing_fraction": (0.6, 0.82)}
+    given = {**GOOD, "timestep": "auto", "grains": (64, 256), "strain": None}
+    settings, sentence = chosen(**{**given, **plane})
+    for flow in settings.flows():
+        alone, _ = chosen(**{**given, "restitution": [flow.restitution], "packing_fraction": [flow.packing_fraction]})
+        assert alone.timestep_by_point is None and alone.timestep == flow.timestep
+    steps = [flow.timestep for flow in settings.flows()]
+    assert settings.timestep == min(steps) < max(steps)
+    assert f"timestep {min(steps):g} to {max(steps):g} / shear rate" in sentence
+    assert all(flow.timestep <= 1 / 160 for flow in chosen(**{**given, **plane, "strain": 1.0})[0].flows())
+
+
+@pytest.mark.parametrize("wrong", [(1e-3,), 1e-3, (1e-3, -1.0), (1e-3, 5e-3)])
+def test_time_steps_by_point_are_one_for_each_and_short_enough(wrong: Any) -> None:
+    assert [flow.timestep for flow in chosen(**GOOD, timestep_by_point=(1e-3, 1e-4))[0].flows()] == [1e-3, 1e-4]
+    with pytest.raises(InputError, match="timestep") as caught:
+        chosen(**GOOD, timestep_by_point=wrong)
+    assert one_sentence(str(caught.value))
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
@@ -143,6 +170,25 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
             chosen(**{**GOOD, "tolerance": value})
 
 
+def test_the_command_and_the_function_start_alike() -> None:
+    """What is left to Python has no text form, and what is left to the command is about figures and the terminal."""
+    python = {one.name for one in fields(RunParameters)}
+    python_only = {"observe", "grains_by_point", "timestep_by_point", "progress", "record", "attributes"}
+    assert set(MAP_OPTIONS) - {"format", "quiet"} == python - python_only
+    assert with_start({}) == PRESETS["quick"]
+    assert with_start({"error": 0.1}).items() >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()
+    assert with_start({"preset": "paper", "seeds": 3})["seeds"] == 3
+    for wrong in (
+        {"preset": "slow"},
+        {"preset": "quick", "from_map": "map.nc"},
+        {"from_map": 3},
+        {"from_map": "no.nc"},
+    ):
+        with pytest.raises(InputError) as caught:
+            with_start(wrong)
+        assert one_sentence(str(caught.value))
+
+
 def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
     given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2, "seeds": 1}
     settings, sentence = chosen(**given, grains="auto", timestep="auto", tolerance="auto")
@@ -150,6 +196,7 @@ def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
         assert size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains) <= 0.6 * 0.2
     assert len({flow.grains for flow in settings.flows()}) > 1
     assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.2" in sentence
+    assert settings.timestep_by_point is None  # so that the force ratios of its points compare
 
 
 def test_automatic_grains_require_an_error() -> None:

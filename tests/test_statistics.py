@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import stdtrit
 
 from jaxgran import statistics
+from jaxgran.sampling.sample import steps_of_blocks
 from jaxgran.statistics import correlation_length, drift, error_correlation, jackknife, standard_errors
 
 TRIALS = 400
@@ -220,6 +221,19 @@ def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> No
     errors = np.array([error["ratio"] for _, error in samples])
     uncertainty = values.std() / np.sqrt(2 * TRIALS)
     assert values.std() - 3 * uncertainty < errors.mean() < 1.2 * values.std() + 3 * uncertainty
+
+
+def test_blocks_that_differ_by_a_step_have_the_error_of_all_their_steps() -> None:
+    """White noise of each step, in blocks of five and six steps, as those of a strain that 32 blocks do not divide."""
+    rng, steps = np.random.default_rng(12), steps_of_blocks(np.array(176.0), 32)
+    assert set(steps.tolist()) == {5, 6}
+    noise = np.sqrt(steps)[:, None] * rng.normal(size=(2, 32, TRIALS))
+    sums = {"over": steps[:, None] * 3 + noise, "under": np.broadcast_to(steps[:, None], noise.shape)}
+    value, error = standard_errors(ratio, sums)
+    expected = 1 / np.sqrt(2 * 176)
+    assert np.std(value["ratio"]) == pytest.approx(expected, rel=4 / np.sqrt(2 * TRIALS))
+    covered = np.mean(np.abs(value["ratio"] - 3) < 1.959964 * error["ratio"])
+    assert covered > 0.95 - 4 * np.sqrt(0.95 * 0.05 / TRIALS)
 
 
 def test_errors_of_two_averages_are_correlated_as_their_blocks_are() -> None:

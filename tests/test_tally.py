@@ -85,6 +85,7 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "squared_impulse": p * p,
         "deep_contacts": overlap > DEEP_OVERLAP,
         "binary_speed_moment": -approach * binary * moment,
+        "binary_dissipation": -approach * binary * (2 - one_plus_alpha) / 2,
     }
     begin = span_of(CONTACT).start
     assert len(terms) == span_of(CONTACT).stop - begin

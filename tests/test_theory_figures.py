@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
-from jaxgran.plotting.enskog_factors import PANELS, enskog_factors
+from jaxgran.plotting.enskog_factors import LENGTH_PANEL, PANELS, enskog_factors
 from jaxgran.plotting.friction import friction_figure, parameters_text
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
+from jaxgran.sampling.enskog_factors import RATES
 
 DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress, relative
@@ -57,10 +58,10 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
         added |= {key: (DIMS, value) for key, value in parts.items()}
         added |= {f"{key}_stderr": (DIMS, STDERR * value) for key, value in parts.items()}
         added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
-        for k, factor in enumerate(PANELS):
-            value = np.exp(factor_of(k, x, nu)) * np.ones(measured.shape)
-            added[f"theory/enskog_factor_{name}_{factor}"] = (DIMS, value)
-            added[f"theory/enskog_factor_{name}_{factor}_stderr"] = (DIMS, STDERR * value)
+    shown = {f"enskog_factor_{rate}_{factor}": k for rate in RATES for k, factor in enumerate(PANELS)}
+    for name, k in (shown | {"correlation_length_from_pressure": len(PANELS)}).items():
+        value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
+        added |= {f"theory/{name}": (DIMS, value), f"theory/{name}_stderr": (DIMS, STDERR * value)}
     ratio = np.ones((*data.force_ratio.shape, 2, 2))
     added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
     added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
@@ -199,10 +200,10 @@ def test_bad_status_is_ringed_in_every_plane(draw) -> None:
 # ---------------------------------------------------------------------------------------------- factors
 
 
-@pytest.mark.parametrize("stress", ["pressure", "shear_stress"])
-def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(stress) -> None:
-    figure = enskog_factors(theory_dataset(), stress)
-    assert [axes.get_title() for axes in figure.axes] == list(PANELS.values())
+@pytest.mark.parametrize("rate", RATES)
+def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(rate) -> None:
+    figure = enskog_factors(theory_dataset(), rate)
+    assert [axes.get_title() for axes in figure.axes] == [*PANELS.values(), LENGTH_PANEL]
     for k, axes in enumerate(figure.axes):
         corners = factor_of(k, *np.meshgrid([0.1, 0.9], [0.3, 0.8]))
         lines = contour_lines(axes, "black")
@@ -214,7 +215,7 @@ def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(stress)
         for dotted in noise(axes):
             assert abs(factor_of(k, *dotted.T)).max() < 1.001 * STDERR
     assert noise(figure.axes[0]) and "within ± std. error" in legend_texts(figure)
-    assert f"Contact {stress.replace('_', ' ')}" in caption(figure)
+    assert RATES[rate].capitalize() in caption(figure)
 
 
 # -------------------------------------------------------------------------------------------- clusters
@@ -255,6 +256,8 @@ def test_excess_too_small_for_the_axis_is_counted() -> None:
     data.force_ratio[0, :2] = [1.0, 0.999]
     assert "2 of 30 points have an excess too small" in caption(cluster_shares(data))
     assert "too small" not in caption(cluster_shares(theory_dataset()))
+    without = theory_dataset()
+    assert "30 of 30 points" in caption(cluster_shares(without.assign(force_ratio=without.force_ratio * 0 + 1)))
 
 
 @pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
@@ -362,7 +365,7 @@ def test_shortest_time_step_is_drawn(draw) -> None:
         (theory_dataset(1, 3), ["curves", "clusters"]),
         (theory_dataset(3, 3).drop_vars("theory/pressure"), ["curves", "contours", "factors", "clusters"]),
         (
-            theory_dataset(3, 3).drop_vars("theory/enskog_factor_pressure_pairs"),
+            theory_dataset(3, 3).drop_vars("theory/enskog_factor_pressure_local_temperature"),  # made before
             ["curves", "contours", "theory", "clusters"],
         ),
         (dense_dataset(), ["curves", "contours", "rheology"]),

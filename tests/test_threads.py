@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxgran.dynamics.threads import Cancelled, in_threads
+from jaxgran.maps.replica import Advance
 from jaxgran.maps.replicas import replicas
 from jaxgran.maps.settings import MapSettings
 
@@ -103,8 +104,8 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
         sent.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
-    def report(steps: float) -> None:
-        reported.append(steps)
+    def report(advance: Advance) -> None:
+        reported.append(advance)
         if len(reported) == 2:
             threading.Timer(0.3, interrupt).start()  # in the middle of a block, of which a replica has 32
 

@@ -200,6 +200,36 @@ def test_peculiar_velocities_are_those_of_the_laboratory_without_the_shear(tmp_p
     np.testing.assert_allclose(read.velocities, tracks().velocities, rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("name", ["discs.csv", "hoomd.gsd"])
+def test_velocities_without_the_shear_are_taken_as_peculiar_with_a_word_about_it(name: str, tmp_path: Path) -> None:
+    """At the rate of the tilting cell, or at that by which the displacements exceed the velocities."""
+    WRITERS[name](tmp_path / name, peculiar(tracks()))
+    with pytest.warns(UserWarning, match="lack the shear of the displacements, of rate .* taken as peculiar"):
+        read = read_tracks(tmp_path / name, interval=INTERVAL)
+    assert read.shear_rate == pytest.approx(1.0, rel=1e-3)
+    fit = fit_restitution(read)
+    assert abs(fit.restitution - RESTITUTION) < 1e-3
+    with pytest.raises(InputError, match=r"shear of rate .*, and its shear rate is 2: "):
+        read_tracks(tmp_path / name, interval=INTERVAL, shear_rate=2.0)
+
+
+def test_recorded_strain_is_the_clock_of_positions_alone(tmp_path: Path) -> None:
+    """A file may hold a strain without the states and parameters of jaxgran; frames may be missing."""
+    seen = tracks()
+    unobserved = replace(seen, velocities=np.full_like(seen.velocities, np.nan))
+    write_gsd(tmp_path / "hoomd.gsd", unobserved)
+    with gsd.hoomd.open(tmp_path / "hoomd.gsd") as file, gsd.hoomd.open(tmp_path / "strain.gsd", "w") as strained:
+        for time, frame in zip(seen.time, file, strict=True):
+            frame.log = {"jaxgran/strain": np.array([time])}
+            strained.append(frame)
+    read, without_clock = (read_tracks(tmp_path / name) for name in ("strain.gsd", "hoomd.gsd"))
+    np.testing.assert_allclose(read.time, seen.time)
+    assert np.isnan(read.velocities).all() and read.shear_rate == pytest.approx(1.0, rel=1e-3)
+    assert fit_restitution(read).restitution == pytest.approx(fit_restitution(without_clock).restitution, abs=1e-6)
+    outcome = jaxgran(tmp_path, "fit", "strain.gsd")
+    assert outcome.status == 0 and "recorded" not in outcome.out
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_states_are_tracks_and_so_is_their_file(dtype: type, tmp_path: Path) -> None:
     """In single precision too, which a fit in double precision once refused."""
@@ -289,7 +319,6 @@ BROKEN: dict[str, Callable[[Path], object]] = {
     "one_step_twice.dump": dump("TIMESTEP\n500\n", "TIMESTEP\n0\n"),
     "cut.gsd": cut(write_gsd, 2000),
     "discs_come_and_go.gsd": other_numbers_of_discs,
-    "peculiar_velocities.gsd": lambda path: write_gsd(path, peculiar(tracks())),
     "diameters_in_metres.csv": text(lambda: changed("diameter", lambda x: 1e-3 * x)),
     "pandas.h5": table_of_pandas,
     "no_box.dump": dump("ITEM: BOX BOUNDS xy xz yz pp pp pp\n", ""),

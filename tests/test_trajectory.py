@@ -277,6 +277,23 @@ def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, t
     assert np.all(bonded.distances < 1.01 * sums) and np.all(bonded.distances > 0.95 * sums)
 
 
+@pytest.mark.parametrize("tilt", TILTS)
+def test_force_and_cluster_of_a_grain_are_those_of_its_bonds(seen, tilt: float, tmp_path: Path) -> None:
+    """Clusters by a search from each grain along its bonds."""
+    write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
+    frame = first_frame(tmp_path / "flow.gsd")
+    force, cluster, size = (frame.log[f"particles/{name}"] for name in ("contact_force", "cluster", "cluster_size"))
+    for grain in range(GRAINS):
+        on_it = (frame.bonds.group == grain).any(axis=1)
+        assert force[grain] == pytest.approx(frame.log["bonds/force"][on_it].sum())
+        reached, new = {grain}, {grain}
+        while new:
+            new = {b for a, b in (*frame.bonds.group, *frame.bonds.group[:, ::-1]) if a in new} - reached
+            reached |= new
+        assert set(np.flatnonzero(cluster == cluster[grain])) == reached and size[grain] == len(reached)
+    assert size.max() > 1
+
+
 def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
     lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
     write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
@@ -285,6 +302,7 @@ def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
     with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
         counts = [frame.bonds.N for frame in file]
         assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
+        assert not file[1].log["particles/contact_force"].any() and (file[1].log["particles/cluster_size"] == 1).all()
     assert counts[1] == 0 < min(counts[0], counts[2])
 
 

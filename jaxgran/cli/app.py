@@ -1,4 +1,4 @@
-"""Command line: ``jaxgran map``, ``plot``, ``explore``, ``run``, ``fit``, ``info``. Exit statuses: ``terminal``."""
+"""Command line: ``jaxgran map``, ``merge``, ``plot``, ``run`` and the others. Exit statuses: ``terminal``."""
 
 import gc
 import inspect
@@ -17,6 +17,7 @@ from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
 from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
+from jaxgran.cli.merge import MERGE_EXAMPLES, merge_command
 from jaxgran.cli.mistakes import Command, Group, UsageError, sentence_of, usage_sentence, with_options
 from jaxgran.cli.run import RUN_EXAMPLES, run_command
 from jaxgran.cli.tables import use_plain_letters
@@ -24,6 +25,7 @@ from jaxgran.cli.terminal import (
     INTERRUPTED,
     NO_FILE,
     end_without_threads,
+    outlive_readers,
     sigterm_interrupts,
     stop,
     stop_interrupted,
@@ -40,8 +42,14 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     "map": (
         map_command,
         "Map the force ratio over a plane of flows.",
-        "Map the force ratio over restitution and packing fraction, with error bars, and draw Figures 1 and 2.",
+        "Map the force ratio over restitution and packing fraction, with error bars, and draw its figures.",
         MAP_EXAMPLES,
+    ),
+    "merge": (
+        merge_command,
+        "Merge the parts of a map, or maps of other seeds.",
+        "Merge the files of the parts of a map, or of maps of the same settings and other seeds, into one.",
+        MERGE_EXAMPLES,
     ),
     "plot": (plot_command, "Draw the figures of a map again.", "Draw the figures of a finished map.", PLOT_EXAMPLES),
     "explore": (
@@ -99,6 +107,7 @@ def command_line(
 
 def program() -> None:
     """The program ``jaxgran``: the command in a process of its own, which does not wait for threads that compile."""
+    outlive_readers()
     gc.set_threshold(50_000, 20, 100)  # raise the garbage collector's thresholds: the process is short-lived
     try:
         main()

@@ -30,14 +30,16 @@ def of_map(command: Command) -> dict[str, Option]:
 
 
 def _as_offered(name: str, one: Option, command: Command) -> Option:
-    values = {"several": False} if command == "run" else {}
+    single = {"several": False} if command == "run" else {}
     words = one.help + (" A list adds a dimension." if command == "map" and is_new_dimension(name) else "")
     text = one.default
-    if command == "map" and name in PRESETS["quick"]:
+    if command == "run" and name in ("restitution", "packing_fraction"):
+        text = None
+    elif command == "map" and name in PRESETS["quick"]:
         text = "of the preset"
     elif text is None and one.kind is not bool and default(name) is not None:
         text = f"{default(name):g}" if isinstance(default(name), float) else str(default(name))
-    return Option(**{**vars(one), "help": words, "default": text, **values})
+    return Option(**{**vars(one), "help": words, "default": text, **single})
 
 
 def command(
@@ -45,6 +47,7 @@ def command(
     run: Callable[..., None],
     required: tuple[str, ...] = (),
     argument: Option | None = None,
+    several: bool = False,
 ) -> Callable[..., None]:
     """A command function for Typer that calls ``run`` with the values of the options that were given.
 
@@ -53,14 +56,16 @@ def command(
       run: called with the argument, if there is one, and with the values by name.
       required: options that must be given.
       argument: a file without an option's name.
+      several: whether several such files are given.
     """
 
     def parsed(**texts: Any) -> None:
-        file = () if argument is None else (texts.pop("file"),)
+        file = () if argument is None else (texts.pop(place),)
         given = {name: text for name, text in texts.items() if text is not None}
         run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
 
-    parameters = [] if argument is None else [_parameter("file", Path, typer.Argument(help=argument.help), ...)]
+    place, kind = ("files", list[Path]) if several else ("file", Path)
+    parameters = [] if argument is None else [_parameter(place, kind, typer.Argument(help=argument.help), ...)]
     for name, one in table.items():
         kind = one.kind if one.kind in (bool, Path) else str
         first = ... if name in required else None
@@ -92,7 +97,7 @@ def placeholder(one: Option) -> str:
     if isinstance(one.kind, tuple):
         return "|".join(one.kind)
     kind = one.example or {float: "NUMBER", int: "INTEGER", Path: "FILE"}.get(one.kind, "TEXT")
-    return ("LIST" if one.several else kind) + ("|auto" if one.auto else "")
+    return ("LIST" if one.several or one.values else kind) + ("|auto" if one.auto else "")
 
 
 def value(name: str, one: Option, text: Any) -> Any:
@@ -109,20 +114,21 @@ def value(name: str, one: Option, text: Any) -> Any:
         return text
     if one.auto and text == "auto":
         return text
-    several = (_WHOLE_LIST if one.kind is int else _LIST) if one.several else ""
-    accepted = "a whole number" if one.kind is int else "a number"
-    accepted = ", ".join(x for x in ("auto" if one.auto else "", f"{accepted} {several}".strip()) if x)
+    several = (_WHOLE_LIST if one.kind is int else _LIST) if one.several or one.values else ""
+    auto = "" if not one.auto else "auto, " if several else "auto or "
+    accepted = f"{auto}{'a whole number' if one.kind is int else 'a number'} {several}".strip()
     try:
         numbers = list(_whole(text) if one.kind is int else _numbers(text))
-        if len(numbers) > 1 and not one.several:
+        if len(numbers) > 1 and not (one.several or one.values):
             raise ValueError(text)
     except ValueError:
         raise refused(name, text, f"must be {accepted}") from None
     if one.range is not None:
         for number in numbers:
-            require(name, number, *one.range)
-    is_axis = one.several and not is_new_dimension(name)
-    return tuple(numbers) if len(numbers) > 1 or is_axis else numbers[0]
+            accepts, words = one.range
+            require(name, number, accepts, ("auto or " if one.auto else "") + words)
+    is_list = one.values or (one.several and not is_new_dimension(name))
+    return tuple(numbers) if len(numbers) > 1 or is_list else numbers[0]
 
 
 def _whole(text: str) -> tuple[int, ...]:
@@ -141,12 +147,6 @@ def _numbers(text: str) -> tuple[float, ...]:
     if not 1 <= steps < MAX_REPLICAS:
         raise ValueError(count)
     return tuple(round(float(start) + (float(stop) - float(start)) * k / steps, 12) for k in range(steps + 1))
-
-
-def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a requested error chooses unless it is given; a longer sample is cheaper than a second seed."""
-    automatic = {"grains": "auto", "timestep": "auto", "tolerance": "auto", "seeds": 1}
-    return automatic if "error" in given else {}
 
 
 def examples(commands: Mapping[str, str]) -> str:

@@ -6,16 +6,25 @@ import shutil
 from pathlib import Path
 
 from jaxgran import environment
-from jaxgran.cache.folder import users_folder, why_unwritable
+from jaxgran.cache.folder import programs_folder, users_folder, why_unwritable
+from jaxgran.cli.arguments import command
+from jaxgran.cli.json_output import JSON, Entry, print_json
 from jaxgran.cli.terminal import configured_jax
 
 INFO_EXAMPLES = {"For a bug report": "jaxgran info"}
+_MEANINGS = {
+    "engine": "engine that is taken where none is given",
+    "solver": "solver of that engine",
+    "cores": "cores of the machine, and of this process",
+    "settings": "environment variables that change runs",
+    **{name: f"cache, {name}" for name in ("cache folder", "compiled programs", "numba engine", "figures")},
+}
 _PACKAGES = ("jax", "jaxlib", "jax-md", "numba", "numpy", "scipy", "xarray", "netCDF4", "gsd", "matplotlib")
 _SETTINGS = ("JAX_", "XLA_", "OMP_", "CUDA_VISIBLE_DEVICES")  # first letters of environment variables that change runs
 
 
-def info_command() -> None:
-    jax = configured_jax()
+def run_info_command(json: bool = False) -> None:
+    configured_jax()
     lines = {
         "jaxgran": environment.versions(["jaxgran"])["jaxgran"] + _commit(),
         "python": platform.python_version(),
@@ -28,10 +37,17 @@ def info_command() -> None:
         "precision": environment.precision(),
         "ffmpeg": shutil.which("ffmpeg") or "none",
         "settings": ", ".join(f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)) or "none",
-        **_caches(jax.config.values["jax_compilation_cache_dir"]),
+        **_caches(),
     }
+    if json:
+        entries = {name: Entry(value, _MEANINGS.get(name, name), None) for name, value in lines.items()}
+        print_json({name.replace(" ", "_"): entry for name, entry in entries.items()})
+        return
     for name, value in lines.items():
         print(f"{name:18s} {value}")
+
+
+info_command = command({"json": JSON}, run_info_command)
 
 
 def _commit() -> str:
@@ -54,7 +70,7 @@ def _devices() -> dict[str, str]:
     return {"devices": ", ".join(found), "engine": f"auto takes {engine.name}", "solver": solver}
 
 
-def _caches(programs: str | None) -> dict[str, str]:
+def _caches() -> dict[str, str]:
     """The folders of caches, and whether files can be written there."""
     import matplotlib
 
@@ -62,7 +78,7 @@ def _caches(programs: str | None) -> dict[str, str]:
 
     folders = {
         "cache folder": users_folder(),
-        "compiled programs": None if programs is None else Path(programs),
+        "compiled programs": programs_folder(),
         "numba engine": object_file().parent,
         "figures": Path(matplotlib.get_cachedir()),
     }

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from jaxgran.cli.mistakes import with_options
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import BAD_STATUS, configured_jax, require_device, say, say_written, stop, stop_interrupted
-from jaxgran.environment import usable_cores
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import options
 from jaxgran.model.checks import refused
@@ -32,14 +31,12 @@ class Outcome(NamedTuple):
 
 def run_map(parameters: Mapping[str, Any], quiet: bool, load: str = "") -> Outcome:
     """Run ``ratio_map`` on all cores, with progress; import the module ``load`` meanwhile."""
-    jax = configured_jax()
+    configured_jax()
     require_device()
     from jaxgran.maps.ratio_map import ratio_map
     from jaxgran.maps.status_report import BadPoints
 
-    given: dict[str, Any] = {"progress": not quiet, "attributes": {"command": _command()}, **_numerics(parameters)}
-    alone = given.get("scheduler") is not None or given.get("record") is not None
-    given.setdefault("workers", usable_cores() if jax.default_backend() == "cpu" and not alone else 1)
+    given: dict[str, Any] = {"progress": not quiet, "attributes": {"command": command_line()}, **_numerics(parameters)}
     if load:
         Thread(target=_load, args=(load,), name="jaxgran-load").start()
     output = given.get("output")
@@ -71,7 +68,7 @@ def _numerics(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _command() -> str:
+def command_line() -> str:
     """The command as given; bytes of a file name that is no text are escaped."""
     return os.fsencode(shlex.join(["jaxgran", *sys.argv[1:]])).decode(errors="backslashreplace")
 
@@ -132,7 +129,7 @@ def _percent(part) -> str:
 
 def _say_retried(data) -> None:
     """Print how many replicas failed and were run again with half the time step."""
-    timestep = data.timestep if "timestep" in data.dims else data.attrs["timestep"]
+    timestep = next(data[name] for name in ("point_timestep", "timestep") if name in data.coords)
     retried = int((data["seeds/sample_timestep"] < 0.75 * timestep).sum())
     if retried:
         say(f"retried with half the time step: {retried} replicas, see sample_timestep in the group seeds.")

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jaxgran.cli.arguments import QUIET, command, for_error, of_map
+from jaxgran.cli.arguments import QUIET, command, of_map
+from jaxgran.cli.json_output import JSON, Entry, print_json
 from jaxgran.cli.measure import finish, print_budget, run_map
 from jaxgran.cli.tables import Table, print_table
-from jaxgran.cli.terminal import configured_jax, say
+from jaxgran.cli.terminal import configured_jax, counted, say
 from jaxgran.maps.parameters import Option
-from jaxgran.maps.progress import counted
 from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.display import unit_text, with_error
 
@@ -25,6 +25,7 @@ _GROUPS = {  # observables that are not here are in the last group
         *("pressure", "contact_pressure", "binary_pressure", "kinetic_pressure"),
         *("shear_stress", "contact_shear_stress", "binary_shear_stress", "kinetic_shear_stress"),
         *("bagnold_pressure", "bagnold_shear_stress", "macroscopic_friction", "inertial_number"),
+        *("dissipation_rate", "binary_dissipation_rate"),
     ),
     "Motion and structure": (
         *("granular_temperature", "local_granular_temperature", "longwave_energy_ratio", "collision_rate"),
@@ -32,6 +33,10 @@ _GROUPS = {  # observables that are not here are in the last group
     ),
 }
 _LAST_GROUP = "Quality of the run"
+_PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
+    *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
+    *("granular_temperature", "local_granular_temperature", "coordination_number", "collision_rate"),
+)
 
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
@@ -56,6 +61,8 @@ RUN_OPTIONS = {
     ),
     "page": Option("HTML file that plays the flow in a browser, with its running averages.", Path, example="FILE.html"),
     "frame_strain": Option("Strain between frames.", default="a hundredth of --strain, or 0.05 with --error"),
+    "all": Option("Print every average, those of the solver's quality last.", bool),
+    "json": JSON,
     "quiet": QUIET,
 }
 RUN_OPTIONS["strain"] = replace(RUN_OPTIONS["strain"], default=f"{RUN_OPTIONS['strain'].default}; 5 with frames")
@@ -69,11 +76,13 @@ def run_run_command(
     movie: Path | None = None,
     page: Path | None = None,
     frame_strain: float | None = None,
+    all: bool = False,
+    json: bool = False,
     quiet: bool = False,
     **given: Any,
 ) -> None:
     frames_wanted = any(x is not None for x in (trajectory, movie, page))
-    chosen = {"seeds": 1, **for_error(given), **given}
+    chosen = {"seeds": 1, **given}
     if frames_wanted:
         if chosen["seeds"] > 1:
             raise InputError("`trajectory`, `movie` and `page` show one seed: leave out `seeds`.", field="seeds")
@@ -90,8 +99,11 @@ def run_run_command(
     output = chosen.get("output")
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
-    print_table(_summary_table(data))
-    print_budget(data)
+    if json:
+        print_json(_entries(data))
+    else:
+        print_table(_summary_table(data, all))
+        print_budget(data)
     if recorder is not None and recorder.frames:
         say("recording frames split the run at different steps, so averages change within their errors.")
         if trajectory is not None:
@@ -155,9 +167,39 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
     say(f"wrote {movie}: {len(frames.scenes)} frames")
 
 
-def _summary_table(data) -> Table:
+def _entries(data) -> dict[str, Entry]:
+    """The parameters of one flow, its averages, its shear-stress ratio, and what kinetic theory predicts."""
+    from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+    from jaxgran.model.status import Status
+    from jaxgran.sampling.observables import OBSERVABLES
+
+    point = flattened(data).isel(packing_fraction=0, restitution=0)
+    entries = {name: Entry(point[name].values, point[name].long_name) for name in ("restitution", "packing_fraction")}
+    entries |= {
+        "grains": Entry(data.attrs["grains"], "number of grains"),
+        "timestep": Entry(data.attrs["timestep"], "time step", "1 / shear rate"),
+        "strain": Entry(point["seeds/strain"].sum().values, "sampled strain of all seeds"),
+        "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
+        "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
+        "status": Entry(Status(int(point.status)).name, "worst status", None),
+    }
+    for name, (meaning, unit) in OBSERVABLES.items():
+        path = path_of(name)
+        entries[name] = Entry(point[path].values, meaning, unit, point[f"{path}_stderr"].values)
+    ratio, error = shear_stress_ratio(point)
+    meaning = "contact shear stress over binary shear stress"
+    entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
+    for name in OBSERVABLES:
+        if f"theory/{name}" in point:
+            meaning, unit = OBSERVABLES[name]
+            entries[f"theory/{name}"] = Entry(point[f"theory/{name}"].values, f"{meaning}, by kinetic theory", unit)
+    return entries
+
+
+def _summary_table(data, all: bool) -> Table:
     """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
+    from jaxgran.maps.theory_variables import LENGTHS
     from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
     grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
@@ -176,8 +218,9 @@ def _summary_table(data) -> Table:
 
     scalars = [name for name in OBSERVABLES if name not in TENSORS]
     others = [name for name in scalars if name not in sum(_GROUPS.values(), ())]
-    for group, names in {**_GROUPS, _LAST_GROUP: others}.items():
-        table.rows.append([group])
+    groups = {**_GROUPS, _LAST_GROUP: others} if all else {"": _PHYSICS}
+    for group, names in groups.items():
+        table.rows += [[group]] if group else []
         for name in names:
             value = with_error(number(path_of(name)), number(f"{path_of(name)}_stderr"))
             samples = strain / correlated.get(name, math.nan)
@@ -187,4 +230,8 @@ def _summary_table(data) -> Table:
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 table.rows.append(["shear-stress ratio", ratio, "", "", ""])
+            if name == "binary_dissipation_rate":
+                for length in (f"theory/{one}" for one in LENGTHS):
+                    value = with_error(number(length), number(f"{length}_stderr"))
+                    table.rows.append([length[7:].replace("_", " "), value, unit_text("sigma"), "", ""])
     return table

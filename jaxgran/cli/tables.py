@@ -1,4 +1,4 @@
-"""Tables on standard output: in pages of columns where the terminal is narrow, and in the letters that it has."""
+"""Tables on standard output: split into pages on a narrow terminal, and in ASCII where its encoding needs it."""
 
 import codecs
 import os
@@ -12,8 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
-_UNLIMITED = 10_000  # characters; width of what is no terminal
-_NARROW_KEY = 22  # characters of a line of a row's name
+_UNLIMITED = 10_000  # characters; width of a page that is not printed on a terminal
+_NARROW_KEY = 22  # characters; width of the names of rows on a narrow terminal
 _IN_ASCII = str.maketrans(
     {"±": "+-", "σ": "sigma", "γ": "gamma", "\u0307": "-dot", "ν": "nu", "α": "alpha", "²": "^2"}
     | {"–": "-", "−": "-", "×": "x", "…": "...", "’": "'"}
@@ -22,10 +22,10 @@ _IN_ASCII = str.maketrans(
 
 @dataclass
 class Table:
-    """A table of texts: a title, the names of its columns, and rows; a row of one text is the name of a group.
+    """A table of strings: title, column names and rows; a row of a single string is a group heading.
 
-    The first ``keys`` columns name a row, and stand on every page. The others are set to the right, or else to the left
-    with ``numbers`` false.
+    The first ``keys`` columns name a row and are repeated on every page. The others are right-aligned, or left-aligned
+    if ``numbers`` is False.
     """
 
     title: str
@@ -36,7 +36,7 @@ class Table:
 
 
 def print_table(table: Table) -> None:
-    """Print a table on standard output, with the columns that do not fit into its width on further pages."""
+    """Print a table on standard output; columns that do not fit its width follow on further pages."""
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console = Console(width=_UNLIMITED)
@@ -51,12 +51,12 @@ def print_table(table: Table) -> None:
 
 
 def _width(page: RichTable) -> int:
-    """The width of a page of which nothing is cut off."""
+    """The width of a page in full."""
     return Console(width=_UNLIMITED).measure(page).maximum
 
 
 def _page(table: Table, columns: Iterable[int], narrow: bool = False) -> RichTable:
-    """The keys and some columns of a table; long keys take several lines if it is ``narrow``."""
+    """The keys and some columns of a table; with ``narrow`` long keys are wrapped."""
     page = RichTable(title=plain(table.title), box=box.SIMPLE, title_justify="left")
     places = [*range(table.keys), *columns]
     for k in places:
@@ -74,20 +74,20 @@ def _page(table: Table, columns: Iterable[int], narrow: bool = False) -> RichTab
 
 
 def plain(text: str) -> str:
-    """The text in the letters that standard output has."""
+    """The text in characters that the encoding of standard output has."""
     encoding = sys.stdout.encoding or "utf-8"
     return text.encode(encoding, "in_ascii").decode(encoding)
 
 
 def use_plain_letters() -> None:
-    """Standard output and error print letters that they do not have in others, rather than end the command."""
+    """Let standard output and error replace characters that they cannot encode, rather than end the command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="in_ascii")
 
 
 def _in_ascii(error: UnicodeError) -> tuple[str | bytes, int]:
-    """What stands for letters that cannot be encoded; bytes of a file name that is no text stay as they are."""
+    """Replacement of characters that cannot be encoded; undecodable bytes of a file name are kept."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     letters = error.object[error.start : error.end]

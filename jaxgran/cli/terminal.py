@@ -17,13 +17,14 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from io import BufferedWriter, FileIO, TextIOWrapper
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn, TypeVar
 
-from jaxgran.cache.folder import cache_folder, enable_cache, fallback_message
+from jaxgran.cache.folder import cache_folder, fallback_message, use_cache
 from jaxgran.environment import devices
 
 NO_FILE = 1
@@ -32,6 +33,7 @@ BAD_STATUS = 3
 INTERRUPTED = 130
 TERMINATED = 143
 
+_T = TypeVar("_T")
 _terminated = False  # whether SIGTERM has come
 
 
@@ -41,7 +43,7 @@ def configured_jax():
 
     jax.config.update("jax_enable_x64", True)
     _say_cache()
-    enable_cache()
+    use_cache()
     return jax
 
 
@@ -64,6 +66,27 @@ def _say_cache() -> None:
     folder = cache_folder()
     if folder is not None:
         os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))
+
+
+def outlive_readers() -> None:
+    """Standard output and error whose reader has gone, as in ``| head``, take what is written and drop it."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if type(stream) is TextIOWrapper and not stream.isatty():
+            stream.flush()
+            buffer = BufferedWriter(_Outliving(stream.fileno(), "w", closefd=False))
+            lines, encoding = stream.line_buffering, stream.encoding
+            setattr(sys, name, TextIOWrapper(buffer, encoding, stream.errors, line_buffering=lines))
+
+
+class _Outliving(FileIO):
+    """A file whose reader may go."""
+
+    def write(self, content: Any) -> int:
+        try:
+            return super().write(content)
+        except BrokenPipeError:
+            return len(content)
 
 
 def say(sentence: str) -> None:
@@ -113,3 +136,14 @@ def end_without_threads(status: int) -> None:
 def stop_interrupted(sentence: str) -> NoReturn:
     """Print that the command was interrupted, and exit with the status of the signal."""
     stop(sentence, TERMINATED if _terminated else INTERRUPTED)
+
+
+def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
+    """The items one by one, with a progress bar on a terminal; ``words`` is its title."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn(words), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield from bar.track(items)

@@ -27,7 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxgran.model.checks import InputError, require, require_number, short_repr
+from jaxgran.model.batches import equal_values
+from jaxgran.model.checks import InputError, as_array, require, require_number, short_repr
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.steady_shear import Scalar
@@ -56,6 +57,8 @@ class Law:
     coefficients: Float[Numbers, " terms"]
     deviations: Float[Numbers, "terms terms"]
     scatter: Float[Numbers, ""]
+
+    __eq__ = equal_values
 
     @property
     def covariance(self) -> Float[Numbers, "terms terms"]:
@@ -90,6 +93,8 @@ class Closure:
     jamming_fraction: Float[Numbers, ""]
     timestep: Float[Numbers, ""]
 
+    __eq__ = equal_values
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -116,6 +121,8 @@ class Prediction:
     shear_stress_stderr: Float[Array, "*flows"]
     extrapolated: Bool[Array, "*flows"]
 
+    __eq__ = equal_values
+
 
 def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> Prediction:
     """Predict force ratio and stresses; supports ``jit``, ``vmap`` and differentiation.
@@ -129,6 +136,7 @@ def predict(closure: Closure, restitution: Scalar, packing_fraction: Scalar) -> 
       InputError: (a ValueError) a number is out of range; traced numbers are not checked.
     """
     require_closure(closure)
+    restitution, packing_fraction = as_array(restitution), as_array(packing_fraction)
     require("restitution", restitution, lambda x: (x >= 0) & (x < 1), "at least 0 and below 1")
     require_fraction(packing_fraction)
     return _predictions(closure, *broadcast(restitution=restitution, packing_fraction=packing_fraction))

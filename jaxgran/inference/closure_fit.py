@@ -14,7 +14,7 @@ from jaxtyping import Array
 from scipy.optimize import brentq
 
 from jaxgran.inference.closure import LAWS, NEEDED, Closure, Law, excess_terms, require_jamming, stress_terms
-from jaxgran.maps.schema import MapData, finest, require_map
+from jaxgran.maps.schema import MapData, finest, require_map, require_one_timestep
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.model.status import Status
@@ -42,11 +42,12 @@ def fit_closure(data: MapData, jamming_fraction: float = JAMMING) -> Closure:
       jamming_fraction: ν_J, above 0.83; by default that of a random quench of the size distribution of maps.
 
     Raises:
-      InputError: (a ValueError) fewer than 12 points, or than 3 values of α or of ν.
+      InputError: (a ValueError) fewer than 12 points, or than 3 values of α or of ν, or time steps chosen by point.
 
     Source: scatter by R. C. Paule and J. Mandel, J. Res. Natl. Bur. Stand. 87, 377 (1982).
     """
     require_map(data, *NEEDED)
+    require_one_timestep(data, "a closure")
     require_jamming(jamming_fraction)
     return fit_points(closure_points(data), jamming_fraction)
 

@@ -31,6 +31,7 @@ from jaxgran.inference.collisions import LONGEST, Candidates, Flights, Noise, ca
 from jaxgran.inference.restitution import LEAST_NOISE, LONGEST_STEP
 from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, struck_windows, without_repeats
 from jaxgran.io.tracks import Tracks, tracks_of_states
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, require_key, require_number, require_untraced, require_whole, short_repr
 from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
 from jaxgran.model.state import State
@@ -108,6 +109,8 @@ class FisherInformation:
     position_share: float
     velocity_share: float
     diameter_share: float
+
+    __eq__ = equal_values
 
 
 def fisher_information(

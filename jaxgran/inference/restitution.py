@@ -38,6 +38,7 @@ from jaxgran.inference.collisions import (
 )
 from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, struck_windows, without_repeats
 from jaxgran.io.tracks import Tracks
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, require_number, require_untraced, short_repr
 
 TRIALS = (0.1, 0.3, 0.5, 0.7, 0.9)  # starting restitutions, of which the best is used
@@ -84,6 +85,8 @@ class RestitutionFit:
     velocity_noise: float
     diameter_noise: float
     misfit: float
+
+    __eq__ = equal_values
 
 
 def fit_restitution(

@@ -19,7 +19,7 @@ from jaxgran.inference.closure import (
     require_fraction,
     with_dtype,
 )
-from jaxgran.model.checks import require
+from jaxgran.model.checks import as_array, require
 from jaxgran.theory.steady_shear import Scalar
 
 _GRID = 33  # restitutions at which the laws are evaluated
@@ -78,6 +78,10 @@ def restitution_from_stresses(
       InputError: (a ValueError) a number is out of range.
     """
     require_closure(closure)
+    packing_fraction, pressure, shear_stress = map(as_array, (packing_fraction, pressure, shear_stress))
+    pressure_stderr, shear_stress_stderr, correlation = map(
+        as_array, (pressure_stderr, shear_stress_stderr, correlation)
+    )
     require_fraction(packing_fraction)
     for name, value in (("pressure", pressure), ("shear_stress", shear_stress)):
         require(name, value, lambda x: (x > 0) & np.isfinite(x), "positive numbers")

@@ -19,6 +19,9 @@ import numpy as np
 from jaxgran.files import atomic_write
 from jaxgran.model.checks import InputError, short_repr
 
+FORMAT_VERSION = 1
+"""Version of the files of ``write_arrays``; a file of another one is not read."""
+
 _DIGEST = hashlib.sha256().digest_size  # bytes
 _LONGEST_NAME = 200  # bytes; file systems accept 255, and temporary files have longer names
 
@@ -64,6 +67,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
     with h5py.File(memory, "w") as file:
         for name, array in arrays.items():
             file.create_dataset(name, data=array)
+        file.attrs["format_version"] = FORMAT_VERSION
         file.attrs["names"] = json.dumps(list(arrays))
         file.attrs["about"] = json.dumps(about, sort_keys=True)
     content = memory.getvalue()
@@ -72,7 +76,11 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], about: Mapping[st
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
-    """Read the arrays and the description written by ``write_arrays``; CorruptFile for any other content."""
+    """Read the arrays and the description written by ``write_arrays``; CorruptFile for any other content.
+
+    Raises:
+      InputError: (a ValueError) the file has another version of the format.
+    """
     import h5py
 
     try:
@@ -84,7 +92,14 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         raise CorruptFile(f"{path.name} does not match its checksum")
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
+            version = file.attrs.get("format_version")
             arrays = {name: np.asarray(file[name]) for name in json.loads(str(file.attrs["names"]))}
-            return arrays, json.loads(str(file.attrs["about"]))
+            about = json.loads(str(file.attrs["about"]))
     except (OSError, KeyError, ValueError) as error:  # the checksum is right, but write_arrays did not write the file
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error
+    if version != FORMAT_VERSION:
+        found = "no format_version" if version is None else f"format_version {version}"
+        raise InputError(
+            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
+        )
+    return arrays, about

@@ -14,6 +14,7 @@ optionally ``vx``, ``vy`` and ``mass``. A unit in brackets may follow a name.
 """
 
 import glob
+import math
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -67,7 +68,8 @@ def read_tracks(
       interval: time between consecutive frames (the smallest difference of frame numbers). By default it is inferred
         from velocities and displacements, or is 1 without velocities.
       shear_rate: γ̇ of a sheared periodic cell; by default the rate at which the cell of the file tilts.
-      peculiar: whether velocities are relative to the mean flow γ̇ y x̂.
+      peculiar: whether velocities are relative to the mean flow γ̇ y x̂. Velocities that lack the shear of the
+        displacements are taken as peculiar with a UserWarning.
       diameter: diameter of all discs, for a file without diameters.
       stride: 3 uses every third frame.
 
@@ -189,7 +191,7 @@ def _lammps_table(path: Path) -> Table:
 def _gsd_table(path: Path) -> Table:
     import gsd.hoomd
 
-    parts, cells = [], []
+    parts, cells, times = [], [], []
     opened: Any = gsd.hoomd.open(path, "r")
     with opened as file:
         if len(file) == 0:
@@ -197,7 +199,10 @@ def _gsd_table(path: Path) -> Table:
         for frame in file:
             grains, box, step = frame.particles, np.asarray(frame.configuration.box, float), frame.configuration.step
             if grains.N == 0 or grains.N != file[0].particles.N:
-                raise InputError("the number of discs changes between frames, so the discs cannot be identified")
+                raise InputError(
+                    f"the number of discs changes from {file[0].particles.N} to {grains.N} in frame {len(parts)}, "
+                    "and a GSD file has no ids: write a table with a column id"
+                )
             columns = {
                 **dict(zip("xyz", np.asarray(grains.position, float).T, strict=True)),
                 **dict(zip(("vx", "vy"), np.asarray(grains.velocity, float).T[:2], strict=True)),
@@ -209,31 +214,42 @@ def _gsd_table(path: Path) -> Table:
                 del columns["mass"]  # absent: the library returns ones
             parts.append(_named(columns))
             cells.append((box[0], box[1], box[3] * box[1]))
+            times.append(_recorded_time(frame.log))
     steps = np.array([part["frame"][0] for part in parts])
-    if np.any(np.diff(steps) <= 0):  # the program did not store step numbers
-        for k, part in enumerate(parts):
-            part["frame"][:] = k
+    if np.all(np.diff(times) > 0):
+        parts = [{**part, "time": np.full_like(part["frame"], time)} for part, time in zip(parts, times, strict=True)]
+    elif np.any(np.diff(steps) <= 0):  # the program did not store step numbers
+        parts = [{**part, "frame": np.full_like(part["frame"], k)} for k, part in enumerate(parts)]
     cells = np.array(cells)
     if not np.all(np.isfinite(cells)) or not np.all(cells[:, :2] > 0):
         raise InputError("its box has no finite width and height")
     return Table({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, cells)
 
 
+def _recorded_time(log: Mapping[str, np.ndarray]) -> float:
+    """The time of a frame by its recorded strain, in units of 1/γ̇ without a shear rate; NaN if there is none."""
+    strain, rate = (np.ravel(log.get(f"jaxgran/{name}", x)) for name, x in (("strain", np.nan), ("shear_rate", 1.0)))
+    return float(strain[0] / rate[0]) if strain.size and rate.size and rate[0] > 0 else np.nan
+
+
 def _of_jaxgran(path: Path) -> bool:
-    """Whether jaxgran wrote a GSD file, with the parameters of its flow."""
+    """Whether jaxgran wrote a GSD file, with the exact states and the parameters of its flow."""
     import gsd.fl
 
     try:
         with gsd.fl.open(str(path), "r") as file:
-            return file.nframes > 0 and file.chunk_exists(0, "log/jaxgran/strain")
+            names = ("jaxgran/strain", "jaxgran/shear_rate", "particles/exact_velocity")
+            return file.nframes > 0 and all(file.chunk_exists(0, f"log/{name}") for name in names)
     except Exception:  # damaged, which the reader will report
         return False
 
 
 def recorded_restitution(path: str | os.PathLike) -> float | None:
-    """The restitution stored in a GSD file of jaxgran; None for any other file."""
-    of_jaxgran = str(path).endswith(".gsd") and _of_jaxgran(Path(path))
-    return float(read_trajectory(path).restitution) if of_jaxgran else None
+    """The restitution stored in a GSD file of jaxgran; None if there is none."""
+    if not str(path).endswith(".gsd") or not _of_jaxgran(Path(path)):
+        return None
+    restitution = float(read_trajectory(path).restitution)
+    return None if math.isnan(restitution) else restitution
 
 
 def _named(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

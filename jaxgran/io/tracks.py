@@ -5,12 +5,14 @@ converts to arrays. A disc missing from a frame has NaN there. Velocities are in
 peculiar ones.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, require_number, require_untraced, short_repr
 from jaxgran.model.state import State
 
@@ -18,6 +20,7 @@ _LARGEST = 50_000_000  # discs × frames that fit into the memory of a small mac
 _SAME_TIME = (0.7, 1.4)  # accepted displacement over velocity × time
 _ONE_MASS = 1e-3  # largest relative variation of the mass of a disc; above it, the column is no mass
 _LEAP = 5.0  # median displacements, above which a displacement is discarded
+_SAME_RATE = 0.2  # largest relative difference of a missing shear from the shear rate
 _SAME_FRAME = 0.2  # largest shear between displacements and velocities, in rms velocities across the cell
 
 
@@ -46,6 +49,8 @@ class Tracks:
     velocities: Float[np.ndarray, "frames grains 2"]
     cell: Float[np.ndarray, "frames 3"]
     shear_rate: float
+
+    __eq__ = equal_values
 
 
 class Table(NamedTuple):
@@ -145,7 +150,7 @@ def tracks_of_table(table: Table, observation: Observation, name: str) -> Tracks
     cell = table.cells if table.cells is not None else np.tile([np.inf, np.inf, 0.0], (len(instants), 1))
     if clock == "time":
         if observation.interval is not None:
-            raise InputError(f"{name} has a column time, so no time between frames may be given.")
+            raise InputError(f"{name} contains its times, so no time between frames may be given.")
         time, has_interval = instants, True
     else:
         time, has_interval = (instants - instants[0]) / np.min(np.diff(instants)), observation.interval is not None
@@ -178,32 +183,68 @@ def _in_one_unit(tracks: Tracks, observation: Observation, has_interval: bool, n
             )
     if rate is None:
         rate = cell_shear_rate(tracks)
-    velocities = _laboratory(tracks.velocities, tracks.positions, rate) if observation.peculiar else tracks.velocities
-    tracks = replace(tracks, velocities=velocities, shear_rate=rate)
-    if has_velocities:
-        _require_frame(tracks, moved, name)
+    tracks = replace(tracks, shear_rate=rate)
+    if not has_velocities:
+        return tracks
+    if observation.peculiar:
+        tracks = _with_shear(tracks, rate, moved)
+    lacking, only_shear = _lacking_shear(tracks, moved)
+    unknown = rate == 0 and observation.shear_rate is None
+    as_expected = unknown or abs(lacking - rate) < _SAME_RATE * abs(rate)
+    if lacking and only_shear and as_expected and not observation.peculiar:
+        tracks = _with_shear(tracks, rate or lacking, moved)
+        warnings.warn(
+            f"the velocities in {name} lack the shear of the displacements, of rate {lacking:.3g}: they are taken as "
+            "peculiar.",
+            stacklevel=4,
+        )
+        lacking, _ = _lacking_shear(tracks, moved)
+    if lacking:
+        raise InputError(
+            f"{name} has velocities that differ from its displacements by a shear of rate {lacking:.3g}, and its shear "
+            f"rate is {rate:.3g}: check the unit of its velocities, the time between its frames and the shear rate."
+        )
     return tracks
 
 
-def _require_frame(tracks: Tracks, moved: np.ndarray, name: str) -> None:
-    """Raise an InputError if displacements and velocities differ by a shear."""
-    during = np.diff(tracks.time)[:, None]
+def _lacking_shear(tracks: Tracks, moved: np.ndarray) -> tuple[float, bool]:
+    """The rate of the shear by which displacements differ from velocities × time, or 0 if it is not significant.
+
+    Also whether most velocities lack nothing but this shear.
+    """
     height = (tracks.positions[1:, :, 1] + tracks.positions[:-1, :, 1]) / 2
-    lacking = moved[..., 0] / during - (tracks.velocities[1:, :, 0] + tracks.velocities[:-1, :, 0]) / 2
+    lacking = _lacking_velocity(tracks, moved)
     defined = np.isfinite(height) & np.isfinite(lacking)
-    if np.count_nonzero(defined) < 3:
-        return
-    y, u = height[defined] - height[defined].mean(), lacking[defined] - np.median(lacking[defined])
-    variance = np.mean(y**2)
-    if variance == 0:
-        return
-    rate = np.mean(y * np.clip(u, *np.quantile(u, (0.02, 0.98)))) / variance
+    half = np.count_nonzero(defined) // 2
+    if half < 2:
+        return 0.0, False
+    order = np.argsort(height[defined])
+    y, u = height[defined][order], lacking[defined][order]
+    apart = y[-half:] - y[:half]
+    if not np.all(apart > 0):
+        return 0.0, False
+    rate = float(np.median((u[-half:] - u[:half]) / apart))  # the median excludes the few discs that collide in between
+    others = u - rate * y
+    others -= np.median(others)
     speed = np.sqrt(np.nanmean(tracks.velocities[..., 1] ** 2))
-    if abs(rate) * np.sqrt(variance) > max(_SAME_FRAME * speed, 5 * np.std(u) / np.sqrt(defined.sum())):
-        raise InputError(
-            f"{name} has velocities that differ from its displacements by a shear of rate {rate:.3g}: give the shear "
-            "rate, and say whether velocities are peculiar."
-        )
+    significant = max(_SAME_FRAME * speed, 5 * np.std(others) / np.sqrt(len(u)))
+    only_shear = bool(np.median(np.abs(others)) <= _SAME_FRAME * speed)
+    return rate if abs(rate) * np.std(y) > significant else 0.0, only_shear
+
+
+def _with_shear(tracks: Tracks, rate: float, moved: np.ndarray) -> Tracks:
+    """Tracks with laboratory velocities from peculiar ones; the mean flow is at rest where the displacements say so."""
+    velocities = _laboratory(tracks.velocities, tracks.positions, rate)
+    sheared = replace(tracks, velocities=velocities, shear_rate=rate)
+    lacking = _lacking_velocity(sheared, moved)
+    known = lacking[np.isfinite(lacking)]
+    return replace(sheared, velocities=velocities + np.array([np.median(known) if known.size else 0.0, 0.0]))
+
+
+def _lacking_velocity(tracks: Tracks, moved: np.ndarray) -> np.ndarray:
+    """What the velocities along x lack of displacement over time, (frames - 1, grains)."""
+    mean = (tracks.velocities[1:, :, 0] + tracks.velocities[:-1, :, 0]) / 2
+    return moved[..., 0] / np.diff(tracks.time)[:, None] - mean
 
 
 def with_stride(tracks: Tracks, stride: int, name: str) -> Tracks:

@@ -14,6 +14,9 @@ particles/velocity             (grains, 3)     σγ̇      peculiar velocities c
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
 bonds/group                    (bonds, 2)      –       pairs of grains in loaded contact in the next step
 log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt
+log/particles/contact_force    (grains,)       mσγ̇²    sum of the contact forces on a grain, by magnitude
+log/particles/cluster          (grains,)       –       number of its cluster; grains of one cluster are joined by bonds
+log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
 log/particles/exact_velocity   (grains, 2)     σγ̇      velocities of the state
 log/particles/exact_radius     (grains,)       σ       radii; in the first frame only
@@ -42,6 +45,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, r
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
+from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt, wrap
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
@@ -89,6 +93,8 @@ class Trajectory:
     shear_rate: Float[np.ndarray, ""]
     restitution: Float[np.ndarray, ""]
     packing_fraction: Float[np.ndarray, ""]
+
+    __eq__ = equal_values
 
 
 def check_trajectory(path: Path) -> None:
@@ -193,11 +199,16 @@ def _gsd_frame(snapshot: Snapshot, step: int):
     frame.bonds.N = len(loaded)
     frame.bonds.types = ["contact"]
     frame.bonds.typeid = np.zeros(len(loaded), np.uint32)
-    frame.bonds.group = np.stack(
-        [np.asarray(snapshot.contacts.i)[loaded], np.asarray(snapshot.contacts.j)[loaded]], axis=-1
-    )
+    pairs = np.stack([np.asarray(snapshot.contacts.i)[loaded], np.asarray(snapshot.contacts.j)[loaded]], axis=-1)
+    forces = np.asarray(impulses[loaded] / timestep, np.float64)
+    frame.bonds.group = pairs
     constants = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
-    grain_log = {"exact_position": state.positions, "exact_velocity": state.velocities, **constants}
+    grain_log = {
+        **_by_grain(pairs, forces, len(state.positions)),
+        "exact_position": state.positions,
+        "exact_velocity": state.velocities,
+        **constants,
+    }
     flow_log = {
         "side": state.side,
         "tilt": state.tilt,
@@ -207,11 +218,25 @@ def _gsd_frame(snapshot: Snapshot, step: int):
         "restitution": np.asarray(snapshot.restitution, np.float64),
     }
     frame.log = {
-        "bonds/force": np.asarray(impulses[loaded] / timestep, np.float64),
+        "bonds/force": forces,
         **{f"particles/{name}": np.array(x) for name, x in grain_log.items()},  # writable copies
         **{f"jaxgran/{name}": np.array([x]) for name, x in flow_log.items()},
     }
     return frame
+
+
+def _by_grain(pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int) -> Chunks:
+    """Contact force and cluster of each grain."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(grains, grains))
+    _, cluster = connected_components(joined, directed=False)
+    return {
+        "contact_force": np.bincount(pairs.ravel(), np.repeat(forces, 2), minlength=grains),
+        "cluster": cluster.astype(np.uint32),
+        "cluster_size": np.bincount(cluster)[cluster].astype(np.uint32),
+    }
 
 
 def _in_space(vectors: Float[np.ndarray, "grains 2"]) -> Float[np.ndarray, "grains 3"]:

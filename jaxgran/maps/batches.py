@@ -5,6 +5,7 @@ So no core waits long at the end. The numbers of a replica do not depend on its 
 
 import math
 from collections.abc import Container
+from heapq import heappop, heappush
 from typing import Literal
 
 import jax
@@ -14,6 +15,9 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.replica import Key
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.flow import ShearFlow
+from jaxgran.sampling.correlation_strain import LEAST_SAMPLE, RELAXATION_STRAIN
+from jaxgran.sampling.steady_state import LEAST_PREPARATION
+from jaxgran.sampling.timestep import COARSE_TIMESTEP
 
 _LARGEST_CPU_BATCH = 4  # replicas of one core between two reports
 _PAIR_BYTES = 48  # of memory for each pair of grains, in a search that compares all pairs
@@ -23,15 +27,43 @@ _DEFAULT_MEMORY = 8 * 2**30  # bytes of a device that does not report its memory
 _LARGEST_COST_RATIO = 2  # between replicas that advance in lockstep
 
 
-def predicted_cost(flow: ShearFlow) -> float:
-    """Relative cost of a unit of strain of a flow, a fit to measured times.
+def predicted_cost(flow: ShearFlow, timestep: float | None = None) -> float:
+    """Relative cost of a unit of strain of a flow, at its own or another time step: a fit to measured times.
 
     The cost is proportional to the number of grains. Dense and dissipative flows form contact networks; the second
     factor is their cost at dt = 1e-3. Steps without a contact are jumped over, so ten times as many steps cost little
     more than twice as much.
     """
-    alpha, nu, dt = (float(x) for x in (flow.restitution, flow.packing_fraction, flow.timestep))
+    dt = float(flow.timestep if timestep is None else timestep)
+    alpha, nu = float(flow.restitution), float(flow.packing_fraction)
     return flow.grains * (8 + 600 * (1 - alpha) * math.exp((nu - 0.8) / 0.04)) * (1e-3 / dt) ** 0.35
+
+
+def replica_cost(flow: ShearFlow, equilibrate: float | None, strain: float | None) -> float:
+    """Relative cost of a whole replica that is steady and precise as early as it can be."""
+    preparation = LEAST_PREPARATION if equilibrate is None else equilibrate
+    coarse = max(COARSE_TIMESTEP, float(flow.timestep))
+    sample = LEAST_SAMPLE if strain is None else strain
+    return preparation * predicted_cost(flow, coarse) + (sample + RELAXATION_STRAIN) * predicted_cost(flow)
+
+
+def points_of_part(settings: MapSettings) -> list[int]:
+    """The points that a map measures: all, or those of its part.
+
+    Each point goes to the part that costs least so far, the most expensive points first.
+    """
+    flows = settings.flows()
+    if settings.part is None:
+        return list(range(len(flows)))
+    number, count = map(int, settings.part.split("/"))
+    shares: list[list[int]] = [[] for _ in range(count)]
+    costs = [replica_cost(flow, settings.equilibrate, settings.strain) for flow in flows]
+    heap = [(0.0, share) for share in range(count)]
+    for point in sorted(range(len(flows)), key=lambda point: -costs[point]):
+        cost, share = heappop(heap)
+        shares[share].append(point)
+        heappush(heap, (cost + costs[point], share))
+    return sorted(shares[number - 1])
 
 
 def remaining_batches(
@@ -52,10 +84,10 @@ def batches(
     flows = settings.flows()
     costs = [predicted_cost(flow) for flow in flows]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
-    lockstep = in_lockstep(settings.engine)
+    lockstep, chosen = in_lockstep(settings.engine), set(points_of_part(settings))
     tasks: list[list[Key]] = []
     for grains in {flow.grains: None for flow in flows}:
-        points = [point for point in order if flows[point].grains == grains]
+        points = [point for point in order if flows[point].grains == grains and point in chosen]
         keys = [(point, seed) for point in points for seed in range(settings.seeds) if (point, seed) not in without]
         most = batch_size(grains, len(keys), workers) if size == "auto" and keys else size
         alike: list[list[Key]] = []

@@ -23,7 +23,7 @@ not in ``units``.
 import xarray as xr
 
 from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, unit_attributes
 
 CONVENTIONS = "CF-1.11"
 _AVERAGES = {"/": CORE, "stresses": STRESSES, "diagnostics": DIAGNOSTICS, "seeds": tuple(OBSERVABLES)}
@@ -35,8 +35,8 @@ def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
     """A group whose variables have the attributes of the module; it comes with long names and units in m, σ and t."""
     for name in map(str, data.variables):
         about = data[name].attrs
-        if about.get("units", "1") != "1":
-            about |= {"reduced_unit": about["units"], "units": "1"}
+        if "units" in about:
+            about |= unit_attributes(about["units"])
         if name == "seed":
             about["standard_name"] = "realization"
         if name == "status":

@@ -14,6 +14,7 @@ import xarray as xr
 from jaxgran import environment
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
+from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
@@ -25,6 +26,7 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import CORE, ERROR_SOURCES, FORMAT_VERSION, STRESSES
 from jaxgran.maps.seeds import NOT_RUN, STATUS_FLAGS, replica_statuses, seed_coordinate, seed_variables, worst_status
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.sums import sum_variables
 from jaxgran.maps.theory_variables import theory_variables
 from jaxgran.model.status import Status
 
@@ -34,11 +36,14 @@ _AXES = {
     "packing_fraction": {"long_name": "packing fraction", "units": "1"},
     "restitution": {"long_name": "restitution", "units": "1"},
 }
+_UNIFORM = "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared"
+_GIVEN = "the diameters over their mean, as many grains of each; mass = diameter squared"
 _TITLES = {
-    "stresses": "stress by origin: contact forces, contact forces if collisions were binary, and peculiar motion",
+    "stresses": "stress and dissipation by origin: contact forces, the same if collisions were binary, peculiar motion",
     "theory": "predictions of kinetic theory, and factors by which it fails",
     "diagnostics": "quality of the contact solves, conservation of momentum and energy, correlation of samples",
     "seeds": "replicas of each point",
+    "sums": "running sums of each replica, from which all averages follow",
     "snapshots": "one instant of every point",
     "large_system": "estimates for a large system",
 }
@@ -71,6 +76,7 @@ def map_dataset(
     theory                        see ``theory_variables``
     diagnostics                   see ``diagnostic_variables``
     seeds                         see ``seed_variables``
+    sums                          see ``sum_variables``
     snapshots                     only with the setting ``snapshots``, see ``instant_variables``
     large_system                  only with several numbers of grains, see ``large_system_variables``
     ============================  ===================================================================================
@@ -81,7 +87,7 @@ def map_dataset(
     packing_fraction,             of their own          values of the plane
     restitution
     grains, timestep              of their own or none  values of a list, or the one of all points
-    point_grains                  point                 number of grains, if it was chosen by point
+    point_grains, point_timestep  point                 number of grains, time step, if it was chosen by point
     error_source                  of its own            total, sampling, timestep, size, tolerance
     seed                          of its own            0, 1, …: number of the replica, from ``first_seed`` on
     observable                    of its own            name of an observable, in ``diagnostics``
@@ -104,6 +110,8 @@ def map_dataset(
         ),
         "seeds": xr.Dataset(seed_variables(settings, grid, replicas, statuses), {"seed": seed_coordinate(settings)}),
     }
+    if any(replicas.values()):
+        groups["sums"] = xr.Dataset(sum_variables(settings, grid, replicas))
     if settings.snapshots:
         groups["snapshots"] = xr.Dataset(instant_variables(grid, first_of_points(replicas)))
     if "grains" in settings.axes:
@@ -132,15 +140,17 @@ def _core(settings: MapSettings, grid: PointGrid, averages: PointAverages, statu
 def _coordinates(settings: MapSettings, grid: PointGrid) -> dict[str, xr.Variable]:
     """The coordinates of the root."""
     single: dict[str, Any] = {"timestep": settings.timestep, "grains": settings.grains}
-    if settings.grains_by_point is not None:
-        del single["grains"]
+    by_point = {
+        name: values
+        for name, values in (("grains", grid.grains), ("timestep", np.asarray(grid.batch.timestep)))
+        if getattr(settings, f"{name}_by_point") is not None
+    }
     coordinates = {name: xr.Variable(name, list(values), _AXES[name]) for name, values in settings.axes.items()}
     for name, value in single.items():
-        if name not in settings.axes:
+        if name in by_point:
+            coordinates[f"point_{name}"] = grid.variable(by_point[name], _AXES[name])
+        elif name not in settings.axes:
             coordinates[name] = xr.Variable((), value, _AXES[name])
-    if settings.grains_by_point is not None:
-        about = {"long_name": "number of grains of a point", "units": "1"}
-        coordinates["point_grains"] = grid.variable(grid.grains, about)
     labels = {
         "error_source": (list(ERROR_SOURCES), "source of an error"),
         "axis_a": (["x", "y"], "direction of the centre-to-centre vector"),
@@ -170,8 +180,10 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     timestep_unit               of the time step
     strain_meaning              of the strain
     shear_rate                  γ̇
-    polydispersity,             of the grains
+    polydispersity or           of the grains
+    diameters,
     size_distribution
+    part, part_points           share of the points that the file has, and their numbers from 0, if it is not all
     tolerance, max_steps        of a contact solve
     solver_parameters           all fields of the solver, in JSON
     precision, device,          what it was computed with; the commit is empty outside a repository
@@ -188,6 +200,8 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     equilibrate = parameters.pop("equilibrate")
     if settings.error is not None:
         del parameters["strain"]  # it differs between seeds: see ``strain`` of the group seeds
+    if settings.diameters is not None:
+        del parameters["polydispersity"]
     parameters["observe"] = identity_of(settings)
     parameters = {name: value for name, value in parameters.items() if value is not None}
     flow, of_sample = settings.flows()[0], "" if settings.observe is None else "observe"
@@ -215,8 +229,8 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         "timestep_unit": "1 / shear rate",
         "strain_meaning": "sampled strain of each seed; where none is given, see seeds/strain",
         "shear_rate": flow.shear_rate,
-        "polydispersity": flow.polydispersity,
-        "size_distribution": "diameters uniform in 1 +- polydispersity, quantile midpoints; mass = diameter squared",
+        "size_distribution": _UNIFORM if settings.diameters is None else _GIVEN,
+        **({} if settings.part is None else {"part_points": points_of_part(settings)}),
         **made_with(),
     }
 

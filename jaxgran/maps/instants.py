@@ -21,7 +21,7 @@ from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.model.status import Status
+from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.batch import advance_batch
 from jaxgran.sampling.recorder import Recorder
 from jaxgran.sampling.steady_state import Batch
@@ -55,7 +55,7 @@ def first_instants(batch: Batch, task: Sequence[Key]) -> list[Instant | None]:
     found: list[Instant | None] = [None] * len(task)
     done = set()
     for k, (point, _) in enumerate(task):
-        if point not in done and batch.status[k] < Status.infeasible:
+        if point not in done and batch.status[k] < GIVEN_UP:
             found[k] = _taken(*jax.tree.map(lambda x, k=k: x[k : k + 1], (batch.flow, batch.numerics, batch.state)))
             done |= {point} if found[k] is not None else set()
     return found
@@ -66,7 +66,7 @@ def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, Instant
     good = {
         key: one.instant
         for key, one in replicas.items()
-        if one is not None and one.status < Status.infeasible and one.instant is not None
+        if one is not None and one.status < GIVEN_UP and one.instant is not None
     }
     return {point: good[point, seed] for point, seed in sorted(good, reverse=True)}
 
@@ -168,6 +168,26 @@ def instant_variables(grid: PointGrid, instants: Mapping[int, Instant]) -> dict[
         variables[name] = grid.variable(values[name], {"long_name": long_name, "units": units}, *further)
         variables[name].encoding = dict(_PACKED) if further else {}
     return variables
+
+
+def instants_of(data: xr.Dataset, count: int) -> dict[int, Instant]:
+    """The instants in the group ``snapshots`` of a map of ``count`` points, by the number of the point."""
+    values = {name: data[name].values for name in _MEANINGS}
+    values = {name: x.reshape(count, *x.shape[x.ndim - len(_MEANINGS[name][2]) :]) for name, x in values.items()}
+    found = {}
+    for point in np.flatnonzero(np.isfinite(values["side"])).tolist():
+        here = {name: numbers[point] for name, numbers in values.items()}
+        n, p = np.isfinite(here["x"]).sum(), (here["pair_i"] != _NO_GRAIN).sum()
+        found[point] = Instant(
+            positions=np.column_stack([here["x"], here["y"]])[:n].astype(float),
+            radii=here["radius"][:n].astype(float),
+            speed=here["speed"][:n].astype(float),
+            pairs=np.column_stack([here["pair_i"], here["pair_j"]])[:p],
+            force=here["force"][:p].astype(float),
+            clustered=here["clustered"][:p] > 0,
+            **{name: float(here[name]) for name in ("side", "tilt", "window")},
+        )
+    return found
 
 
 def _rounded(values: np.ndarray, bits: int = _BITS) -> np.ndarray:

@@ -20,9 +20,10 @@ RESERVED = frozenset(
         *(name for one in OBSERVABLES for name in (one, *(f"{one}_{ending}" for ending in _ENDINGS))),
         *("status", "correlation_strain", "friction_error_correlation"),
         *("strain", "equilibration_strain", "sample_timestep"),
-        *("grains", "timestep", "packing_fraction", "restitution", "point_grains", "seed", "observable"),
-        *("error_source", "axis_a", "axis_b", "grain", "pair"),
-        *(*GROUPS, "theory", "seeds", "snapshots", "large_system"),
+        *("grains", "timestep", "packing_fraction", "restitution", "point_grains", "point_timestep"),
+        *("seed", "observable"),
+        *("error_source", "axis_a", "axis_b", "grain", "pair", "block", "quantity"),
+        *(*GROUPS, "theory", "seeds", "sums", "snapshots", "large_system"),
     ]
 )
 """Names of the variables, coordinates, dimensions and groups of a map."""

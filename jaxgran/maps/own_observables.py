@@ -11,6 +11,7 @@ import numpy as np
 from jaxgran.maps.own_names import dimensions_of
 from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.observe import digest_of, observed_shapes
 from jaxgran.sampling.sample import observed_estimates
 
@@ -72,7 +73,7 @@ def own_seed_variables(
     """The variable NAME in the group ``seeds``, for what ``observe`` returns, if the map has several seeds."""
     if settings.observe is None or settings.seeds == 1:
         return {}
-    totals = {key: one.sample.tally.total(axis=0) for key, one in replicas.items() if one is not None}
+    totals = {key: one.sample.tally.total(axis=0) for key, one in replicas.items() if one and one.status < GIVEN_UP}
     variables = {}
     for name, sums in (sums_by_name(settings) or {}).items():
         value = np.full((len(grid.flows), settings.seeds, *sums.shape), np.nan)

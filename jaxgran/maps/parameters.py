@@ -15,11 +15,15 @@ This module loads neither JAX nor xarray, so that the command line can print its
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import KW_ONLY, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
+from jaxgran.maps.presets import PRESETS
 from jaxgran.model.choices import Activation, EngineName, SolverName
+
+BY_POINT = ("grains_by_point", "timestep_by_point")
+"""Parameters with a number for each point."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -34,6 +38,7 @@ class Option:
       help: its meaning, in one sentence.
       kind: ``float``, ``int``, ``bool``, ``str`` or ``Path``, or the words that are accepted.
       several: whether a map also accepts a list.
+      values: whether the value itself is a list.
       auto: whether "auto" is accepted.
       unit: unit of the number, or "".
       range: whether a number is accepted, and the same in words; None where ``ShearFlow`` checks it.
@@ -47,6 +52,7 @@ class Option:
     help: str
     kind: type | tuple[str, ...] = float
     several: bool = False
+    values: bool = False
     auto: bool = False
     unit: str = ""
     range: tuple[Callable[[Any], Any], str] | None = None
@@ -72,8 +78,13 @@ _TOLERANCE = (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1")
 class MapParameters:
     """What the numbers of a map depend on."""
 
-    restitution: Sequence[float] = field(metadata=row("Restitution, 0 to 1.", several=True))
-    packing_fraction: Sequence[float] = field(metadata=row("Packing fraction, up to 0.83.", several=True))
+    restitution: Sequence[float] = field(  # type: ignore[assignment]
+        default=None, metadata=row("Restitution, 0 to 1.", several=True, default="of the preset")
+    )
+    packing_fraction: Sequence[float] = field(  # type: ignore[assignment]
+        default=None, metadata=row("Packing fraction, up to 0.83.", several=True, default="of the preset")
+    )
+    _: KW_ONLY
     grains: int | Sequence[int] | Literal["auto"] = field(
         default=256,
         metadata=row('Number of grains; "auto" chooses it for `error`.', int, several=True, auto=True, short="n"),
@@ -82,8 +93,8 @@ class MapParameters:
     timestep: float | Sequence[float] | Literal["auto"] = field(
         default=1e-3,
         metadata=row(
-            'Time step of the sample; "auto" takes the longest one that changes stresses by at most 2 %, or by a share '
-            "of `error`.",
+            'Time step of the sample; "auto" takes for each point the longest one that changes its stresses by at most '
+            "2 %, or for all points the longest one that changes them by at most a share of `error`.",
             several=True,
             auto=True,
             unit="1/shear rate",
@@ -154,11 +165,58 @@ class MapParameters:
             commands=(),
         ),
     )
+    timestep_by_point: Sequence[float] | None = field(
+        default=None,
+        metadata=row(
+            "Time step of each point, in the order of packing fractions and restitutions, the last one fastest; "
+            "`timestep` is then the shortest.",
+            unit="1/shear rate",
+            commands=(),
+        ),
+    )
+    polydispersity: float = field(
+        default=0.26,
+        metadata=row(
+            "Half-width of the uniform distribution of diameters, over their mean, 0 to 0.5.",
+            range=(lambda x: (x >= 0) & (x <= 0.5), "between 0 and 0.5"),
+        ),
+    )
+    diameters: Sequence[float] | None = field(
+        default=None,
+        metadata=row(
+            "Diameters of equally many grains each, such as 1,1.4, in place of the uniform distribution; their mean is "
+            "the unit of length.",
+            values=True,
+        ),
+    )
+    part: str | None = field(
+        default=None,
+        metadata=row(
+            "Measure one share of the points only, such as 3/20, the third of twenty of about the same cost; `jaxgran "
+            "merge` joins their files.",
+            str,
+            commands=("map",),
+            example="K/N",
+        ),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunParameters(MapParameters):
     """All parameters of ``ratio_map``: what the numbers depend on, and how the map is run and kept."""
+
+    preset: str = field(
+        default="quick", metadata=row("Starting point of all other parameters.", tuple(PRESETS), commands=("map",))
+    )
+    from_map: str | Path | None = field(
+        default=None,
+        metadata=row(
+            "Repeat the map of this file; other parameters replace its own.",
+            Path,
+            commands=("map",),
+            example="FILE.nc",
+        ),
+    )
 
     output: str | Path | None = field(
         default=None,
@@ -169,8 +227,8 @@ class RunParameters(MapParameters):
         default=False,
         metadata=row("Continue an unfinished map of the output, or read the output if it is finished.", bool),
     )
-    workers: int = field(
-        default=1,
+    workers: int | None = field(
+        default=None,
         metadata=row(
             "Number of batches that run at a time, in threads; more than one only on a CPU.",
             int,
@@ -216,9 +274,8 @@ def option(name: str) -> Option:
 
 
 def default(name: str) -> Any:
-    """The default of a parameter; None if it has none."""
-    value = RunParameters.__dataclass_fields__[name].default
-    return None if value is MISSING else value
+    """The default of a parameter."""
+    return RunParameters.__dataclass_fields__[name].default
 
 
 def takes(parameters: Callable[P, object]) -> Callable[[Callable[..., R]], Callable[P, R]]:
@@ -244,8 +301,8 @@ def _described(name: str) -> str:
     if about.unit:
         words += f" In {about.unit}."
     if is_new_dimension(name):
-        words += " A sorted list adds a dimension."
-    return words if value is MISSING else f"{words} Default: {about.default or repr(value)}."
+        words += " A list adds a dimension."
+    return f"{words} Default: {about.default or repr(value)}."
 
 
 def is_new_dimension(name: str) -> bool:

@@ -12,7 +12,8 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.status import Status
+from jaxgran.model.grains import Grains
+from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
 from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
@@ -26,11 +27,13 @@ class PointGrid:
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     flows: Sequence[ShearFlow] = ()
+    classes: Grains | None = None  # (points, grains) in the proportions of given diameters
 
     @classmethod
     def of(cls, settings: MapSettings) -> "PointGrid":
         """The grid of a map."""
-        return cls(tuple(settings.axes), tuple(map(len, settings.axes.values())), settings.flows())
+        flows, shape = settings.flows(), tuple(map(len, settings.axes.values()))
+        return cls(tuple(settings.axes), shape, flows, settings.size_classes(len(flows)))
 
     @cached_property
     def batch(self) -> ShearFlow:
@@ -63,7 +66,7 @@ class PointGrid:
 
 
 class PointAverages(NamedTuple):
-    """Averages over the finite seeds of each point, in the order of ``settings.flows()``; NaN where there are none.
+    """Averages over the seeds of each point that were not given up, in the order of ``settings.flows()``, or NaN.
 
     ============================  ==============  =================================================================
     values, stderrs               (points, ...)   each observable and its standard error, by name
@@ -71,7 +74,7 @@ class PointAverages(NamedTuple):
     observable_correlation        (points,)       strain of one independent sample, for averages of scalars, by name
     friction_error_correlation    (points,)       of the errors of macroscopic_friction and inertial_number
     drifting                      (points,)       whether the averages still change
-    samples                       by point        finite samples
+    samples                       by point        samples of these seeds
     ============================  ==============  =================================================================
     """
 
@@ -90,7 +93,7 @@ def tensor_shape(name: str) -> tuple[int, ...]:
 
 
 def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> PointAverages:
-    """The averages of every point over its finite replicas."""
+    """The averages of every point over its replicas that were not given up."""
     flows = settings.flows()
     count = len(flows)
     scalars = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
@@ -101,13 +104,13 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
         observable_correlation={name: np.full(count, np.nan) for name in scalars},
         friction_error_correlation=np.full(count, np.nan),
         drifting=np.zeros(count, bool),
-        samples=_finite_samples(settings, replicas),
+        samples=_samples(settings, replicas),
     )
     for point, samples in found.samples.items():
         flow, (values, stderrs) = flows[point], estimates(samples)
         for name in OBSERVABLES:
             found.values[name][point], found.stderrs[name][point] = values[name], stderrs[name]
-        mass = flow.grains * (1 + float(flow.polydispersity) ** 2 / 3)
+        mass = _mass(settings, flow)
         area, shear_rate = samples[0].area, samples[0].shear_rate
         strain = found.correlation_strain[point] = flow_correlation_strain(values, flow.grains, mass, area, shear_rate)
         found.drifting[point] = is_drifting(samples, float(strain))
@@ -119,12 +122,18 @@ def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]
     return found
 
 
-def _finite_samples(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> dict[int, Sequence[Sample]]:
-    """The samples of the finite replicas of each point that has any, in the order of the seeds."""
-    finite: dict[int, Sequence[Sample]] = {}
+def _mass(settings: MapSettings, flow: ShearFlow) -> float:
+    """The mass of all grains of a flow, in m."""
+    grains = settings.grains_of(flow.grains, 1)
+    return flow.grains * (1 + float(flow.polydispersity) ** 2 / 3) if grains is None else float(grains.masses.sum())
+
+
+def _samples(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> dict[int, Sequence[Sample]]:
+    """The samples of each point that has any, in the order of the seeds, without those that were given up."""
+    by_point: dict[int, Sequence[Sample]] = {}
     for point in range(len(settings.flows())):
         seeds = [replicas.get((point, seed)) for seed in range(settings.seeds)]
-        samples = [one.sample for one in seeds if one is not None and one.status < Status.nonfinite]
+        samples = [one.sample for one in seeds if one is not None and one.status < GIVEN_UP]
         if samples:
-            finite[point] = samples
-    return finite
+            by_point[point] = samples
+    return by_point

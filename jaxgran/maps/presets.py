@@ -1,6 +1,15 @@
-"""The presets of ``jaxgran map``: the parameters of a whole map by name, as arguments of ``ratio_map``."""
+"""What a map starts from: a preset or the map of a file, what is given on top, and what a requested error chooses.
 
+This module loads neither JAX nor xarray at once, as the help of the command line needs the names of the presets.
+"""
+
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+from jaxgran.model.checks import InputError, refused
 
 PRESETS: dict[str, dict[str, Any]] = {
     "quick": {
@@ -26,3 +35,50 @@ PRESETS: dict[str, dict[str, Any]] = {
         "strain": 16.0,
     },
 }
+
+
+def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of ``ratio_map``: those given, on top of those of a preset or of a file.
+
+    Raises:
+      InputError: (a ValueError) there is no such preset or map, or both are given.
+    """
+    preset, from_map = given.get("preset", "quick"), given.get("from_map")
+    if not isinstance(preset, str) or preset not in PRESETS:
+        raise refused("preset", preset, f"must be {', '.join(list(PRESETS)[:-1])} or {list(PRESETS)[-1]}")
+    if from_map is None:
+        return combined(PRESETS[preset], given)
+    if "preset" in given:
+        raise InputError("`preset` and `from_map` exclude each other.", field="preset")
+    if not isinstance(from_map, (str, os.PathLike)):
+        raise refused("from_map", from_map, "must be a file name")
+    return combined(_parameters_of(Path(from_map)), given)
+
+
+def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a preset or a file, replaced by those that are given and by what these choose."""
+    replaced = {"error": ("seeds", "strain"), "strain": ("error",), "polydispersity": ("diameters",)}
+    left_out = {name for option, names in replaced.items() if given.get(option) is not None for name in names}
+    kept = {name: value for name, value in start.items() if name not in left_out}
+    for name, other in (("grains", "timestep"), ("timestep", "activation")):
+        if f"{name}_by_point" in kept and given.keys() & {name, other, "restitution", "packing_fraction", "error"}:
+            del kept[f"{name}_by_point"]
+            kept[name] = "auto"  # chosen again, for the points that are given
+    return kept | for_error(given) | dict(given)
+
+
+def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
+    """What a requested error chooses unless it is given; a longer sample is cheaper than a second seed."""
+    automatic = {"grains": "auto", "timestep": "auto", "tolerance": "auto", "seeds": 1}
+    return automatic if given.get("error") is not None else {}
+
+
+def _parameters_of(file: Path) -> dict[str, Any]:
+    """The parameters of the map in a file; a warning names other differences that could change its numbers."""
+    from jaxgran.maps.results import choices_of, differences, read_dataset
+
+    data = read_dataset(file)
+    chosen, different = choices_of(data), differences(data)
+    if different:
+        warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)
+    return chosen | {"tolerance": getattr(chosen["solver"], "tolerance", None)}  # also of another solver

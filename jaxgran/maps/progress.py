@@ -1,88 +1,100 @@
-"""Progress of a map on standard error: points done, replica-steps per second, time left."""
+"""Progress of a map on standard error: points done, share of the work, replica-steps per second, time left."""
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from jaxgran.maps.batches import points_of_part, predicted_cost, replica_cost
+from jaxgran.maps.replica import Advance, Key
+from jaxgran.maps.settings import MapSettings
+
 _SECONDS_BETWEEN_LINES = 10  # without a terminal
-_T = TypeVar("_T")
+_MOST_STARTED = 0.95  # largest share of a replica that is done before it is finished
 
 
 class Meter:
-    """Counts finished replicas and reports on standard error: a bar on a terminal, lines elsewhere.
+    """How much of a map is done, reported on standard error: a bar on a terminal, lines elsewhere.
+
+    A replica counts by its cost, and while it runs by the cost of the strain that it has been sheared, up to
+    ``_MOST_STARTED``: the strain until it is steady and its errors are small is not known before.
 
     Args:
-      costs: relative cost of a replica of each point.
-      seeds: replicas of each point.
+      settings: the map.
       quiet: whether to report nothing.
     """
 
-    def __init__(self, costs: list[float], seeds: int, quiet: bool):
-        self.costs, self.seeds, self.quiet = costs, seeds, quiet
-        self.left = [seeds] * len(costs)
+    def __init__(self, settings: MapSettings, quiet: bool):
+        self.flows, self.quiet = settings.flows(), quiet
+        self.costs = [replica_cost(flow, settings.equilibrate, settings.strain) for flow in self.flows]
+        self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
+        self.running: dict[Key, float] = {}  # share of each replica that has been started
+        self.total = sum(self.costs[point] for point in self.left) * settings.seeds
         self.done_steps, self.done_cost, self.known_cost = 0.0, 0.0, 0.0
         self.start = self.last_line = time.perf_counter()
         self.console = Console(stderr=True, quiet=quiet)
         self.bar = Progress(
             TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=self.console, transient=False
         )
-        self.task = self.bar.add_task("compiling", total=sum(costs) * seeds)
+        self.task = self.bar.add_task("compiling", total=self.total)
 
-    def steps(self, steps: float) -> None:
-        """Count replica-steps."""
-        self.done_steps += steps
+    def advanced(self, advance: Advance) -> None:
+        """Count what replicas have been advanced by."""
+        self.done_steps += float(np.sum(advance.steps))
+        columns = np.asarray(advance.timestep).tolist(), np.asarray(advance.steps).tolist()
+        for key, timestep, steps in zip(advance.keys, *columns, strict=True):
+            cost = steps * timestep * predicted_cost(self.flows[key[0]], timestep) / self.costs[key[0]]
+            self.running[key] = min(self.running.get(key, 0.0) + cost, _MOST_STARTED)
         self._show()
 
-    def resumed(self, points: Iterable[int]) -> None:
-        """Count the replicas of an earlier run, by their points; the estimate of the time left leaves them out."""
-        for point in points:
+    def resumed(self, keys: Iterable[Key]) -> None:
+        """Count the replicas of an earlier run; the estimate of the time left leaves them out."""
+        for point, _ in keys:
             self.left[point] -= 1
             self.known_cost += self.costs[point]
 
-    def replica(self, point: int) -> None:
-        """Count a finished replica of a point."""
-        self.left[point] -= 1
-        self.done_cost += self.costs[point]
+    def finished(self, key: Key) -> None:
+        """Count a finished replica."""
+        self.running.pop(key, None)
+        self.left[key[0]] -= 1
+        self.done_cost += self.costs[key[0]]
         self._show()
+
+    @property
+    def _cost_of_run(self) -> float:
+        """Cost of what this run has done."""
+        return self.done_cost + sum(self.costs[point] * share for (point, _), share in self.running.items())
 
     def _show(self) -> None:
         if self.console.is_terminal:
-            self.bar.update(self.task, completed=self.known_cost + self.done_cost, description=self._line())
+            self.bar.update(self.task, completed=self.known_cost + self._cost_of_run, description=self._line())
         elif time.perf_counter() - self.last_line > _SECONDS_BETWEEN_LINES:
             self.last_line = time.perf_counter()
             self.console.print(self._line(), highlight=False)
 
     def _line(self) -> str:
-        seconds = time.perf_counter() - self.start
-        points = sum(left == 0 for left in self.left)
-        share = self.done_cost / max(sum(self.costs) * self.seeds - self.known_cost, 1e-9)
-        left = f"{_duration(seconds / share - seconds)} left" if share > 0 else "estimating the time left"
-        return f"{points}/{len(self.costs)} points, {self.done_steps / seconds:.3g} replica-steps/s, {left}"
+        seconds, done = time.perf_counter() - self.start, self._cost_of_run
+        points = sum(left == 0 for left in self.left.values())
+        percent = 100 * (self.known_cost + done) / self.total
+        left = _duration(seconds * max(self.total - self.known_cost - done, 0.0) / done) if done > 0 else "unknown time"
+        speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
+        return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {left} left"
 
 
 @contextmanager
-def progress(costs: list[float], seeds: int, quiet: bool) -> Iterator[Meter]:
+def progress(settings: MapSettings, quiet: bool) -> Iterator[Meter]:
     """A ``Meter`` that is shown while the block runs, and once more at its end."""
-    meter = Meter(costs, seeds, quiet)
+    meter = Meter(settings, quiet)
     if meter.console.is_terminal and not quiet:
         with meter.bar:
             yield meter
     else:
-        meter.console.print(f"0/{len(costs)} points, compiling", highlight=False)
+        meter.console.print(f"0/{len(meter.left)} points, compiling", highlight=False)
         yield meter
         meter.console.print(meter._line(), highlight=False)
-
-
-def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
-    """The items one by one, with a progress bar on a terminal; ``words`` is its title."""
-    console = Console(stderr=True)
-    columns = TextColumn(words), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield from bar.track(items)
 
 
 def _duration(seconds: float) -> str:

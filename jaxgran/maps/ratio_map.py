@@ -1,5 +1,6 @@
 """The ratio map: a grid of restitutions and packing fractions, run in batches on all cores, as a dataset and a file."""
 
+import inspect
 import os
 import sys
 import warnings
@@ -10,15 +11,18 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import jax
+import numpy as np
 
 from jaxgran.dynamics.advance import register_numba
 from jaxgran.dynamics.engine import Numba, select_engine
-from jaxgran.maps.batches import predicted_cost
+from jaxgran.environment import usable_cores
+from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.output import check_output, remove_pictures
 from jaxgran.maps.parameters import RunParameters, takes
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.presets import with_start
+from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.replicas import replicas
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole, short_repr
@@ -35,7 +39,8 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
     With ``output``, finished batches are kept in a folder beside it while the map runs: an unfinished map of the same
     parameters is continued if ``resume`` is True and is an error otherwise, and a finished one is then read from its
-    file. A file with anything else is replaced only if ``overwrite`` is True.
+    file. A file with anything else is replaced only if ``overwrite`` is True. ``save_figures`` draws the figures of
+    ``jaxgran map``, and ``open_map`` reads the file.
 
     Args:
       {PARAMETERS}
@@ -59,11 +64,11 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
       >>> data.force_ratio.dims
       ('packing_fraction', 'restitution')
     """
-    run = RunParameters(*arguments, **parameters)
+    given = inspect.signature(RunParameters).bind(*arguments, **parameters).arguments
+    run = RunParameters(**with_start(given))
     output = _checked(run)
     settings, automatic_choice = chosen_settings(run)
-    if run.workers > 1 and jax.default_backend() != "cpu":
-        raise refused("workers", run.workers, "must be 1 on an accelerator")
+    workers = _workers(run)
     if automatic_choice:
         _tell(run, f"chosen: {automatic_choice}")
     earlier, difference, finished = (None, "", False) if output is None else _earlier(output, settings)
@@ -82,7 +87,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
                 _tell(run, f"{output} is finished and is read from its file.")
                 return earlier
             _tell_resumed(run, settings, checkpoint)
-        results, attributes, interruption = _run(run, settings, None if run.record else checkpoint)
+        results, attributes, interruption = _run(run, settings, workers, None if run.record else checkpoint)
         from jaxgran.maps.dataset import map_dataset  # here: xarray is loaded while the flows run
         from jaxgran.maps.results import write_dataset
 
@@ -95,12 +100,12 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
             raise Interrupted(data) from interruption
         complete = sum(replica is not None for replica in results.values()) == _count(settings)
     except OSError as error:
-        if checkpoint is not None and run.record is None:
+        if checkpoint is not None and checkpoint.done:
             error.add_note(f"finished batches are in {checkpoint.folder}: make room and add `resume=True`")
         raise
     finally:
         if checkpoint is not None:
-            checkpoint.close(complete or run.record is not None)
+            checkpoint.close(complete)
     _warn_of_bad_points(data)
     return data
 
@@ -109,18 +114,20 @@ def _checked(run: RunParameters) -> Path | None:
     """The output of a map; InputError if something cannot be accepted about how the map is run and kept."""
     for name in ("overwrite", "resume"):
         require_flag(name, getattr(run, name))
-    require_whole("workers", run.workers, 1, _MOST_WORKERS)
+    if run.workers is not None:
+        require_whole("workers", run.workers, 1, _MOST_WORKERS)
     if not isinstance(run.progress, bool) and not callable(run.progress):
         raise refused("progress", run.progress, "must be True, False or a function of one number")
     if run.scheduler is not None and not isinstance(run.scheduler, str):
         raise refused("scheduler", run.scheduler, "must be an address")
-    if run.scheduler is not None and run.workers > 1:
+    several = run.workers is not None and run.workers > 1
+    if run.scheduler is not None and several:
         raise InputError("`scheduler` and `workers` exclude each other.", field="scheduler")
     if run.strain is not None and run.error is not None:
         raise InputError("`strain` and `error` exclude each other.", field="strain")
     if run.record is not None and not callable(run.record):
         raise refused("record", run.record, "must be a function")
-    if run.record is not None and (run.resume or run.workers > 1 or run.scheduler is not None):
+    if run.record is not None and (run.resume or several or run.scheduler is not None):
         raise InputError("what is recorded cannot be resumed, and needs one worker.", field="record")
     if run.attributes is not None and not isinstance(run.attributes, dict):
         raise refused("attributes", run.attributes, "must be a dictionary")
@@ -135,6 +142,16 @@ def _checked(run: RunParameters) -> Path | None:
     return output
 
 
+def _workers(run: RunParameters) -> int:
+    """How many batches run at a time; InputError if they cannot."""
+    on_cpu = jax.default_backend() == "cpu"
+    if run.workers is None:
+        return usable_cores() if on_cpu and run.scheduler is None and run.record is None else 1
+    if run.workers > 1 and not on_cpu:
+        raise refused("workers", run.workers, "must be 1 on an accelerator")
+    return run.workers
+
+
 def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
     """The map that the output has already, how it differs from one of these settings, and whether it is finished."""
     if not output.exists():
@@ -146,32 +163,30 @@ def _earlier(output: Path, settings: MapSettings) -> tuple[Any, str, bool]:
 
 
 def _run(
-    run: RunParameters, settings: MapSettings, checkpoint: Checkpoint | None
+    run: RunParameters, settings: MapSettings, workers: int, checkpoint: Checkpoint | None
 ) -> tuple[dict[Key, Replica | None], dict[str, Any], BaseException | None]:
     """Run what the checkpoint lacks; the results, attributes of the run, and the interruption that ended it."""
     from jaxgran.maps.progress import progress  # here: a worker of a cluster need not load Rich
 
     Thread(target=_load_meanwhile, args=(settings,), name="jaxgran-load").start()
-    workers, start = min(_count(settings), run.workers), perf_counter()
+    workers, start = min(_count(settings), workers), perf_counter()
     results: dict[Key, Replica | None] = {} if checkpoint is None else dict(checkpoint.done)
     attributes: dict[str, Any] = {"workers": workers, "resumed_replicas": len(results)}
     interruption = None
-    with progress(
-        [predicted_cost(flow) for flow in settings.flows()], settings.seeds, quiet=run.progress is not True
-    ) as meter:
-        meter.resumed(point for point, _ in results)
+    with progress(settings, quiet=run.progress is not True) as meter:
+        meter.resumed(results)
 
-        def report(steps: float) -> None:
-            meter.steps(steps)
+        def report(advance: Advance) -> None:
+            meter.advanced(advance)
             if callable(run.progress):
-                run.progress(steps)
+                run.progress(float(np.sum(advance.steps)))
 
         running = replicas(settings, "auto", workers, report, checkpoint, warnings.warn, run.scheduler, run.record)
         try:
             with closing(running):
                 for key, replica in running:
                     results[key] = replica
-                    meter.replica(key[0])
+                    meter.finished(key)
         except BaseException as error:
             if not is_interruption(error):
                 raise
@@ -196,7 +211,7 @@ def _load_meanwhile(settings: MapSettings) -> None:
 
 def _count(settings: MapSettings) -> int:
     """Number of replicas."""
-    return len(settings.flows()) * settings.seeds
+    return len(points_of_part(settings)) * settings.seeds
 
 
 def _tell(run: RunParameters, sentence: str) -> None:

@@ -1,11 +1,22 @@
-"""The result of one replica of a map."""
+"""One replica of a map: its key, its progress and its result."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
+
+from jax.typing import ArrayLike
 
 from jaxgran.analysis.instant import Instant
 from jaxgran.sampling.sample import Sample
 
 Key = tuple[int, int]  # number of the point, in the order of ``MapSettings.flows``; seed
+
+
+class Advance(NamedTuple):
+    """What some replicas have been advanced by, for a report of progress."""
+
+    keys: Sequence[Key]
+    timestep: ArrayLike | Sequence[float]  # (replicas,)
+    steps: ArrayLike | Sequence[float]  # (replicas,)
 
 
 class Replica(NamedTuple):

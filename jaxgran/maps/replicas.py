@@ -26,20 +26,22 @@ from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
-from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
-from jaxgran.sampling.batch import AdvanceWrapper, ObserveBatch, Report, advance_batch, reporting, stack
+from jaxgran.sampling.batch import AdvanceWrapper, ObserveBatch, advance_batch, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
 from jaxgran.sampling.timestep import COARSE_TIMESTEP
+
+_REPEATED = Status.capacity, Status.nonfinite  # a jammed packing would be jammed again
 
 
 def replicas(
     settings: MapSettings,
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
-    report: Report | None = None,
+    report: Callable[[Advance], None] | None = None,
     checkpoint: Checkpoint | None = None,
     warn: Callable[[str], None] = warnings.warn,
     scheduler: str | None = None,
@@ -51,7 +53,7 @@ def replicas(
       settings: the map.
       batch: number of replicas that run together, or "auto", see ``batch_size``.
       workers: number of threads; more than one only on a CPU. See ``in_threads`` for how they end.
-      report: called with the replica-steps done since its last call.
+      report: called after each advance.
       checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor yielded.
       warn: called with one sentence about each batch that is given up.
       scheduler: address of a Dask scheduler, whose workers run the batches instead of this process. They
@@ -59,13 +61,13 @@ def replicas(
       record: wraps the function that advances a sampled batch, but not the one of its preparation. It has an effect
         only with one worker.
     """
-    tasks = remaining_batches(settings, batch, workers, checkpoint)
+    tasks, flows = remaining_batches(settings, batch, workers, checkpoint), settings.flows()
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
-    on_steps = report or (lambda _: None)
+    report = report or (lambda _: None)
     if scheduler is not None:
         outcomes = run_on_cluster(scheduler, _run_task, calls)
     elif workers > 1:
-        outcomes = in_threads(_run_task, calls, workers, on_steps)
+        outcomes = in_threads(_run_task, calls, workers, report)
     else:
         outcomes = ((number, _run_task(*call, report, record)) for number, call in enumerate(calls))
     with closing(outcomes):
@@ -77,7 +79,8 @@ def replicas(
             if checkpoint is not None:
                 checkpoint.add(dict(outcome))
             if scheduler is not None:
-                on_steps(float(sum(replica.sample.tally.steps.sum() for _, replica in outcome)))
+                keys, steps = zip(*((key, one.sample.tally.steps.sum()) for key, one in outcome), strict=True)
+                report(Advance(keys, [float(flows[point].timestep) for point, _ in keys], steps))
             yield from outcome
 
 
@@ -93,15 +96,23 @@ def _run_task(
     settings: MapSettings,
     task: Sequence[Key],
     journal: Path | None = None,
-    report: Report | None = None,
+    report: Callable[[Advance], None] | None = None,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
-    drive = reporting(advance_batch, report)
+    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved.
+
+    A replica whose time step was too long is run once more, from another packing and with half the time step, and the
+    better result is kept.
+    """
     measured = _measured if record is None else partial(_measured, record=record)
+    drive = _reporting(task, report)
     try:
         done = measured(settings, task, drive if journal is None else Journal(journal, task, drive))
-        return _retried(settings, done, partial(measured, drive=drive, refinement=2))
+        repeated = [key for key, replica in done if replica.status in _REPEATED]
+        if not repeated:
+            return done
+        second = dict(measured(settings, repeated, _reporting(repeated, report), refinement=2))
+        return [(key, min(one, second.get(key, one), key=lambda replica: replica.status)) for key, one in done]
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -115,16 +126,11 @@ def _run_task(
         ]
 
 
-def _retried(
-    settings: MapSettings, done: list[tuple[Key, Replica]], refined: Callable[..., list[tuple[Key, Replica]]]
-) -> list[tuple[Key, Replica]]:
-    """The replicas of a batch. Failed ones are run again once, from another packing and with half the time steps.
-
-    The second result is kept if its status is better.
-    """
-    failed = [key for key, replica in done if replica.status >= Status.infeasible]
-    second = dict(refined(settings, failed)) if failed else {}
-    return [(key, second[key] if key in second and second[key].status < first.status else first) for key, first in done]
+def _reporting(task: Sequence[Key], report: Callable[[Advance], None] | None) -> ObserveBatch:
+    """The function that advances the replicas of a task and reports it."""
+    if report is None:
+        return advance_batch
+    return reporting(advance_batch, lambda timestep, steps: report(Advance(task, timestep, steps)))
 
 
 @persistent_jit
@@ -146,7 +152,8 @@ def _measured(
     flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
     keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
     coarse = COARSE_TIMESTEP / refinement
-    batch = prepare_batch(flow, keys, settings.equilibrate, drive, coarse, numerics=settings.numerics)
+    grains = settings.grains_of(flow.grains, len(task))
+    batch = prepare_batch(flow, keys, settings.equilibrate, drive, coarse, grains, numerics=settings.numerics)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     sampling = drive if settings.observe is None else partial(drive, observe=settings.observe)

@@ -15,13 +15,15 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.files import atomic_write
+from jaxgran.maps.parameters import BY_POINT
 from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
-from jaxgran.model.checks import InputError, short_repr
+from jaxgran.model.checks import InputError, refused, short_repr
 
 if TYPE_CHECKING:
     from jaxgran.maps.settings import MapSettings
 
 _MARK = b"SHA-256:"  # between the dataset and its checksum
+_SINCE = ("polydispersity",)  # parameters that older maps do not name; they had the default
 _DIGEST = hashlib.sha256().digest_size  # bytes
 
 
@@ -64,6 +66,21 @@ def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr
     return data
 
 
+def open_map(path: str | Path) -> xr.DataTree:
+    """The map of a file, loaded into memory: that of ``ratio_map(output=…)``, of ``jaxgran map`` or of ``to_netcdf``.
+
+    Args:
+      path: the file.
+
+    Raises:
+      InputError: (a ValueError) the file does not exist, cannot be read, is not a map, or has another version of the
+        format.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise refused("path", path, "must be a file name")
+    return read_dataset(Path(path))
+
+
 def _whole(path: Path) -> bytes:
     """The content of a file; a ValueError if it ends in a checksum that is not its own."""
     whole = path.read_bytes()
@@ -93,14 +110,14 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.name not in ("strain", "error", "grains_by_point", "observe"):  # which not every map has
+            elif field.default is not None and field.name not in _SINCE:
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         chosen["snapshots"] = bool(chosen["snapshots"])
         chosen |= {"solver": _solver_of(data), "engine": engine_named(data.attrs["engine_requested"])}
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist())
-            for name in ("restitution", "packing_fraction", "grains_by_point")
+            for name in ("restitution", "packing_fraction", *BY_POINT, "diameters")
             if name in chosen
         }
     except KeyError as missing:
@@ -146,7 +163,8 @@ def is_finished(data: xr.DataTree) -> bool:
     status = data["seeds"].status
     flags = dict(zip(status.attrs["flag_meanings"].split(), status.attrs["flag_values"], strict=True))
     missing = [flags[name] for name in ("not_run", "failed")]
-    return not np.isin(status, missing).any()
+    chosen = np.isin(np.arange(data.status.size), data.attrs.get("part_points", range(data.status.size)))
+    return not np.isin(status.values.reshape(chosen.size, -1)[chosen], missing).any()
 
 
 def differences(data: xr.DataTree) -> list[str]:

@@ -49,6 +49,8 @@ STRESSES = (
     "kinetic_shear_stress",
     "bagnold_pressure",
     "bagnold_shear_stress",
+    "dissipation_rate",
+    "binary_dissipation_rate",
     "cluster_pressure_share",
     "cluster_shear_share",
 )
@@ -156,6 +158,25 @@ def parts(data: MapData) -> list[xr.Dataset]:
             values = found[0][name].values.tolist()
             found = [part.isel({name: k}).assign_attrs({name: x}) for part in found for k, x in enumerate(values)]
     return found
+
+
+def timestep_text(data: MapData) -> str:
+    """The time step of a map, or the range of those that were chosen by point, in units of 1/γ̇."""
+    if has_one_timestep(data):
+        return f"{data.attrs['timestep']:g}"
+    return " to ".join(f"{float(limit(data.point_timestep)):g}" for limit in (np.min, np.max))
+
+
+def has_one_timestep(data: MapData) -> bool:
+    """Whether the force ratios of a map compare: they depend on the time step."""
+    return "point_timestep" not in data
+
+
+def require_one_timestep(data: MapData, what: str) -> None:
+    """Raise an InputError if the force ratios of a map do not compare."""
+    if not has_one_timestep(data):
+        reason = f"force ratios of one time step, and those of this map are {timestep_text(data)} / shear rate"
+        raise InputError(f"{what} needs {reason}: make a map with a number for `timestep`.")
 
 
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:

@@ -10,7 +10,7 @@ from jaxgran.maps.points import PointGrid, tensor_shape
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.status import Status
+from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
 NOT_RUN = -1  # status of a replica without a result
@@ -47,7 +47,7 @@ def seed_variables(
     equilibration_strain  strain before the sample
     sample_timestep       time step of the sample, shorter than asked for where a replica was retried
     NAME                  average of each observable, also of the user's, over the replica; only if the map has
-                          several seeds
+                          several seeds, and NaN from the status ``infeasible`` on
     ====================  ===========================================================================================
     """
     shape = (len(grid.flows), settings.seeds)
@@ -59,8 +59,8 @@ def seed_variables(
         tally = replica.sample.tally
         equilibration[key] = replica.strain
         strain[key] = tally.duration.sum() * replica.sample.shear_rate
-        timestep[key] = strain[key] / max(tally.steps.sum(), 1)
-        if settings.seeds > 1:
+        timestep[key] = strain[key] / tally.steps.sum() if tally.steps.any() else np.nan
+        if settings.seeds > 1 and replica.status < GIVEN_UP:
             for name, value in replica.sample.averages.items():
                 values[name][key] = value
     retried = "time step of the sample, shorter than asked for where a replica was retried"

@@ -1,24 +1,29 @@
 """MapSettings: all parameters that the numbers of a ratio map depend on, checked before the run."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
 from jaxgran.maps.own_names import require_observe
-from jaxgran.maps.parameters import MapParameters
+from jaxgran.maps.parameters import BY_POINT, MapParameters
 from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains, own_grains
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
+from jaxgran.sampling.packing import require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
 
@@ -45,7 +50,10 @@ class MapSettings(MapParameters):
         require_whole("seeds", self.seeds, 1, MAX_REPLICAS, "the most replicas of a map")
         require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
         require_flag("snapshots", self.snapshots)
-        self._require_grains_by_point()
+        plane = len(self.packing_fraction) * len(self.restitution)
+        self._require_by_point("grains", len(self._timesteps) * plane)
+        self._require_by_point("timestep", plane)
+        self._sort_plane()
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
             raise InputError(
@@ -55,19 +63,21 @@ class MapSettings(MapParameters):
             value, ranged = getattr(self, row.name), row.metadata["option"].range
             if ranged is not None and value is not None and row.name not in self.axes:
                 require_number(row.name, value, *ranged)
+        self._require_diameters()
+        self._require_part()
         flows = stack_of_any_size(self._checked_flows())
         if self.engine is not None:
             select_engine(flows, self.numerics, option="" if self.observe is None else "observe")
         if self.observe is not None:
             require_observe(self.observe, self._checked_flows()[0])
-        shortest, longest = min(self._timesteps), max(self._timesteps)
+        shortest, longest = (float(limit(flow.timestep for flow in self._checked_flows())) for limit in (min, max))
         if shortest < SHORTEST_TIMESTEP:
             raise refused("timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate")
         strain = LEAST_SAMPLE if self.strain is None else self.strain
         if strain > MAX_STEPS * shortest:
             most = f"{MAX_STEPS} time steps, that is {MAX_STEPS * shortest:g}"
             raise refused("strain", strain, f"must be at most {most}")
-        limits = longest_timestep(_temperature(flows), flows.packing_fraction, self.activation)
+        limits = longest_timestep(_temperature(self, flows), flows.packing_fraction, self.activation)
         excess = np.asarray(flows.timestep) / limits
         worst = int(np.argmax(excess))
         if excess[worst] > 1:
@@ -108,15 +118,55 @@ class MapSettings(MapParameters):
     def _timesteps(self) -> tuple[float, ...]:
         return self.axes.get("timestep", (self.timestep,))  # type: ignore[arg-type]
 
-    def _require_grains_by_point(self) -> None:
-        points = len(self._timesteps) * len(self.packing_fraction) * len(self.restitution)
-        if self.grains_by_point is not None and not (
-            isinstance(self.grains_by_point, tuple)
-            and len(self.grains_by_point) == points
-            and "grains" not in self.axes
-        ):
-            reason = f"must be a list of {points} numbers, one for each point"
-            raise refused("grains_by_point", self.grains_by_point, reason)
+    def _require_by_point(self, name: str, points: int) -> None:
+        """Raise an InputError unless what is given by point is given for all points, and not as a list too."""
+        values = getattr(self, f"{name}_by_point")
+        listed = isinstance(values, tuple) and len(values) == points and _are_numbers(values)
+        if values is not None and (not listed or name in self.axes):
+            raise refused(f"{name}_by_point", values, f"must be a list of {points} numbers, one for each point")
+
+    def _sort_plane(self) -> None:
+        """Put restitutions and packing fractions, and what is given by their points, in ascending order."""
+        for name in BY_POINT:
+            if getattr(self, name) is not None:
+                by_point = np.reshape(getattr(self, name), (-1, len(self.packing_fraction), len(self.restitution)))
+                by_point = by_point[:, np.argsort(self.packing_fraction)][..., np.argsort(self.restitution)]
+                object.__setattr__(self, name, tuple(by_point.ravel().tolist()))
+        for name in ("restitution", "packing_fraction"):
+            object.__setattr__(self, name, tuple(sorted(getattr(self, name))))
+
+    def _require_diameters(self) -> None:
+        if self.diameters is None:
+            return
+        own_grains(self.diameters)  # type: ignore[arg-type]
+        if any(size % len(self.diameters) for size in self.sizes):
+            sizes = ", ".join(map(str, self.sizes))
+            reason = f"must be a list whose length divides the number of grains, {sizes}"
+            raise refused("diameters", list(self.diameters), reason)
+        densest = max(self._checked_flows(), key=lambda flow: float(flow.packing_fraction))
+        for size in self.sizes:
+            require_room(replace(densest, grains=size), own_grains(np.resize(self.diameters, size)))
+
+    def _require_part(self) -> None:
+        if self.part is None:
+            return
+        found = re.fullmatch(r"([1-9]\d{0,5})/([1-9]\d{0,5})", self.part) if isinstance(self.part, str) else None
+        points = math.prod(map(len, self.axes.values()))
+        if found is None or not int(found[1]) <= int(found[2]) <= points:
+            raise refused(
+                "part", self.part, f"must be K/N with K at most N, and N at most {points}, the number of points"
+            )
+
+    def grains_of(self, size: int, replicas: int) -> Grains | None:
+        """The discs (replicas, size) that a flow is given; None where their diameters are uniform."""
+        if self.diameters is None:
+            return None
+        discs = own_grains(np.resize(self.diameters, size))
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (replicas, size)), discs)
+
+    def size_classes(self, replicas: int) -> Grains | None:
+        """Discs in the proportions of the given diameters, for kinetic theory; None where diameters are uniform."""
+        return None if self.diameters is None else self.grains_of(8 * len(self.diameters), replicas)
 
     def flows(self) -> list[ShearFlow]:
         """One flow for each point, in the order of ``axes``: the last one changes fastest."""
@@ -125,6 +175,8 @@ class MapSettings(MapParameters):
     def _checked_flows(self) -> list[ShearFlow]:
         """New flows for all points; InputError if a number is out of range."""
         points = list(product(self._timesteps, self.packing_fraction, self.restitution))
+        if self.timestep_by_point is not None:
+            points = [(dt, *point) for dt, (_, *point) in zip(self.timestep_by_point, points, strict=True)]
         if self.grains_by_point is None:
             numbers = [(grains, *point) for grains in self.sizes for point in points]
         else:
@@ -136,6 +188,7 @@ class MapSettings(MapParameters):
                 packing_fraction=nu,
                 timestep=dt,
                 activation=self.activation,
+                polydispersity=self.polydispersity,
             )
             for grains, dt, nu, alpha in numbers
         ]
@@ -166,10 +219,14 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     by_point = chosen["grains_by_point"]
     if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
         chosen["grains"] = max(by_point)
+    by_point = chosen["timestep_by_point"]
+    if isinstance(by_point, tuple) and by_point and _are_numbers(by_point) and chosen["timestep"] != "auto":
+        chosen["timestep"] = min(by_point)
     automatic = {name for name in _SAFE if isinstance(chosen[name], str) and chosen[name] == "auto"}
     if not automatic:
         return MapSettings(**chosen), ""
     checked = MapSettings(**{**chosen, **{name: _SAFE[name] for name in automatic}, "strain": None})
+    chosen |= {name: getattr(checked, name) for name in ("restitution", "packing_fraction", *BY_POINT)}
     target = _AUTOMATIC_ERROR if checked.error is None else SHARES["timestep"] * checked.error
     notes = []
     if "grains" in automatic:
@@ -181,15 +238,25 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
         notes.append(f"{sizes} grains, {checked.seeds} seed{'s' if checked.seeds > 1 else ''}")
     if "timestep" in automatic:
         flows = stack_of_any_size(replace(checked, timestep=_SAFE["timestep"], strain=1.0).flows())
-        steps = automatic_timestep(_temperature(flows), flows.packing_fraction, checked.activation, target)
-        least = int(np.argmin(steps))
-        chosen["timestep"] = float(two_digits(steps[least], up=False))
-        notes.append(f"timestep {chosen['timestep']:g} / shear rate, set by {_point(flows, least)}")
+        steps = automatic_timestep(_temperature(checked, flows), flows.packing_fraction, checked.activation, target)
+        if isinstance(chosen["strain"], int | float):
+            steps = np.minimum(steps, chosen["strain"] / _FEWEST_STEPS)
+        plane = len(checked.packing_fraction) * len(checked.restitution)  # the same for all numbers of grains
+        by_point = [float(two_digits(dt, up=False)) for dt in steps[:plane]]
+        chosen["timestep"] = min(by_point)
+        note = f"timestep {min(by_point):g}"
+        if checked.error is None and max(by_point) > min(by_point):  # with an error, so that force ratios compare
+            chosen["timestep_by_point"] = tuple(by_point)
+            note += f" to {max(by_point):g}"
+        notes.append(f"{note} / shear rate, the shortest at {_point(flows, int(np.argmin(steps)))}")
     if "tolerance" in automatic:
         chosen["tolerance"] = float(two_digits(automatic_tolerance(target), up=False))
         notes.append(f"tolerance {chosen['tolerance']:g}")
     aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
-    return MapSettings(**chosen), f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
+    sentence = f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
+    if chosen["timestep_by_point"] is not None:
+        sentence += " Force ratios at different time steps do not compare, and are not contoured."
+    return MapSettings(**chosen), sentence
 
 
 def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:
@@ -212,15 +279,19 @@ def _with_tolerance(solver: Any, tolerance: Any) -> Any:
 
 
 def _require_axis(name: str, values: Any) -> None:
-    """Raise an InputError unless these are sorted numbers."""
+    """Raise an InputError unless these are different numbers."""
     if not isinstance(values, tuple) or len(values) > MAX_REPLICAS:
         raise refused(name, values, f"must be a list of at most {MAX_REPLICAS} numbers")
     if len(values) == 0:
         raise refused(name, [], "must be a list of at least one number")
-    if not all(isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values):
+    if not _are_numbers(values):
         raise refused(name, values, "must be a list of numbers")
-    if len(set(values)) < len(values) or list(values) not in (sorted(values), sorted(values)[::-1]):
-        raise refused(name, list(values), "must be sorted and without repetition")
+    if len(set(values)) < len(values):
+        raise refused(name, list(values), "must be a list without repetition, in any order")
+
+
+def _are_numbers(values: tuple) -> bool:
+    return all(isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) for x in values)
 
 
 def _plain(value: Any, kind: Any) -> Any:
@@ -239,9 +310,9 @@ def _plain(value: Any, kind: Any) -> Any:
     return tuple(plain) if isinstance(plain, list) else plain
 
 
-def _temperature(flows: ShearFlow) -> np.ndarray:
+def _temperature(settings: MapSettings, flows: ShearFlow) -> np.ndarray:
     """Expected granular temperature of each flow, in mσ²/t²."""
-    theory = predicted(flows).granular_temperature
+    theory = predicted(flows, settings.size_classes(np.size(flows.restitution))).granular_temperature
     return expected_temperature(theory, flows.packing_fraction, flows.shear_rate)
 
 

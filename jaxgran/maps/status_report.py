@@ -2,7 +2,9 @@
 
 import math
 
-from jaxgran.maps.schema import MapData, parts
+import numpy as np
+
+from jaxgran.maps.schema import MapData, flattened, parts
 from jaxgran.model.status import MEANINGS
 from jaxgran.sampling.correlation_strain import FEWEST_CORRELATION_STRAINS
 
@@ -19,6 +21,9 @@ def bad_points(data: MapData) -> dict[str, list[str]]:
         zip(data.status.attrs["flag_values"].tolist(), data.status.attrs["flag_meanings"].split(), strict=True)
     )
     bad: dict[str, list[str]] = {}
+    if "part_points" in data.attrs:  # the other points are those of other parts
+        own = np.isin(np.arange(data.status.size), data.attrs["part_points"]).reshape(data.status.shape)
+        data = flattened(data).assign(status=data.status.where(own, 0).assign_attrs(data.status.attrs))
     for part in parts(data):
         which = f", {part.attrs['grains']} grains" if "grains" in data.dims else ""
         which += f", time step {part.attrs['timestep']:g}" if "timestep" in data.dims else ""

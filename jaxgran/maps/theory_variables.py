@@ -1,18 +1,25 @@
 """What kinetic theory predicts at the points of a map, and which of its assumptions fails there."""
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 
+import jax
 import numpy as np
 import xarray as xr
 
 from jaxgran.maps.points import PointGrid
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
-from jaxgran.sampling.observables import OBSERVABLES, STRESS_UNIT
+from jaxgran.model.grains import Grains
+from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
+from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.sample import Sample
 
-THEORY = ("granular_temperature", "pressure", "shear_stress", "collision_rate")  # predicted
+THEORY = ("granular_temperature", "pressure", "shear_stress", "dissipation_rate", "collision_rate")  # predicted
+LENGTHS = {
+    "correlation_length": "Enskog's dissipation rate over the measured one, at the local temperature",
+    "correlation_length_from_pressure": "the same quotient of the dissipation rates over the contact pressures",
+}
 _THEORY_NAME = "Enskog moments of an anisotropic Gaussian in each size class"
 _LARGEST = 1e12  # a prediction above it has no steady state
 
@@ -24,45 +31,51 @@ def theory_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -
     variable                      meaning
     ============================  ===================================================================================
     NAME                          prediction of kinetic theory, for the names in ``THEORY``
-    enskog_STRESS                 contact pressure and shear stress of Enskog's theory at the measured granular
-                                  temperature, with ``_stderr``
-    enskog_factor_STRESS_FACTOR   factors whose product times enskog_STRESS is contact_STRESS, see
+    enskog_RATE                   contact pressure, contact shear stress and dissipation rate of Enskog's theory at the
+                                  measured granular temperature, with ``_stderr``
+    enskog_factor_RATE_FACTOR     factors whose product times enskog_RATE is the measured rate, see
                                   ``sampling.enskog_factors``, with ``_stderr``
+    correlation_length,           L and L′ of ``sampling.enskog_factors``, with ``_stderr``
+    correlation_length_
+    from_pressure
     ============================  ===================================================================================
     """
     variables = {}
-    for name, values in _predictions(grid.batch).items():
+    for name, values in _predictions(grid.batch, grid.classes).items():
         long_name, units = OBSERVABLES[name]
         about = {"long_name": f"kinetic theory's prediction of the {long_name}", "units": units, "theory": _THEORY_NAME}
         variables[name] = grid.variable(values, about)
     return variables | _enskog_variables(grid, samples)
 
 
-def _predictions(flows: ShearFlow) -> dict[str, np.ndarray]:
+def _predictions(flows: ShearFlow, classes: Grains | None) -> dict[str, np.ndarray]:
     """Prediction of kinetic theory at every point; NaN where it has no steady state, as at α = 1."""
-    theory = kinetic_theory(flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity)
+    numbers = flows.restitution, flows.packing_fraction, flows.shear_rate, flows.polydispersity
+    theory = kinetic_theory(*numbers, classes)
     with np.errstate(invalid="ignore"):
         values = {name: getattr(theory, name) for name in THEORY}
         return {name: np.where(np.isfinite(x) & (x < _LARGEST), x, np.nan) for name, x in values.items()}
 
 
 def _enskog_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -> dict[str, xr.Variable]:
-    """Enskog's stresses, the factors between them and the measured ones, and their standard errors."""
+    """Enskog's rates, the factors between them and the measured ones, correlation lengths, and standard errors."""
     attrs = {
-        f"enskog_{stress}": (f"contact {words} of Enskog's theory at the measured granular temperature", STRESS_UNIT)
-        for stress, words in STRESSES.items()
+        f"enskog_{rate}": (f"{words} of Enskog's theory at the measured granular temperature", OBSERVABLES[rate][1])
+        for rate, words in RATES.items()
     }
-    for stress, words in STRESSES.items():
+    for rate, words in RATES.items():
         for factor, (measured, assumed) in FACTORS.items():
-            attrs[f"{stress}_{factor}"] = (f"contact {words} with {measured} over that with {assumed}", "1")
+            attrs[f"{rate}_{factor}"] = (f"{words} with {measured} over that with {assumed}", "1")
+    attrs |= {name: (words, "sigma") for name, words in LENGTHS.items()}
     values, stderrs = ({name: np.full(len(grid.flows), np.nan) for name in attrs} for _ in range(2))
     for point, seeds in samples.items():
-        value, stderr = stress_factors(grid.flows[point], seeds)
+        grains = None if grid.classes is None else jax.tree.map(itemgetter(point), grid.classes)
+        value, stderr = measured_over_enskog(grid.flows[point], seeds, grains)
         for name in attrs:
             values[name][point], stderrs[name][point] = value[name], stderr[name]
     variables = {}
     for name, (long_name, units) in attrs.items():
-        full = name if name.startswith("enskog_") else f"enskog_factor_{name}"
+        full = name if name.startswith("enskog_") or name in LENGTHS else f"enskog_factor_{name}"
         variables[full] = grid.variable(values[name], {"long_name": long_name, "units": units})
         about = {"long_name": f"standard error of {long_name}", "units": units}
         variables[f"{full}_stderr"] = grid.variable(stderrs[name], about)

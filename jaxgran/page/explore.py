@@ -16,7 +16,7 @@ def explore(data: MapData, output: str | Path | None = None) -> Page:
     A notebook shows the page if this call is the last line of a cell.
 
     Args:
-      data: dataset of a map, as ``ratio_map`` returns it and ``read_dataset`` reads it. Every number at its points is
+      data: dataset of a map, as ``ratio_map`` returns it and ``open_map`` reads it. Every number at its points is
         shown, also one that you have added.
       output: file to write the page to, or None.
 

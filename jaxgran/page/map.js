@@ -4,10 +4,11 @@
 const [sizes, timesteps, fractions, restitutions] = pageData.axes.map((axis) => axis.values);
 const observables = pageData.observables;
 const names = observables.map((one) => one.name);
-const first = Math.max(names.indexOf("force_ratio"), 0);
+const ratio = observables[names.indexOf("force_ratio")];
+const first = Math.max(names.indexOf("excess"), 0);
 const chosen = {
   observable: first, grains: sizes.length - 1, timestep: 0, row: fractions.length >> 1, column: restitutions.length >> 1,
-  quotient: false, log: false, excess: true, levels: 10,
+  quotient: false, log: names[first] === "excess" && observables[first].value.some((v) => v > 0), excess: true, levels: 10,
 };
 
 // Numbers of points: grains, time step, row of ν, column of α; a map without several sizes or time steps has one.
@@ -15,6 +16,7 @@ const pointAt = (row, column) => {
   const part = Math.max(chosen.grains, 0) * Math.max(timesteps.length, 1) + chosen.timestep;
   return (part * fractions.length + row) * restitutions.length + column;
 };
+const timestepAt = (point) => plain(pageData.timesteps?.[point] ?? timesteps[chosen.timestep]);
 const grainsAt = (point) => pageData.grains?.[point] ?? sizes[Math.max(chosen.grains, 0)];
 const overPlane = (what) => fractions.map((_, row) => restitutions.map((_, column) => what(pointAt(row, column), row, column)));
 const words = (status) => status.replace(/_/g, " ") + (pageData.meanings[status] ? `: ${pageData.meanings[status]}` : "");
@@ -28,14 +30,13 @@ function currentView() {
     const number = one[part][point];
     return quotient ? (shown(number) && one.theory[point] ? number / one.theory[point] : null) : number;
   };
-  const ratio = observables[first];
   return {
     x: restitutions.map((a) => Number((1 - a).toFixed(12))), y: fractions,
     value: overPlane(divided("value")),
     error: one.error ? overPlane(divided("error")) : null,
     theory: one.theory ? overPlane(divided("theory")) : null,
     status: overPlane((point) => pageData.status[point]),
-    excess: ratio.name === "force_ratio" ? overPlane((point) => (shown(ratio.value[point]) ? ratio.value[point] - 1 : null)) : null,
+    excess: ratio ? overPlane((point) => (shown(ratio.value[point]) ? ratio.value[point] - 1 : null)) : null,
     hover: (row, column) => hoverText(one, row, column),
     label: withUnit(one.name.replace(/_/g, " "), quotient ? "" : one.unit) + (quotient ? " / kinetic theory" : ""),
     row: chosen.row, column: chosen.column, log: chosen.log,
@@ -46,10 +47,10 @@ function hoverText(one, row, column) {
   const point = pointAt(row, column);
   const lines = [
     `α = ${plain(restitutions[column])}, ν = ${plain(fractions[row])}`,
-    `${one.name.replace(/_/g, " ")} = ${numberText(one.value[point])}${one.error ? ` ± ${numberText(one.error[point], 2)}` : ""} ${one.unit}`,
+    `${one.name.replace(/_/g, " ")} = ${withError(one.value[point], one.error?.[point]).filter(Boolean).join(" ± ")} ${one.unit}`,
   ];
   if (one.theory) lines.push(`kinetic theory ${numberText(one.theory[point])}`);
-  if (sizes.length) lines.push(`N = ${grainsAt(point)}${timesteps.length ? `, dt = ${plain(timesteps[chosen.timestep])}/γ̇` : ""}`);
+  if (sizes.length) lines.push(`N = ${grainsAt(point)}${timesteps.length ? `, dt = ${timestepAt(point)}/γ̇` : ""}`);
   if (one.samples) lines.push(`${numberText(one.samples[point], 3)} effective samples`);
   lines.push(`status ${pageData.status[point].replace(/_/g, " ")}`);
   return lines.map(escaped).join("<br>");
@@ -59,12 +60,12 @@ function hoverText(one, row, column) {
 
 function draw() {
   const view = currentView();
-  const excess = chosen.excess && view.excess ? pageData.excessLevels : null;
+  const excess = chosen.excess && view.excess && pageData.excessLevels.length ? pageData.excessLevels : null;
   Plotly.react("plane", planeTraces(view, chosen.levels, excess), planeLayout(view), chartOptions);
   const alpha = restitutions[chosen.column], nu = fractions[chosen.row];
   const column = fractions.map((_, row) => [row, chosen.column]), row = restitutions.map((_, k) => [chosen.row, k]);
   Plotly.react("against-nu", curveTraces(view, fractions, column, chosen.row), curveLayout(view, `α = ${alpha}`, "packing fraction ν"), chartOptions);
-  Plotly.react("against-alpha", curveTraces(view, restitutions, row, chosen.column), curveLayout(view, `ν = ${nu}`, "restitution α"), chartOptions);
+  Plotly.react("against-alpha", curveTraces(view, view.x, row, chosen.column), curveLayout(view, `ν = ${nu}`, "1 − α"), chartOptions);
   drawPoint(alpha, nu);
   showControls();
   keepAddress();
@@ -74,7 +75,7 @@ function drawPoint(alpha, nu) {
   const point = pointAt(chosen.row, chosen.column);
   const which = [`α = ${alpha}`, `ν = ${nu}`];
   if (sizes.length) which.push(`N = ${grainsAt(point)}`);
-  if (timesteps.length) which.push(`dt = ${plain(timesteps[chosen.timestep])}/γ̇`);
+  if (timesteps.length) which.push(`dt = ${timestepAt(point)}/γ̇`);
   element("which").textContent = which.join(", ");
   element("status").textContent = `Status ${words(pageData.status[point])}.`;
   element("status").classList.toggle("bad", pageData.status[point] !== "ok");
@@ -95,7 +96,7 @@ function commandAgain(point, alpha, nu) {
   if (!again || !sizes.length || !timesteps.length || !again.strain[point]) return "";
   const strain = Number((4 * again.strain[point]).toPrecision(3));
   return `jaxgran map --restitution ${alpha} --packing-fraction ${nu} --grains ${grainsAt(point)} --seeds ${again.seeds}` +
-    ` --timestep ${plain(timesteps[chosen.timestep])} --strain ${strain} ${again.options} --output point.nc`;
+    ` --timestep ${timestepAt(point)} --strain ${strain} ${again.options} --output point.nc`;
 }
 
 // ---------------------------------------------------------------------------------------------------- controls
@@ -127,7 +128,7 @@ function showControls() {
   for (const name of SWITCHES) element(`choose-${name}`).checked = chosen[name];
   element("choose-levels").value = chosen.levels;
   element("choose-quotient").disabled = !observables[chosen.observable].theory;
-  element("choose-excess").parentElement.hidden = observables[first].name !== "force_ratio";
+  element("choose-excess").parentElement.hidden = !ratio;
 }
 
 function chooseCell(cell) {
@@ -176,10 +177,10 @@ function startMap() {
   element("title").textContent = pageData.title;
   const belongs = [];
   if (sizes.length) belongs.push(pageData.grains ? `N chosen by point, up to ${sizes[0]}` : `N = ${sizes.join(", ")}`);
-  if (timesteps.length) belongs.push(`dt = ${timesteps.map(plain).join(", ")}/γ̇`);
+  if (timesteps.length) belongs.push(pageData.timesteps ? "dt chosen by point" : `dt = ${timesteps.map(plain).join(", ")}/γ̇`);
   if (pageData.about) belongs.push(pageData.about);
   element("about").textContent = `${belongs.join(", ")}. Error bars are one standard error of sampling. ` +
-    "Choose a point by a click, or with the arrow keys.";
+    `${ratio ? "The excess is the force ratio − 1. " : ""}Choose a point by a click, or with the arrow keys.`;
   element("notes").replaceChildren(...pageData.notes.map((note) => {
     const line = document.createElement("p");
     line.textContent = note;

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.parameters import options
-from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, require_map
+from jaxgran.maps.parameters import default, options
+from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, has_one_timestep, path_of, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
@@ -27,11 +27,13 @@ _AXES = {
     "packing_fraction": "packing fraction ν",
     "restitution": "restitution α",
 }
+_SEVERAL_TIMESTEPS = "Time steps differ between points. The force ratio depends on them: its values do not compare."
 _PLANE = ("packing_fraction", "restitution")
 _COMPANIONS = ("_stderr", "_ci95")
+_FIRST = ("force_ratio", "excess")  # the page opens with the second
 _GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
-_LEFT_OUT = ("status", "point_grains")
-_NAMED = {name: one.kind for name, one in options("map").items() if isinstance(one.kind, tuple)}  # choices of a run
+_LEFT_OUT = ("status", "point_grains", "point_timestep")
+_NAMED = {name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)}  # choices of a run
 
 
 def map_data(data: MapData) -> dict[str, Any]:
@@ -45,7 +47,8 @@ def map_data(data: MapData) -> dict[str, Any]:
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses
-    grains         the number of grains of each point, if it was chosen by point
+    grains,        the number of grains and the time step of each point, if they were chosen by point
+    timesteps
     instants       grains and forces of each point, see ``grain_data``
     again          what the command needs that measures a point again, if the map was made by this program
     about, notes   sentences: parameters of the map, and what is left out
@@ -57,7 +60,9 @@ def map_data(data: MapData) -> dict[str, Any]:
     data = require_map(data)
     data, notes = _thinned(data.sortby([name for name in _AXES if name in data.dims]))
     dims = [name for name in _AXES if name in data.dims]
+    data = _with_excess(data)
     names = [str(name) for name in data.data_vars if _is_shown(data, str(name))]
+    names.sort(key=lambda name: _FIRST.index(name) if name in _FIRST else len(_FIRST))
     observables = [one for name, label in _labels(names).items() for one in _observables(data, name, label, dims)]
     if not observables:
         raise InputError("data must be a ratio map, and it has no number at its points.")
@@ -67,14 +72,15 @@ def map_data(data: MapData) -> dict[str, Any]:
         "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
         "observables": observables,
         "status": _statuses(data, dims),
-        "grains": numbers(_column(data.point_grains, data, dims)) if "point_grains" in data else None,
+        "grains": _by_point(data, "point_grains", dims),
+        "timesteps": _by_point(data, "point_timestep", dims),
         "meanings": MEANINGS,
-        "excessLevels": list(EXCESS_LEVELS),
+        "excessLevels": list(EXCESS_LEVELS) if has_one_timestep(data) else [],
         "instants": instants,
         "encoding": ENCODING,
         "again": _again(data, dims),
         "about": _about(data),
-        "notes": notes + more,
+        "notes": notes + more + ([] if has_one_timestep(data) else [_SEVERAL_TIMESTEPS]),
     }
 
 
@@ -98,12 +104,21 @@ def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, list[str]]:
     return data, [f"The map has {points} points. This page shows a part of them: {shown} restitutions."]
 
 
+def _with_excess(data: xr.Dataset) -> xr.Dataset:
+    """The map with the excess, force ratio − 1, and the errors of the force ratio as its errors."""
+    if "force_ratio" not in data or "excess" in data:
+        return data
+    excess = (data.force_ratio - 1).assign_attrs(long_name="force ratio − 1", units="1")
+    errors = {f"excess{end}": data[f"force_ratio{end}"] for end in _COMPANIONS if f"force_ratio{end}" in data}
+    return data.assign({"excess": excess, **errors})
+
+
 def _is_shown(data: xr.Dataset, name: str) -> bool:
     """Whether a variable is a number at every point, and not part of another one."""
     variable = data[name]
     dims = set(variable.dims) - set(FINEST)
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
-    belongs |= name.startswith("theory/") and name.removeprefix("theory/") in data
+    belongs |= name.startswith("theory/") and path_of(name.removeprefix("theory/")) in data
     apart = name in _LEFT_OUT or name.startswith("snapshots/") or "flag_values" in variable.attrs
     return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES}) and not (belongs or apart)
 
@@ -111,7 +126,8 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
 def _observables(data: xr.Dataset, name: str, label: str, dims: list[str]) -> Iterator[dict[str, Any]]:
     """The entry of a variable, or those of its components."""
     about = data[name].attrs
-    parts = {"value": name, "error": f"{name}_stderr", "whole": f"{name}_ci95", "theory": f"theory/{name}"}
+    parts = {"value": name, "error": f"{name}_stderr", "whole": f"{name}_ci95"}
+    parts |= {"theory": f"theory/{label}"} if path_of(label) == name else {}
     samples = _effective_samples(data, label)
     for component, chosen in _components(data[name]).items():
         columns = {
@@ -202,7 +218,7 @@ def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | 
 
 
 def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
-    """Seeds, sampled strain of a seed at every point, and options; None if the file lacks them.
+    """Seeds, sampled strain of a seed at every point with a value, and options; None if the file lacks them.
 
     The reader pastes the command into a shell, so it contains only numbers and known names.
     """
@@ -216,12 +232,20 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
         chosen[name] = value
     try:
         chosen["tolerance"] = f"{float(data.attrs['tolerance']):g}"
+        sizes = "diameters" if "diameters" in data.attrs else "polydispersity"
+        if sizes in data.attrs and not np.array_equal(data.attrs[sizes], default(sizes)):
+            chosen[sizes] = ",".join(repr(float(x)) for x in np.ravel(data.attrs[sizes]))
         seeds = int(data.attrs["seeds"])
     except (TypeError, ValueError):
         return None
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
-    strain = _column(data["seeds/strain"].mean("seed"), data, dims)
+    strain = _column(data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims)
     return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
+
+
+def _by_point(data: xr.Dataset, name: str, dims: list[str]) -> list[float | None] | None:
+    """The numbers of grains or the time steps of all points, if they were chosen by point."""
+    return numbers(_column(data[name], data, dims)) if name in data else None
 
 
 def _about(data: xr.Dataset) -> str:

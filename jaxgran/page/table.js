@@ -6,7 +6,7 @@ const COLUMNS = ["observable", "value", "± error", "unit", "theory", "samples",
 function tableRows(observables, point) {
   return observables.map((one) => {
     const at = (part, digits) => (one[part] ? numberText(one[part][point], digits) : "");
-    return [one.name.replace(/_/g, " "), at("value"), at("error", 2), one.unit, at("theory"), at("samples", 3), at("whole", 2)];
+    return [one.name.replace(/_/g, " "), ...withError(one.value[point], one.error?.[point]), one.unit, at("theory"), at("samples", 3), at("whole", 2)];
   });
 }
 

@@ -186,9 +186,14 @@ def force_lines(
 
     They are repeated at each of the ``shifts`` (images, 2), lattice vectors that include zero.
     """
-    segments = np.stack([starts, starts + branches], axis=1)
-    images = (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
+    images = image_segments(starts, branches, shifts)
     return LineCollection(list(images), linewidths=np.tile(widths, len(shifts)), **style)
+
+
+def image_segments(starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """Return the ends (images · pairs, 2, 2) of lines from ``starts`` along ``branches``, at each of the ``shifts``."""
+    segments = np.stack([starts, starts + branches], axis=1)
+    return (segments[None] + shifts[:, None, None]).reshape(-1, 2, 2)
 
 
 # ------------------------------------------------------------------------------------- frame and text
@@ -270,7 +275,10 @@ def _run_description(attrs: dict) -> str:
         parts.append(f"$N={attrs['grains']}$")
     if attrs.get("seeds") is not None:
         parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
-    if np.ndim(attrs.get("timestep", ())) == 0:
+    if "timestep_by_point" in attrs:
+        limits = (scientific(float(limit(attrs["timestep_by_point"]))) for limit in (np.min, np.max))
+        parts.append(rf"$\mathrm{{d}}t={'$ to $'.join(limits)}/\dot{{\gamma}}$ by point")
+    elif np.ndim(attrs.get("timestep", ())) == 0:
         parts.append(rf"$\mathrm{{d}}t={scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
     if "activation" in attrs:
         parts.append(f"{attrs['activation']} activation")

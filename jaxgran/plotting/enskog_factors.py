@@ -1,4 +1,4 @@
-"""The figure that says which assumption of kinetic theory fails where: four factors in the plane of 1 − α and ν."""
+"""The figure that says which assumption of kinetic theory fails where: its factors in the plane of 1 − α and ν."""
 
 from __future__ import annotations
 
@@ -24,24 +24,36 @@ from jaxgran.plotting.drawing import (
 )
 from jaxgran.plotting.interpolation import left_out_note
 from jaxgran.plotting.theory import draw_errors, noise_keys
+from jaxgran.sampling.enskog_factors import RATES
 
 PANELS = {
-    "anisotropy": "(a) anisotropy of the temperature",
-    "chaos": "(b) chaos: squared speed of approach",
-    "pairs": "(c) pair correlation at contact",
-    "binary": "(d) binary assumption",
+    "local_temperature": "(a) local temperature",
+    "anisotropy": "(b) anisotropy",
+    "chaos": "(c) chaos: speed of approach",
+    "pairs": "(d) pairs at contact",
+    "binary": "(e) binary assumption",
 }
 """Factors of the map and the titles of their panels."""
 
-_NOTE = (
-    "Contact {}: measured = Enskog × (a) × (b) × (c) × (d). "
-    "Black contours: factor, or less one in % (dashed where negative)"
+LENGTH_PANEL = r"(f) correlation length $L'/\sigma$"
+"""Title of the last panel."""
+
+_NOTES = (
+    "{}: measured = Enskog × (a) × (b) × (c) × (d) × (e); (f) ratio of dissipation to pressure, Enskog over measured",
+    "Black contours: factor or length, or less one in % (dashed where negative)",
 )
+_LENGTH = "theory/correlation_length_from_pressure"
 
 
-def _needed(stress: str) -> list[str]:
-    """Return the names of the variables that :func:`enskog_factors` draws."""
-    return [f"theory/enskog_factor_{stress}_{factor}{end}" for factor in PANELS for end in ("", "_stderr")]
+def _drawn(rate: str) -> dict[str, str]:
+    """Return the names of the variables that :func:`enskog_factors` draws, and the titles of their panels."""
+    factors = {f"theory/enskog_factor_{rate}_{factor}": title for factor, title in PANELS.items()}
+    return factors | {_LENGTH: LENGTH_PANEL}
+
+
+def _needed(rate: str) -> list[str]:
+    """Return these names with those of the standard errors."""
+    return [f"{name}{end}" for name in _drawn(rate) for end in ("", "_stderr")]
 
 
 def has_factors(data: xr.Dataset) -> bool:
@@ -49,30 +61,31 @@ def has_factors(data: xr.Dataset) -> bool:
     return not what_lacks(data, *RATIO, *_needed("pressure"))
 
 
-def enskog_factors(data: MapData, stress: Literal["pressure", "shear_stress"] = "pressure") -> Figure:
-    """Return the four factors by which a measured contact stress differs from Enskog's, in the plane of 1 − α and ν.
+def enskog_factors(data: MapData, rate: Literal["pressure", "shear_stress", "dissipation_rate"] = "pressure") -> Figure:
+    """Return the factors by which a contact stress or the dissipation rate differs from Enskog's, in the plane.
 
-    Each factor is a stress with one more assumption replaced by what was measured, over the stress before:
-    see ``jaxgran.sampling.enskog_factors``. Black contours have it as their label; they are dashed where it is below
-    one. In dotted areas it differs from one by less than its standard error. Green contours show the excess of the
-    force ratio.
+    Each factor is the rate with one more assumption replaced by what was measured, over the rate before; the last panel
+    is the correlation length L′: see ``jaxgran.sampling.enskog_factors``. The axes are 1 − α and ν. Black contours have
+    the factor as their label; they are dashed where it is below one. In dotted areas it differs from one by less than
+    its standard error. Green contours show the excess of the force ratio.
 
     Args:
-      data: a map with `theory/enskog_factor_...` of the stress and `force_ratio`, with `_stderr`, and `status`.
-      stress: "pressure" or "shear_stress".
+      data: a map with `theory/enskog_factor_...` of the rate, `theory/correlation_length_from_pressure` and
+        `force_ratio`, with `_stderr`, and `status`.
+      rate: "pressure" or "shear_stress" of the contacts, or "dissipation_rate".
 
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
-    data = require_map(data, *RATIO, *_needed(stress))
+    data = require_map(data, *RATIO, *_needed(rate))
     require_plane(data)
-    data = finest(ordered(data, *_needed(stress)))
-    figure = empty_figure(width=7.4, height=6.8)
-    grid = figure.subplots(2, 2, sharex=True, sharey=True)
-    measured = np.isfinite(data[f"theory/enskog_factor_{stress}_pairs"].values)
+    data = finest(ordered(data, *_needed(rate)))
+    figure = empty_figure(width=7.6, height=5.9)
+    grid = figure.subplots(2, 3, sharex=True, sharey=True)
+    measured = np.isfinite(data[f"theory/enskog_factor_{rate}_pairs"].values)
     fields, noisy, over = [], False, []
-    for axes, (factor, title) in zip(grid.flat, PANELS.items(), strict=True):
-        value, error = (data[f"theory/enskog_factor_{stress}_{factor}{end}"].values for end in ("", "_stderr"))
+    for axes, (name, title) in zip(grid.flat, _drawn(rate).items(), strict=True):
+        value, error = (data[f"{name}{end}"].values for end in ("", "_stderr"))
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(value > 0, np.log(value), np.nan)
             noisy |= draw_errors(axes, data, logarithm, error / value)
@@ -84,7 +97,7 @@ def enskog_factors(data: MapData, stress: Literal["pressure", "shear_stress"] = 
     for axes in grid[:, 0]:
         axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
-    note = _NOTE.format(stress.replace("_", " "))
+    notes = [note.format(RATES[rate].capitalize()) for note in _NOTES]
     found = left_out_note(data, fields, "each factor")
-    finish(figure, data, measured, [note, found, status_note(data), missing_note(measured, " (hatched)")])
+    finish(figure, data, measured, [*notes, found, status_note(data), missing_note(measured, " (hatched)")])
     return figure

@@ -9,6 +9,7 @@ from matplotlib.lines import Line2D
 
 from jaxgran.maps.schema import RATIO, MapData, finest, relative_ci95, require_map, what_lacks
 from jaxgran.plotting.drawing import (
+    ALPHA_LABEL,
     LABEL_SIZE,
     NU_LABEL,
     PANEL_TITLE,
@@ -56,7 +57,7 @@ def dominating_errors(data: MapData) -> Figure:
     """
     data = require_map(data, *RATIO, *_NEEDED)
     data = finest(ordered(data, *_NEEDED))
-    alpha, nu = np.meshgrid(data.restitution.values, data.packing_fraction.values)
+    x, y = np.meshgrid(1 - data.restitution.values, data.packing_fraction.values)
     figure = empty_figure(width=3.4 * len(_PANELS) + 0.6, height=4.6)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)
     for axes, (name, title) in zip(panels, _PANELS.items(), strict=True):
@@ -68,16 +69,16 @@ def dominating_errors(data: MapData) -> Figure:
         area = _LEAST + (_LARGEST - _LEAST) * np.clip(whole / 0.3, 0, 1)
         for k, (_, mark) in enumerate(_PARTS.values()):
             here = known & (largest == k)
-            axes.scatter(alpha[here], nu[here], area[here], "white", marker=mark, edgecolors="black", linewidths=1)
+            axes.scatter(x[here], y[here], area[here], "white", marker=mark, edgecolors="black", linewidths=1)
         if whole.size <= 60:
-            for x, y, error in zip(alpha[known], nu[known], whole[known], strict=True):
+            for *place, error in zip(x[known], y[known], whole[known], strict=True):
                 text = f"{100 * error:.2g}"
-                axes.annotate(text, (x, y), (0, -9), textcoords="offset points", ha="center", va="top", fontsize=6)
+                axes.annotate(text, place, (0, -9), textcoords="offset points", ha="center", va="top", fontsize=6)
         if known.any():
             median, worst = np.median(whole[known]), whole[known].max()
             title += f"\n{100 * median:.2g} % (median), {100 * worst:.2g} % (largest)"
         axes.set_title(title, **PANEL_TITLE)
-        axes.set_xlabel(r"restitution $\alpha$", fontsize=LABEL_SIZE)
+        axes.set_xlabel(ALPHA_LABEL, fontsize=LABEL_SIZE)
         axes.margins(0.12, 0.14)
     panels[0].set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     handles = [

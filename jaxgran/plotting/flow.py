@@ -11,19 +11,19 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import EllipseCollection
+from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
+from matplotlib.text import Annotation, Text
 
 from jaxgran.analysis.force_chains import pair_forces
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.model.cell import centred, minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, force_lines, scientific
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, image_segments, scientific
 from jaxgran.plotting.encoding import (
     BINARY_COLOUR,
     CLUSTER_COLOUR,
@@ -52,6 +52,7 @@ _LEGEND: dict[str, Any] = {
     "columnspacing": 1.4,
 }
 _LATTICE = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]  # the cell and its eight neighbours
+_LINE_MARGIN = 0.05  # in sides of the cell, at least half of the width of a line
 
 
 class Scene(NamedTuple):
@@ -160,58 +161,101 @@ def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
     return Scale(deepest(values), widest(forces))
 
 
-def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None) -> None:
+class Artists(NamedTuple):
+    """What differs from frame to frame in a picture, in the order in which it is drawn."""
+
+    grains: EllipseCollection
+    clusters: LineCollection
+    binaries: LineCollection
+    cell: Polygon
+    scale_bar: Line2D
+    scale_label: Annotation
+    title: Text
+
+
+def draw_picture(axes: Axes, scene: Scene, colour: Colour, scale: Scale, strain: float | None = None) -> Artists:
     """Draw a scene with its title, colour bar and legend."""
-    grains = draw_scene(axes, scene, colour, scale)
-    axes.set_title(title_of(scene, strain), fontsize=LABEL_SIZE)
+    artists = draw_scene(axes, scene, colour, scale)
+    artists.title.set_text(title_of(scene, strain))
     bar_axes = axes.inset_axes((1.02, 0.25, 0.022, 0.7))
-    bar = axes.figure.colorbar(grains, cax=bar_axes, extend="max")
+    bar = axes.figure.colorbar(artists.grains, cax=bar_axes, extend="max")
     bar.set_label(COLOUR_LABELS[colour], fontsize=TICK_SIZE)
     bar.ax.tick_params(labelsize=SMALL_SIZE)
     axes.legend(handles=force_key(scale), loc="upper left", bbox_to_anchor=(0.0, 0.0), **_LEGEND)
+    return artists
 
 
-def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> ScalarMappable:
+def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artists:
     """Draw grains, forces, the cell and a scale bar.
 
     Parts that reach over an edge of the cell are cut and drawn at the opposite edge.
     """
+    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
+    half_width = 0.505 * scene.side * (1 + abs(scene.tilt))
+    low, high = -0.6 * scene.side, 0.505 * scene.side
+    axes.set(xlim=(-half_width, half_width), ylim=(low, high), aspect="equal")
+    axes.set_axis_off()
+    (scale_bar,) = axes.plot([0, length], [0, 0], color="black", linewidth=1.6, solid_capstyle="butt")
+    artists = Artists(
+        grains=EllipseCollection(
+            (),
+            (),
+            (),
+            units="xy",
+            offsets=np.zeros((0, 2)),
+            offset_transform=axes.transData,
+            cmap=COLOURS[colour],
+            norm=Normalize(0, scale.colour),
+            edgecolor=GRAIN_EDGE,
+            linewidth=0.4,
+            zorder=1,
+        ),
+        clusters=LineCollection([], zorder=2, **_CLUSTER),
+        binaries=LineCollection([], zorder=3, **_BINARY),
+        cell=Polygon(np.zeros((4, 2)), closed=True, facecolor="none", edgecolor="#404040", linewidth=0.9, zorder=4),
+        scale_bar=scale_bar,
+        scale_label=axes.annotate(
+            rf"{length} $\sigma$", (0, 0), (4, 0), textcoords="offset points", va="center", fontsize=TICK_SIZE
+        ),
+        title=axes.set_title("", fontsize=LABEL_SIZE),
+    )
+    axes.add_patch(artists.cell)
+    for artist in (artists.grains, artists.clusters, artists.binaries):
+        axes.add_collection(artist, autolim=False)
+    show_scene(artists, scene, colour, scale)
+    return artists
+
+
+def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> None:
+    """Show another scene of a cell of the same side by artists that are there."""
     corners = scene.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners[:, 0] += scene.tilt * corners[:, 1]
-    cell = Polygon(corners, closed=True, facecolor="none", edgecolor="#404040", linewidth=0.9, zorder=4)
-    axes.add_patch(cell)
+    artists.cell.set_xy(corners)
     which, places = _images(scene)
-    grains = EllipseCollection(
-        2 * scene.radii[which],
-        2 * scene.radii[which],
-        np.zeros(which.size),
-        units="xy",
-        offsets=places,
-        offset_transform=axes.transData,
-        array=getattr(scene, colour)[which],
-        cmap=COLOURS[colour],
-        norm=Normalize(0, scale.colour),
-        edgecolor=GRAIN_EDGE,
-        linewidth=0.4,
-        zorder=1,
-    )
+    diameters = 2 * scene.radii[which]
+    artists.grains.set(widths=diameters, heights=diameters, angles=np.zeros(which.size), offsets=places)
+    artists.grains.set_array(getattr(scene, colour)[which])
+    segments, pairs = _segments(scene)
+    widths = np.clip(WIDEST_LINE * scene.force / scale.force, THINNEST_LINE, WIDEST_LINE)
+    for lines, chosen in ((artists.clusters, scene.clustered[pairs]), (artists.binaries, ~scene.clustered[pairs])):
+        lines.set_segments(list(segments[chosen]))
+        lines.set(linewidths=widths[pairs[chosen]])
+    for artist in (artists.grains, artists.clusters, artists.binaries):
+        artist.set_clip_path(artists.cell)
+    start, length = -0.5 * scene.side * (1 + scene.tilt), np.ptp(artists.scale_bar.get_xdata())
+    low = -0.57 * scene.side
+    artists.scale_bar.set_data([start, start + length], [low, low])
+    artists.scale_label.xy = (start + length, low)
+
+
+def _segments(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and indices of the pairs."""
     shifts = scene.side * np.array([(a + scene.tilt * b, b) for a, b in _LATTICE])
-    lines = [
-        force_lines(
-            scene.starts[chosen],
-            scene.branches[chosen],
-            shifts,
-            np.clip(WIDEST_LINE * scene.force[chosen] / scale.force, THINNEST_LINE, WIDEST_LINE),
-            zorder=order,
-            **style,
-        )
-        for chosen, style, order in ((scene.clustered, _CLUSTER, 2), (~scene.clustered, _BINARY, 3))
-    ]
-    for artist in (grains, *lines):
-        axes.add_collection(artist, autolim=False)
-        artist.set_clip_path(cell)
-    _frame(axes, scene)
-    return grains
+    ends = image_segments(scene.starts, scene.branches, shifts)
+    along, up = ends[..., 0] - scene.tilt * ends[..., 1], ends[..., 1]
+    reach = (0.5 + _LINE_MARGIN) * scene.side
+    inside = np.all([(x.min(axis=-1) < reach) & (x.max(axis=-1) > -reach) for x in (along, up)], axis=0)
+    return ends[inside], np.tile(np.arange(len(scene.force)), len(shifts))[inside]
 
 
 def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -226,26 +270,6 @@ def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     inside = (abs(x) <= scene.side / 2 + reach) & (abs(y) <= scene.side / 2 + scene.radii[:, None])
     which, image = np.nonzero(inside)
     return which, places[which, image]
-
-
-def _frame(axes: Axes, scene: Scene) -> None:
-    """Set limits around the cell, hide the axes and draw a scale bar."""
-    half = scene.side / 2
-    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
-    low = -half - 0.07 * scene.side
-    half_width = 1.01 * half * (1 + abs(scene.tilt))
-    axes.set(xlim=(-half_width, half_width), ylim=(low - 0.03 * scene.side, half * 1.01), aspect="equal")
-    axes.set_axis_off()
-    start = -half * (1 + scene.tilt)
-    axes.plot([start, start + length], [low, low], color="black", linewidth=1.6, solid_capstyle="butt")
-    axes.annotate(
-        rf"{length} $\sigma$",
-        (start + length, low),
-        (4, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=TICK_SIZE,
-    )
 
 
 def force_key(scale: Scale) -> Sequence[Line2D]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, get_args
 
-from jaxgran.maps.schema import RATIO, MapData, require_map
+from jaxgran.maps.schema import RATIO, MapData, has_one_timestep, require_map
 from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
@@ -28,7 +28,7 @@ def save_figures(
     file                    written if the map has
     ======================= ==================================================================
     `{stem}_curves.png`     always
-    `{stem}_contours.png`   at least two restitutions and two packing fractions
+    `{stem}_contours.png`   at least two restitutions, two packing fractions, and one time step for all points
     `{stem}_timestep.png`   at least two time steps
     `{stem}_size.png`       at least two numbers of grains
     `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
@@ -53,7 +53,7 @@ def save_figures(
     stem = writable_stem(stem)
     figures = {
         "curves": (True, ratio_curves),
-        "contours": (is_plane(data), ratio_contours),
+        "contours": (is_plane(data) and has_one_timestep(data), ratio_contours),
         "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
         "size": (data.sizes.get("grains", 1) >= 2, averages_against_grains),
         "theory": (is_plane(data) and has_theory(data), theory_errors),

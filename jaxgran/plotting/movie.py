@@ -21,7 +21,7 @@ from jaxgran.io.atomic import require_place
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.plotting.drawing import empty_figure
 from jaxgran.plotting.encoding import BINARY_COLOUR
-from jaxgran.plotting.flow import COLOURS, common_scale, draw_picture, scene_of
+from jaxgran.plotting.flow import COLOURS, common_scale, draw_picture, scene_of, show_scene, title_of
 
 MOST_DRAWN = 500  # frames of a movie, which are held in memory while it is written
 _WIDTH = 5.6  # inches
@@ -82,36 +82,42 @@ def write_movie(path: Path, frames: Frames, follow: _Follow = iter) -> None:
     figure = empty_figure(_WIDTH, _HEIGHT)
     figure.set_layout_engine("none")  # a fixed layout, so that only the flow moves
     figure.set_dpi(_DPI)
-    drawings = _drawings(figure, frames, follow)
     with atomic_write(path) as temporary:
         if path.suffix == ".gif":
             palette = _palette()
             nearest = _nearest(palette)
-            first, *others = [_picture(figure, palette, nearest) for _ in drawings]
+            first, *others = [_picture(pixels, palette, nearest) for pixels in _drawings(figure, frames, follow)]
             first.save(temporary, save_all=True, append_images=others, duration=1000 // _FRAMES_PER_SECOND, loop=0)
         else:
             writer = FFMpegWriter(_FRAMES_PER_SECOND)
             with writer.saving(figure, str(temporary), _DPI):
-                for _ in drawings:
+                for _ in _drawings(figure, frames, follow):
                     writer.grab_frame()
 
 
-def _drawings(figure: Figure, frames: Frames, follow: _Follow) -> Iterator[None]:
-    """Draw the frames one after the other in the same figure; yields after each."""
+def _drawings(figure: Figure, frames: Frames, follow: _Follow) -> Iterator[np.ndarray]:
+    """The pixels of each frame, (height, width, 4); what moves is drawn over what does not."""
     scale = common_scale(frames.scenes, "speed")
-    for scene, strain in follow(list(zip(frames.scenes, frames.strains, strict=True))):
-        figure.clear()
-        axes = figure.add_axes(_AXES_PLACE)
-        draw_picture(axes, scene, "speed", scale, strain)
-        axes.set_xlim(-_HALF_WIDTH * scene.side, _HALF_WIDTH * scene.side)
-        yield
-
-
-def _picture(figure: Figure, palette: np.ndarray, nearest: np.ndarray) -> Image.Image:
-    """The figure as an image, in the colours of a palette."""
-    canvas = FigureCanvasAgg(figure)
+    first, canvas = frames.scenes[0], FigureCanvasAgg(figure)
+    axes = figure.add_axes(_AXES_PLACE)
+    artists = draw_picture(axes, first, "speed", scale, frames.strains[0])
+    axes.set_xlim(-_HALF_WIDTH * first.side, _HALF_WIDTH * first.side)
+    for artist in artists:
+        artist.set_animated(True)
     canvas.draw()
-    red, green, blue = np.moveaxis(np.asarray(canvas.buffer_rgba())[..., :3] >> 2, -1, 0)
+    at_rest = canvas.copy_from_bbox(figure.bbox)
+    for scene, strain in follow(list(zip(frames.scenes, frames.strains, strict=True))):
+        show_scene(artists, scene, "speed", scale)
+        artists.title.set_text(title_of(scene, strain))
+        canvas.restore_region(at_rest)
+        for artist in artists:
+            axes.draw_artist(artist)
+        yield np.asarray(canvas.buffer_rgba())
+
+
+def _picture(pixels: np.ndarray, palette: np.ndarray, nearest: np.ndarray) -> Image.Image:
+    """A frame as an image, in the colours of a palette."""
+    red, green, blue = np.moveaxis(pixels[..., :3] >> 2, -1, 0)
     picture = Image.fromarray(nearest[red, green, blue])
     picture.putpalette(palette.tobytes())
     return picture

@@ -22,7 +22,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from jaxgran.maps.schema import RATIO, MapData, finest, require_map, shear_stress_ratio, what_lacks
+from jaxgran.maps.schema import (
+    RATIO,
+    MapData,
+    finest,
+    has_one_timestep,
+    require_map,
+    require_one_timestep,
+    shear_stress_ratio,
+    what_lacks,
+)
 from jaxgran.model.checks import InputError
 from jaxgran.plotting.contours import (
     EXCESS_LEVELS,
@@ -74,7 +83,7 @@ def ratio_curves(data: MapData) -> Figure:
 
     Returns:
       Two panels with one scale, or one where the map has no `stress_ratio`. Error bars are one standard error; a point
-      whose status is not `ok` is an open symbol in a ring.
+      whose status is not `ok` is an open symbol in a ring. Points are not joined if their time steps differ.
 
     Raises:
       InputError: (a ValueError) the data are not a map.
@@ -87,11 +96,12 @@ def ratio_curves(data: MapData) -> Figure:
     figure = empty_figure(width=2.3 + 2.7 * len(labels), height=3.5)
     grid = figure.subplots(1, len(labels), sharey=True, squeeze=False)[0]
     handles: list[Line2D] = []
+    joined = {} if has_one_timestep(data) else {"linestyle": "none"}
     for axes, (name, label) in zip(grid, labels.items(), strict=True):
         axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
         styles = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
         handles = [
-            _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}", name)
+            _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style | joined, f"{value:.4g}", name)
             for value, style in styles
         ]
         axes.set_xlim(padded(data.packing_fraction.values))
@@ -102,7 +112,8 @@ def ratio_curves(data: MapData) -> Figure:
     _set_ratio_scale(grid[0], np.concatenate([data[name].values for name in labels]))
     add_curve_legend(figure, data, handles, ALPHA_TITLE)
     measured = np.isfinite(data.force_ratio.values)
-    finish(figure, data, measured, [status_note(data), missing_note(measured)])
+    compare = "Time steps differ between points, and both ratios depend on them: they do not compare" if joined else ""
+    finish(figure, data, measured, [compare, status_note(data), missing_note(measured)])
     return figure
 
 
@@ -122,10 +133,12 @@ def ratio_contours(data: MapData) -> Figure:
       The levels of `EXCESS_LEVELS` that the map reaches, labelled; the others are named under the axes.
 
     Raises:
-      InputError: (a ValueError) fewer than two restitutions or two packing fractions.
+      InputError: (a ValueError) fewer than two restitutions or two packing fractions, or time steps that were chosen
+        by point.
     """
     data = require_map(data, *RATIO)
     require_plane(data)
+    require_one_timestep(data, "a contour of the force ratio")
     data = finest(ordered(data))
     x, y = refined_axes(data)
     excess, stderr = data.force_ratio.values - 1.0, data.force_ratio_stderr.values

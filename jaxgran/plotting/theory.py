@@ -241,6 +241,7 @@ def cluster_shares(data: MapData) -> Figure:
 def _draw_shares(axes: Axes, data: xr.Dataset, name: str) -> None:
     """Draw a share against the excess: a line for each restitution, a symbol for each packing fraction."""
     axes.set_xscale("log")
+    axes.set_xlim(_LEAST_EXCESS, 1.0)  # the range of a map without a positive excess
     styles, symbols = (curve_styles(data.sizes[name]) for name in ("restitution", "packing_fraction"))
     excess, share, bad = data.force_ratio.values - 1.0, data[name].values, suspect(data)
     x_error, y_error = data.force_ratio_stderr.values, data[f"{name}_stderr"].values

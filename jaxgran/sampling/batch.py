@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, PartitionSpec
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxgran.cache.persistent_jit import persistent_jit
@@ -31,7 +32,7 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.sampling.observe import Observable, advance_and_observe
 
-Report = Callable[[float], None]  # called with the replica-steps done since the last call
+Report = Callable[[ArrayLike, ArrayLike], None]  # called with time step and number of steps of each replica
 # Advances each replica by its number of steps, and a wrapper that adds reports or records and leaves the states alone.
 AdvanceBatch = Callable[[ShearFlow, Numerics, State, Array], tuple[State, Tally]]
 AdvanceWrapper = Callable[[AdvanceBatch], AdvanceBatch]
@@ -211,16 +212,14 @@ def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, step
     return jax.tree.map(lambda *x: np.concatenate(x), *(shares[k] for k in sorted(shares)))
 
 
-def reporting(drive: ObserveBatch, report: Report | None) -> ObserveBatch:
-    """The same advance with a report of the replica-steps after each call; unchanged without ``report``."""
-    if report is None:
-        return drive
+def reporting(drive: ObserveBatch, report: Report) -> ObserveBatch:
+    """The same advance with a report after each call."""
 
     def driven(
         flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
     ) -> tuple[State, Tally]:
         state, tally = drive(flow, numerics, state, steps, observe)
-        report(float(np.sum(tally.steps)))
+        report(flow.timestep, tally.steps)
         return state, tally
 
     return driven

@@ -8,6 +8,7 @@ A homogeneous gas follows Haff's law, T = T₀/(1 + t/τ)². In collisions per g
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -22,8 +23,9 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
-from jaxgran.dynamics.replicas import batch_of, over_replicas, replicas_to_check
+from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import Tally
+from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, as_array, is_traced, require, two_digits
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.flow import ShearFlow
@@ -52,6 +54,8 @@ class Cooling:
     temperature: Float[Array, "*b times"]
     collisions: Float[Array, "*b times"]
     tally: Tally
+
+    __eq__ = equal_values
 
     @property
     def status(self) -> Int[Array, "*b"]:
@@ -94,21 +98,18 @@ def cooling(
         than a tenth of its diameter in one step, positions cannot resolve a step, or the engine cannot do this.
     """
     numerics = checked_numerics(solver, engine)
-    batch = batch_of(flow, state)
-    if batch is None:
-        return waited(_cooling(flow, numerics, state, _require_cooling(times, flow, state)))
-    same_times = [_require_cooling(times, *one) for one in replicas_to_check(batch)]
-    return waited(_cooling_replicas(numerics, *batch, same_times[0]))
+    batch = checked_batch(partial(_require_cooling, times), flow, state)
+    at = times if isinstance(times, Tracer) else jnp.asarray(np.asarray(times, float))
+    return waited(_cooling_replicas(numerics, *batch, at) if batch else _cooling(flow, numerics, state, at))
 
 
-def _require_cooling(times: ArrayLike, flow: ShearFlow, state: State) -> Array:
-    """The times as an array; InputError unless the state can cool at them."""
+def _require_cooling(times: ArrayLike, flow: ShearFlow, state: State) -> None:
+    """Raise an InputError unless the state can cool at these times."""
     require_state(flow, state)
     require("shear_rate", flow.shear_rate, lambda x: x == 0, "0 in free cooling")
-    found = _require_times(flow, times)
+    _require_times(flow, times)
     _require_slow(flow, state)
     require_match(flow, state)
-    return found
 
 
 @jax.jit
@@ -136,10 +137,10 @@ def _temperature(state: State) -> Float[Array, ""]:
     return jnp.sum(state.grains.masses[:, None] * state.velocities**2) / (2 * state.grains.masses.size)
 
 
-def _require_times(flow: ShearFlow, times: Any) -> Array:
-    """The times as an array; InputError unless they are positive and increase by a time step or more."""
+def _require_times(flow: ShearFlow, times: Any) -> None:
+    """Raise an InputError unless the times are positive and increase by a time step or more; traced ones pass."""
     if isinstance(times, Tracer):
-        return times
+        return
     values = as_array(times)
     words = "a list of positive times that increase"
     require("times", values, lambda x: (x.ndim == 1) & (x > 0) & np.isfinite(x), words)
@@ -151,7 +152,6 @@ def _require_times(flow: ShearFlow, times: Any) -> Array:
             raise InputError(f"times must increase by a time step, {step:g}, or more.")
         if np.any(gaps > MAX_STEPS):
             raise InputError(f"times must be at most {MAX_STEPS} time steps, {MAX_STEPS * step:g}, apart.")
-    return jnp.asarray(values)
 
 
 def _require_slow(flow: ShearFlow, state: State) -> None:

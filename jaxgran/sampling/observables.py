@@ -1,6 +1,6 @@
 """Observables: the averages computed from a tally, with their names and units."""
 
-from typing import Any
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,8 @@ OBSERVABLES: dict[str, tuple[str, str]] = {
     "longwave_energy_ratio": ("kinetic energy of the four longest waves of velocity over that of equipartition", "1"),
     "bagnold_pressure": ("pressure over mass of a mean grain times squared shear rate", "1"),
     "bagnold_shear_stress": ("shear stress over mass of a mean grain times squared shear rate", "1"),
+    "dissipation_rate": ("energy that contacts lose per unit area and time", "m / t^3"),
+    "binary_dissipation_rate": ("energy that contacts would lose if collisions were binary", "m / t^3"),
     "cluster_pressure_share": ("share of the contact pressure in clusters of three or more grains", "1"),
     "cluster_shear_share": ("share of the contact shear stress in clusters of three or more grains", "1"),
     "coordination_number": ("contacts per grain that carry an impulse (twice their number over the grains)", "1"),
@@ -61,6 +63,71 @@ EXTREME_OBSERVABLES = {
     "momentum_drift": "momentum_drift",
 }
 TENSORS = ("contact_stress", "binary_stress", "kinetic_stress", "stress_ratio")
+
+
+class Average:
+    """An average of a sample as an attribute, by the name of an observable."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name, self.__doc__ = name, "{}, unit {}".format(*OBSERVABLES[name])
+
+    @overload
+    def __get__(self, sample: None, owner: type) -> "Average": ...
+
+    @overload
+    def __get__(self, sample: "Averages", owner: type) -> Array | np.ndarray: ...
+
+    def __get__(self, sample: Any, owner: type) -> Any:
+        return self if sample is None else sample.averages[self.name]
+
+
+class Averages:
+    """Every observable as an attribute, from the mapping ``averages``; editors know the names."""
+
+    force_ratio = Average()
+    contact_force = Average()
+    binary_force = Average()
+    force_second_moment = Average()
+    pressure = Average()
+    contact_pressure = Average()
+    binary_pressure = Average()
+    kinetic_pressure = Average()
+    shear_stress = Average()
+    contact_shear_stress = Average()
+    binary_shear_stress = Average()
+    kinetic_shear_stress = Average()
+    granular_temperature = Average()
+    local_granular_temperature = Average()
+    longwave_energy_ratio = Average()
+    bagnold_pressure = Average()
+    bagnold_shear_stress = Average()
+    dissipation_rate = Average()
+    binary_dissipation_rate = Average()
+    cluster_pressure_share = Average()
+    cluster_shear_share = Average()
+    coordination_number = Average()
+    network_size = Average()
+    macroscopic_friction = Average()
+    inertial_number = Average()
+    collision_rate = Average()
+    iterations = Average()
+    median_residual = Average()
+    worst_residual = Average()
+    unconverged_share = Average()
+    mean_overlap = Average()
+    max_overlap = Average()
+    momentum_drift = Average()
+    energy_balance_error = Average()
+    complementarity_power = Average()
+    contact_stress = Average()
+    binary_stress = Average()
+    kinetic_stress = Average()
+    stress_ratio = Average()
+
+
+def unit_attributes(unit: str) -> dict[str, str]:
+    """The attributes of a dataset's variable that give its unit: all are numbers in units of m, σ and t."""
+    return {"units": "1"} if unit == "1" else {"reduced_unit": unit, "units": "1"}
 
 
 def averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike) -> dict[str, Array]:
@@ -110,6 +177,8 @@ def _averages(tally: Tally, area: ArrayLike, grains: int, shear_rate: ArrayLike,
         "longwave_energy_ratio": _ratio(tally.wave_kinetic, temperature * tally.duration),
         "bagnold_pressure": total_pressure / shear_rate**2,
         "bagnold_shear_stress": total_shear / shear_rate**2,
+        "dissipation_rate": tally.dissipation / volume,
+        "binary_dissipation_rate": tally.binary_dissipation / volume,
         "cluster_pressure_share": _ratio(*(xp.trace(x, axis1=-2, axis2=-1) for x in (in_clusters, in_all))),
         "cluster_shear_share": _ratio(in_clusters[..., 0, 1], in_all[..., 0, 1]),
         "coordination_number": 2 * tally.loaded_contacts / (grains * tally.steps),

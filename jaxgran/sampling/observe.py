@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+import traceback
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,11 +20,13 @@ from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import nothing_observed, without_contacts
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
+_NEEDS_VALUES = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 Observable = Callable[[Snapshot], Any]  # returns a pytree of arrays to average
 
 
@@ -67,7 +70,21 @@ def digest_of(observe: Observable, flow: ShearFlow) -> str:
 
 def _observe_step(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:
     """The result of ``observe`` for the contacts and impulses of one step."""
-    return observe(snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok)))
+    snapshot = snapshot_of(flow, state, contacts, impulses, jnp.int32(Status.ok))
+    try:
+        return observe(snapshot)
+    except _NEEDS_VALUES as error:
+        raise InputError(
+            f"observe must compute with jax.numpy, since JAX traces its snapshot, and {_line_of(observe, error)} "
+            "needs the values: jnp.sum and jnp.where take the place of functions of NumPy, float() and if."
+        ) from None
+
+
+def _line_of(observe: Observable, error: Exception) -> str:
+    """The line of a user's function that raised an error; "it" where that is not known."""
+    file = getattr(getattr(observe, "__code__", None), "co_filename", "")
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return f"line {lines[-1].lineno}, {short_repr(lines[-1].line)}," if lines else "it"
 
 
 def _abstract_state(grains: int) -> State:

@@ -45,11 +45,11 @@ class _Fire(NamedTuple):
     neighbours: PairLists
     velocities: Array  # (grains, 2)
     step: Array  # time step
-    mixing: Array  # share of the velocity that is turned along the forces
+    mixing: Array  # fraction of the velocity that is aligned with the forces
     downhill: Array  # iterations since the forces last opposed the velocities
     overlap: Array  # largest overlap of the inflated discs, σ
-    iterations: Array  # of this start
-    attempts: Array  # starts so far
+    iterations: Array  # since the last random start
+    attempts: Array  # random starts so far
 
 
 def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[State, Bool[Array, ""]]:
@@ -61,7 +61,7 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
       grains: given discs, in mean diameters, see ``own_grains``; None for those of ``polydisperse``.
 
     Returns:
-      The state, with zero velocities and no tilt, and False if ten random starts all failed. This is not expected up to
+      The state, with zero velocities and no tilt, and whether one of ten random starts succeeded, as is expected up to
       the largest accepted packing fraction, 0.83.
 
     Raises:
@@ -70,10 +70,10 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     """
     require_flow(flow)
     require_key(key)
-    words = (
+    message = (
         "a packing has no derivatives in reverse mode (jax.grad, jax.vjp): differentiate what follows from its state."
     )
-    flow, grains = forward_only((flow, grains), words)
+    flow, grains = forward_only((flow, grains), message)
     size_key, place_key = jax.random.split(key)
     generated = grains is None
     if grains is None:
@@ -102,7 +102,7 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
         now = lax.cond(any_replica(stuck), lambda: where_active(stuck, start(now.attempts), now), lambda: now)
         return where_active(active, _fire_step(now, inflated, side, allowed), now)
 
-    # the loop makes the first start too: compiled once, the search for pairs is half of this program
+    # the loop also makes the first start, so the search for pairs, half of this program, is compiled once
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(start, jnp.int32(0)))
     before = nothing._replace(overlap=jnp.full_like(side, jnp.inf), iterations=jnp.int32(_ITERATIONS))
     end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, before)

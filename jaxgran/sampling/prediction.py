@@ -20,9 +20,18 @@ _LARGEST_RESTITUTION = 0.99  # the temperature diverges at α = 1
 
 
 def kinetic_theory(
-    restitution: ArrayLike, packing_fraction: ArrayLike, shear_rate: ArrayLike = 1.0, polydispersity: ArrayLike = 0.26
+    restitution: ArrayLike,
+    packing_fraction: ArrayLike,
+    shear_rate: ArrayLike = 1.0,
+    polydispersity: ArrayLike = 0.26,
+    grains: Grains | None = None,
 ) -> SteadyShear:
-    """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1."""
+    """``gaussian_moments`` of many flows, (replicas,) each; not finite where α is 1.
+
+    Given grains (replicas, grains) are taken as a mixture of eight classes, sorted by diameter and then by mass.
+    """
+    if grains is not None:
+        return jax.tree.map(np.asarray, _mixture_moments(restitution, packing_fraction, shear_rate, grains))
     numbers = np.stack(np.broadcast_arrays(restitution, packing_fraction, shear_rate, polydispersity), axis=-1)
     count = len(numbers)
     filled = numbers[np.arange(-(-count // _TOGETHER) * _TOGETHER) % count].reshape(-1, _TOGETHER, 4)
@@ -31,14 +40,9 @@ def kinetic_theory(
 
 
 def predicted(flow: ShearFlow, grains: Grains | None = None) -> SteadyShear:
-    """Prediction of kinetic theory for every flow of a batch, with α at most 0.99, since T diverges at α = 1.
-
-    Given grains are taken as a mixture of eight classes, sorted by diameter and then by mass.
-    """
+    """``kinetic_theory`` of every flow of a batch, with α at most 0.99, since T diverges at α = 1."""
     numbers = np.minimum(flow.restitution, _LARGEST_RESTITUTION), flow.packing_fraction, flow.shear_rate
-    if grains is None:
-        return kinetic_theory(*numbers, flow.polydispersity)
-    return jax.tree.map(np.asarray, _mixture_moments(*numbers, grains))
+    return kinetic_theory(*numbers, flow.polydispersity, grains)
 
 
 @persistent_jit
@@ -48,10 +52,10 @@ def _gaussian_moments(numbers: Float[Array, "flows 4"]) -> SteadyShear:
 
 @persistent_jit
 def _mixture_moments(alpha: Array, packing_fraction: Array, shear_rate: Array, grains: Grains) -> SteadyShear:
-    return jax.vmap(mixture_moments)(alpha, packing_fraction, shear_rate, *jax.vmap(_classes)(grains))
+    return jax.vmap(mixture_moments)(alpha, packing_fraction, shear_rate, *jax.vmap(size_classes)(grains))
 
 
-def _classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
+def size_classes(grains: Grains) -> tuple[Float[Array, " classes"], Float[Array, " classes"]]:
     """Mean diameters and masses of classes of equal numbers of grains, sorted by diameter and then by mass."""
     order = jnp.lexsort((grains.masses, grains.radii))
     edges = np.arange(_SIZE_CLASSES + 1) * order.size // _SIZE_CLASSES

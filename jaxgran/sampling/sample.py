@@ -1,9 +1,9 @@
 """Sample: sums over a strain of a flow, kept in blocks, and the averages with errors that follow from them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -14,16 +14,28 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
-from jaxgran.dynamics.replicas import batch_of, compiled_for_few_sizes, over_replicas, replicas_to_check
+from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, over_replicas
 from jaxgran.dynamics.tally import TABLE, Tally
-from jaxgran.model.batches import in_numpy, replica_of
-from jaxgran.model.checks import InputError, is_traced, require, require_untraced, require_whole, short_repr, two_digits
+from jaxgran.model.batches import equal_values, in_numpy, length_of, replica_of
+from jaxgran.model.checks import (
+    InputError,
+    as_array,
+    is_traced,
+    require,
+    require_untraced,
+    require_whole,
+    short_repr,
+    two_digits,
+)
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, averages
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, Averages, averages
 from jaxgran.sampling.observe import Observable, advance_and_observe
 from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 BLOCKS = 32
 MOST_BLOCKS = 10**6
@@ -51,7 +63,7 @@ def _rows(sample: "Sample") -> list[Row]:
     return [
         *[Row("replicas", count) for count in np.shape(here.area)],
         Row("grains", here.grains),
-        Row("strain", rounded(here._total.duration * here.shear_rate)),
+        Row("strain", rounded(here.strain)),
         *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _UNITS_OF_SHOWN.items()),
         Row("status", statuses(np.asarray(here.status))),
     ]
@@ -59,7 +71,7 @@ def _rows(sample: "Sample") -> list[Row]:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Sample:
+class Sample(Averages):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
     ==========  =========  ====  =================================================
@@ -71,9 +83,10 @@ class Sample:
     grains      static     –     number of grains
     ==========  =========  ====  =================================================
 
-    The properties are averages over all blocks, in units of m, σ and the time unit t of the shear rate (1/γ̇ at the
-    default γ̇ = 1). ``averages`` has all of them, by the names of ``observables.OBSERVABLES``. They are NumPy numbers,
-    and JAX arrays only where JAX traces the sample. ``sample[0]`` is the sample of the first replica of a batch.
+    Every observable is an attribute, such as ``sample.pressure``: the average over all blocks, in units of m, σ and the
+    time unit t of the shear rate (1/γ̇ at the default γ̇ = 1). ``averages`` has all of them by name, and ``errors()``
+    their standard errors. They are NumPy numbers, and JAX arrays only where JAX traces the sample. ``sample[0]`` is the
+    sample of the first replica of a batch.
     """
 
     tally: Tally
@@ -81,11 +94,19 @@ class Sample:
     shear_rate: Float[Array | np.ndarray, "*replicas"]
     grains: int = field(metadata={"static": True})
 
+    __eq__ = equal_values
     __repr__, _repr_html_ = display_methods("Sample", _rows)
 
     def __getitem__(self, replica: Any) -> "Sample":
         """The sample of one replica of a batch, or of several by a slice or a list."""
         return replica_of(self, replica, np.shape(self.area))
+
+    def __len__(self) -> int:
+        """Number of samples of a batch."""
+        return length_of(self, np.shape(self.area))
+
+    def __bool__(self) -> bool:
+        return True  # one has no length
 
     @property
     def averages(self) -> Mapping[str, Array | np.ndarray]:
@@ -93,44 +114,9 @@ class Sample:
         return averages(self._total, self.area, self.grains, self.shear_rate)
 
     @property
-    def force_ratio(self) -> Float[Array | np.ndarray, "*replicas"]:
-        """⟨F⟩/⟨F_bc⟩, mean contact force over mean force of binary collisions, dimensionless."""
-        return self.averages["force_ratio"]
-
-    @property
-    def pressure(self) -> Float[Array | np.ndarray, "*replicas"]:
-        """Pressure, contact and kinetic, in m/t²."""
-        return self.averages["pressure"]
-
-    @property
-    def shear_stress(self) -> Float[Array | np.ndarray, "*replicas"]:
-        """Shear stress −Σ^{xy}, contact and kinetic, in m/t²."""
-        return self.averages["shear_stress"]
-
-    @property
-    def granular_temperature(self) -> Float[Array | np.ndarray, "*replicas"]:
-        """Granular temperature Σ m c²/(2N), in mσ²/t²."""
-        return self.averages["granular_temperature"]
-
-    @property
-    def contact_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
-        """Stress tensor of the contact forces, in m/t²."""
-        return self.averages["contact_stress"]
-
-    @property
-    def binary_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
-        """Stress tensor of the contact forces if all collisions were binary, in m/t²."""
-        return self.averages["binary_stress"]
-
-    @property
-    def kinetic_stress(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
-        """Stress tensor of the peculiar motion, in m/t²."""
-        return self.averages["kinetic_stress"]
-
-    @property
-    def stress_ratio(self) -> Float[Array | np.ndarray, "*replicas 2 2"]:
-        """Contact stress over binary stress, by component, dimensionless."""
-        return self.averages["stress_ratio"]
+    def strain(self) -> Float[Array | np.ndarray, "*replicas"]:
+        """The sampled strain, in whole time steps."""
+        return self._total.duration * in_numpy(self.shear_rate)
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
@@ -161,6 +147,20 @@ class Sample:
         each = [here[place].errors() for place in range(len(here.area))]
         return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
 
+    def to_dataset(self) -> "xr.Dataset":
+        """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the strain and the status.
+
+        A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``. ``long_name`` says what a
+        variable is. ``reduced_unit`` is its unit in m, σ and t.
+
+        Raises:
+          InputError: JAX transforms this function.
+        """
+        require_untraced("to_dataset()", "take it of the finished sample", self)
+        from jaxgran.sampling.sample_dataset import dataset_of
+
+        return dataset_of(self)
+
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
         """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.
 
@@ -174,8 +174,10 @@ class Sample:
         Raises:
           InputError: the sample was made without ``observe``, or it holds a batch, or JAX transforms this function.
         """
-        if self.observed_sums is None or np.ndim(self.area):
-            raise InputError("observed() needs one replica, sampled with observe: sample[0] is the first of a batch.")
+        if self.observed_sums is None:
+            raise InputError("observed() needs a sample that was made with observe=, and this one was made without.")
+        if np.ndim(self.area):
+            raise InputError("observed() needs the sample of one replica, such as sample[0] of this batch.")
         require_untraced("observed()", "take it of the finished sample", self)
 
         return observed_estimates([self], estimate)
@@ -305,7 +307,7 @@ def sample(
       observe: a function of a ``Snapshot`` that returns a pytree of arrays to average. It is static: each new function,
         such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
         2 s. Where the engine ``Jax`` runs, or the function uses values from outside that JAX traces, that engine is
-        compiled with it, in about 20 s. ``enable_cache`` keeps the program for the next process.
+        compiled with it, in about 20 s. The next process loads the program.
         The contacts are those of a step with an approaching contact, before the impulses act. The size of their
         buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
@@ -323,11 +325,9 @@ def sample(
         ``observe`` is not summed over contacts; or the engine cannot do this.
     """
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
+    strain = as_array(strain)
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
-    batch = batch_of(flow, state, strain)
-    each: Iterable[Any] = replicas_to_check(batch) if batch else [(flow, state, strain)]
-    for one in each:
-        _require_sheared_state(blocks, *one)
+    batch = checked_batch(partial(_require_sheared_state, blocks), flow, state, strain)
     numerics = checked_numerics(solver, engine)
     for name, function in (("observe", observe), ("callback", callback)):
         if function is not None and not callable(function):
@@ -368,10 +368,18 @@ def _sample_replicas(
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
-    """Numbers of time steps of the blocks; they differ by one at most."""
-    steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
-    edges = jnp.round(steps * jnp.arange(blocks + 1, dtype=steps.dtype) / blocks)
-    return jnp.diff(edges).astype(jnp.int32)
+    return steps_of_blocks(jnp.round(strain / (flow.shear_rate * flow.timestep)), blocks)
+
+
+def steps_of_blocks(steps: Any, blocks: int) -> Any:
+    """Time steps of each of ``blocks`` parts of ``steps`` time steps, (..., blocks), which differ by one at most.
+
+    Examples:
+      >>> steps_of_blocks(np.array(10.0), 4).tolist()
+      [2, 3, 3, 2]
+    """
+    edges = (steps[..., None] * np.arange(blocks + 1, dtype=steps.dtype) / blocks).round()
+    return (edges[..., 1:] - edges[..., :-1]).astype(np.int32)
 
 
 def _sample_blocks(

@@ -5,14 +5,15 @@ network needs a strain of up to 0.5 to adapt. So the flow is sheared to its stea
 is then shortened geometrically. At the final step the network relaxes over a strain of 0.5 before the sample begins.
 
 The test for a steady state is statistical. The flow is sheared in chunks, and the temperature T and pressure P of each
-chunk are recorded. The last two thirds of the record are split into halves. The means of ln T of the two halves must
-differ by less than twice the standard error of the difference, or by less than 0.1. This standard error must be at most
-0.1. The same must hold for ln P. The error takes chunks as correlated at least as long as the memory of the flow. Few
-grains fluctuate by more: after the last chunk a flow counts as steady unless the means differ by four errors, which are
-those of the noise about a straight line.
+chunk are recorded. The last two thirds of the record are split into halves. The means of ln T in the two halves must
+differ by less than twice the standard error of their difference, or by less than 0.1, and this error must be at most
+0.1. The same holds for ln P. In this error, chunks are correlated over at least the correlation strain of the flow.
+Small systems fluctuate more, so a flow that is undecided after the last chunk still counts as steady if the means
+differ by less than four standard errors of the noise about a linear trend.
 
-A chunk lasts a quarter of a memory, which is measured in the first chunks. So the preparation takes at least three
-memories. A sample lasts six, unless its strain is given. If that is less than four, the status is ``short_sample``.
+A chunk lasts a quarter of the correlation strain, which is measured in the first chunks. So the preparation takes at
+least three correlation strains. A sample lasts six, unless its strain is given; below four its status is
+``short_sample``.
 """
 
 from collections.abc import Mapping
@@ -33,7 +34,7 @@ from jaxgran.model.checks import InputError, is_traced, key_shape, require, requ
 from jaxgran.model.flow import ShearFlow, one_of, require_sheared
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.model.status import Status
+from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.model.vmapped_in_python import vmapped_in_python
 from jaxgran.sampling.batch import (
     AdvanceBatch,
@@ -53,7 +54,7 @@ from jaxgran.sampling.correlation_strain import (
 from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
+from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error, steps_of_blocks
 from jaxgran.sampling.timestep import (
     COARSE_TIMESTEP,
     bounded_coarse_timestep,
@@ -64,11 +65,12 @@ from jaxgran.sampling.timestep import (
 from jaxgran.statistics import drift
 
 LONGEST_STRAIN = 256.0  # of a sample that is extended until its errors are small
-LONGEST_MEMORIES = 32.0  # the same limit for flows that remember long
+LONGEST_MEMORIES = 32.0  # the same limit in correlation strains, where it is longer
 _SHORTENING_STRAIN = 0.1  # strain at each time step between the coarse and the final one
 _SHORTEST_CHUNK = 0.75  # strain of a chunk
 _FEWEST_CHUNKS = 12  # before the first test for a steady state
-_MEASURING_CHUNKS = 4  # whose averages give the length of the chunks after them; the test leaves them out
+LEAST_PREPARATION = _FEWEST_CHUNKS * _SHORTEST_CHUNK  # strain, where it is not given
+_MEASURING_CHUNKS = 4  # which set the length of later chunks; the test leaves them out
 _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
@@ -81,14 +83,14 @@ _UNCOMPILED = (
 
 
 class Batch(NamedTuple):
-    """Replicas on the way to their sample; all arrays have a leading (replicas,) axis."""
+    """Replicas in preparation; all arrays have a leading (replicas,) axis."""
 
     flow: ShearFlow
     numerics: Numerics
     state: State
     status: Int[np.ndarray, " replicas"]
     strain: Float[np.ndarray, " replicas"]  # before the sample
-    memory: Float[np.ndarray, " replicas"]  # strain over which the flow remembers
+    memory: Float[np.ndarray, " replicas"]  # correlation strain
 
 
 def prepare(
@@ -115,7 +117,7 @@ def prepare(
       flow: parameters of one flow; or numbers (replicas,) of several flows.
       key: JAX random key; the same key gives the same state. Keys (replicas,) prepare a batch.
       equilibrate: strain at the coarse time step, or None to shear until the flow is steady. A given strain is not
-        checked here. A map gives the status ``not_steady`` if it is shorter than the memory of the flow.
+        checked here. A map gives the status ``not_steady`` if it is shorter than the correlation strain of the flow.
       grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,) axis; None for
         diameters uniform in σ ± ``polydispersity``.
       solver, engine: as in ``sample``, for all replicas. With ``Jax()`` those of a batch advance in lockstep by
@@ -126,8 +128,8 @@ def prepare(
 
     Raises:
       InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
-        diameter in one step, float32 positions cannot resolve the step, or ``pack`` does not accept the grains, or
-        the engine cannot do this. Or this function, which decides in Python when a flow is steady, stands within
+        diameter in one step, float32 positions cannot resolve the step, ``pack`` does not accept the grains, or the
+        engine cannot do this. Or this function, which decides in Python when a flow is steady, is called within
         ``jax.jit`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
     """
@@ -193,14 +195,14 @@ def prepare_batch(
 def sample_batch(
     batch: Batch, strain: float | None, drive: AdvanceBatch = advance_batch, error: float | None = None
 ) -> tuple[Batch, Sample]:
-    """Sample every replica of a batch in blocks of equal strain.
+    """Sample every replica of a batch in blocks whose numbers of time steps differ by one at most.
 
     Args:
       batch: prepared replicas.
-      strain: strain to sample, or None for six memories of each flow and at least 8.
+      strain: strain to sample, or None for six correlation strains of each flow, at least 8.
       drive: advances the batch.
       error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica is
-        doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 memories. None samples ``strain`` only.
+        doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 correlation strains. None samples ``strain`` only.
     """
     strains = (
         np.maximum(LEAST_SAMPLE, SAMPLE_MEMORIES * batch.memory)
@@ -208,20 +210,20 @@ def sample_batch(
         else np.full_like(batch.memory, strain)
     )
     longest = np.maximum(LONGEST_STRAIN, LONGEST_MEMORIES * batch.memory)
-    batch, tally = _blocks(batch, strains / BLOCKS, BLOCKS, drive)
+    batch, tally = _blocks(batch, strains, BLOCKS, drive)
     while error is not None:
         worst = np.array([relative_error(one) for one in _as_sample(batch, tally)])
-        extended = (worst > error) & (2 * strains <= longest) & (batch.status < Status.nonfinite)
+        extended = (worst > error) & (2 * strains <= longest) & (batch.status < GIVEN_UP)
         if not extended.any():
             break
+        batch, more = _blocks(batch, np.where(extended, strains, 0), BLOCKS // 2, drive)
         strains = np.where(extended, 2 * strains, strains)
-        batch, more = _blocks(batch, np.where(extended, strains / BLOCKS, 0), BLOCKS // 2, drive)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
     batch = batch._replace(memory=_memory(batch, _averages(batch, sample._total)))
     short = strains < FEWEST_CORRELATION_STRAINS * batch.memory
-    found = np.where(short, Status.short_sample, Status.ok)
-    return batch._replace(status=np.maximum.reduce([batch.status, found, sample.status])), sample
+    of_length = np.where(short, Status.short_sample, Status.ok)
+    return batch._replace(status=np.maximum.reduce([batch.status, of_length, sample.status])), sample
 
 
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:
@@ -238,7 +240,7 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
 
     Raises:
       InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or this
-        function stands within ``jax.jit`` or a derivative.
+        function is called within ``jax.jit`` or a derivative.
       RuntimeError: no packing was found.
     """
     if is_traced(flow, key, temperature, grains):
@@ -298,21 +300,30 @@ _heated = batch_program(_heated_replica)
 
 
 def _chunk(batch: Batch, strain: np.ndarray, drive: AdvanceBatch) -> tuple[Batch, Tally]:
-    """Advance every replica by its own strain; a replica with a number that is not finite is not advanced."""
-    finite = batch.status < Status.nonfinite
-    steps = np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
-    counts = jax.device_put(np.where(finite, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
+    """Advance every replica by its own strain."""
+    return _advanced(batch, _steps(batch, strain), drive)
+
+
+def _steps(batch: Batch, strain: np.ndarray) -> Float[np.ndarray, " replicas"]:
+    """Whole numbers of time steps of the strain of each replica."""
+    return np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
+
+
+def _advanced(batch: Batch, steps: np.ndarray, drive: AdvanceBatch) -> tuple[Batch, Tally]:
+    """Advance every replica by its own number of time steps; one that is given up stays as it is."""
+    going_on = batch.status < GIVEN_UP
+    counts = jax.device_put(np.where(going_on, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
     state, tally = drive(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
-    failed = np.where(tally.status >= Status.infeasible, tally.status, Status.ok)  # the sample reports milder ones
+    failed = np.where(tally.status >= GIVEN_UP, tally.status, Status.ok)  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
 
 
 def _blocks(batch: Batch, strain: np.ndarray, count: int, drive: AdvanceBatch) -> tuple[Batch, Tally]:
-    """Advance every replica ``count`` times by its own strain, and keep all tallies, (replicas, count)."""
+    """Advance every replica by its own strain in ``count`` blocks, and keep all tallies, (replicas, count)."""
     tallies = []
-    for _ in range(count):
-        batch, tally = _chunk(batch, strain, drive)
+    for steps in steps_of_blocks(_steps(batch, strain), count).T:
+        batch, tally = _advanced(batch, steps, drive)
         tallies.append(tally)
     return batch, jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
 
@@ -337,18 +348,18 @@ def _as_sample(batch: Batch, tally: Tally) -> Sample:
 def _sheared(batch: Batch, strain: np.ndarray, drive: AdvanceBatch, measure: bool = False) -> Batch:
     """Shear every replica by its own strain, in chunks of at most 1 so that progress can be reported.
 
-    With ``measure`` the chunks give the memory of the flow; that of the last one stays.
+    With ``measure`` the last chunk gives the correlation strain.
     """
     chunks = max(1, int(np.ceil(np.max(strain))))
-    for _ in range(chunks):
-        batch, tally = _chunk(batch, strain / chunks, drive)
+    for steps in steps_of_blocks(_steps(batch, strain), chunks).T:
+        batch, tally = _advanced(batch, steps, drive)
         if measure:
             batch = batch._replace(memory=_memory(batch, _averages(batch, tally)))
     return batch._replace(strain=batch.strain + strain)
 
 
 def _memory(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Strain over which each flow of a batch remembers, see ``flow_correlation_strain``."""
+    """Correlation strain of each flow of a batch, see ``flow_correlation_strain``."""
     masses = np.ascontiguousarray(batch.state.grains.masses)  # or the order of the sum would depend on their place
     mass, area = np.sum(masses, axis=-1), np.asarray(batch.state.side) ** 2
     return flow_correlation_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
@@ -359,7 +370,7 @@ def _until_steady(batch: Batch, drive: AdvanceBatch) -> Batch:
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
     for chunks in range(1, _MOST_CHUNKS + 1):
-        waiting = steady | (batch.status == Status.nonfinite)
+        waiting = steady | (batch.status >= GIVEN_UP)
         if waiting.all():
             break
         chunk = np.maximum(_SHORTEST_CHUNK, batch.memory / 4)

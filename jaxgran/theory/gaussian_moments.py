@@ -102,7 +102,7 @@ def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, g
         pressure=(xx + yy) / 2 * rate**2,
         shear_stress=-xy * rate**2,
         collision_rate=collisions.rate,
-        dissipation=collisions.dissipation * rate**3,
+        dissipation_rate=collisions.dissipation * rate**3,
     )
 
 

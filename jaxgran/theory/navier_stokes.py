@@ -38,7 +38,7 @@ def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: S
         pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
         shear_stress=viscosity * jnp.sqrt(temperature) * rate,
         collision_rate=maxwellian_collision_rate(density, chi, temperature) / rate,
-        dissipation=cooling * temperature**1.5,
+        dissipation_rate=cooling * temperature**1.5,
     )
 
 
@@ -84,5 +84,5 @@ def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scala
         pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
         shear_stress=viscosity * dilute_viscosity * rate,
         collision_rate=maxwellian_collision_rate(density, chi, temperature) * (1 - kurtosis / 16) / rate,
-        dissipation=cooling * (density * temperature) ** 2 / dilute_viscosity,
+        dissipation_rate=cooling * (density * temperature) ** 2 / dilute_viscosity,
     )

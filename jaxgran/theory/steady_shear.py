@@ -25,7 +25,7 @@ class SteadyShear:
     pressure              m/t²     half the trace of the stress, kinetic and collisional
     shear_stress          m/t²     positive, kinetic and collisional
     collision_rate        –        collisions per grain and unit strain; each grain counts all its collisions
-    dissipation           m/t³     energy lost per unit area and time; equals the power of the shear,
+    dissipation_rate      m/t³     energy lost per unit area and time; equals the power of the shear,
                                    shear_stress × shear_rate
     ====================  =======  ===========================================================================
 
@@ -37,7 +37,7 @@ class SteadyShear:
     pressure: Float[Array, "*replicas"]
     shear_stress: Float[Array, "*replicas"]
     collision_rate: Float[Array, "*replicas"]
-    dissipation: Float[Array, "*replicas"]
+    dissipation_rate: Float[Array, "*replicas"]
 
 
 def contact_value(packing_fraction: Scalar) -> Float[Array, ""]:

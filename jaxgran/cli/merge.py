@@ -1,0 +1,50 @@
+"""The command ``merge``: the parts of a map, or maps of other seeds, as one map."""
+
+import os
+from pathlib import Path
+
+from jaxgran.cli.arguments import OVERWRITE, command
+from jaxgran.cli.map import MAP_OPTIONS, shown
+from jaxgran.cli.measure import command_line, finish
+from jaxgran.cli.terminal import configured_jax, require_device
+from jaxgran.maps.parameters import Option, option
+from jaxgran.model.checks import InputError, short_repr
+from jaxgran.model.choices import FileFormat
+
+MERGE_EXAMPLES = {
+    "The parts of an array job": "jaxgran merge parts/part-*.nc --output map.nc",
+    "Two maps of the same settings, the second from --first-seed 2 on": "jaxgran merge map.nc more.nc --output both.nc",
+}
+MERGE_OPTIONS = {
+    "output": option("output"),
+    "overwrite": OVERWRITE,
+    "format": MAP_OPTIONS["format"],
+}
+
+
+def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, format: FileFormat = "png") -> None:
+    configured_jax()
+    require_device()
+    from jaxgran.maps.merge import merge_maps
+    from jaxgran.maps.output import check_output, remove_pictures
+    from jaxgran.maps.results import write_dataset
+
+    check_output(output)
+    if os.path.exists(output) and not overwrite:
+        raise InputError(
+            f"output {short_repr(str(output))} already exists; pass `overwrite=True` to replace it.", field="output"
+        )
+    data = merge_maps(files)
+    data.attrs["command"] = command_line()
+    write_dataset(data, output)
+    remove_pictures(output)
+    finish(data, [output, *shown(data, output, format)], interrupted=False, can_resume=False)
+
+
+merge_command = command(
+    MERGE_OPTIONS,
+    run_merge_command,
+    required=("output",),
+    argument=Option("Datasets of maps.", Path),
+    several=True,
+)

@@ -1,0 +1,159 @@
+"""Maps that are merged are those of one run to the bit, and what does not belong together is refused in a sentence."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import in_a_process
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic import one_sentence, random_instant, random_replica
+
+from jaxgran.maps.batches import points_of_part, predicted_cost
+from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.merge import merge_maps
+from jaxgran.maps.ratio_map import ratio_map
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.results import is_finished, open_map
+from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.status_report import bad_points
+from jaxgran.model.checks import InputError
+from jaxgran.model.status import Status
+
+SETTINGS = MapSettings((0.5, 0.7, 0.9), (0.5, 0.6), grains=64, seeds=3, strain=2.0, snapshots=True)
+RUN = {"wall_time_seconds": 2.0, "resumed_replicas": 0, "automatic_choice": ""}
+CLUSTER = Path(__file__).parents[1] / "docs" / "how-to" / "cluster.md"
+
+
+@pytest.fixture(scope="module")
+def replicas() -> dict[Key, Replica]:
+    """The replicas of all points: one that is not steady, one that is infeasible, and one that is not finite."""
+    rng, bad = (
+        np.random.default_rng(0),
+        {(0, 1): Status.not_steady, (1, 0): Status.infeasible, (2, 2): Status.nonfinite},
+    )
+    keys = [(point, seed) for point in range(6) for seed in range(3)]
+    made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), key[0]) for key in keys}
+    return {key: one._replace(instant=random_instant(10 * key[0] + key[1])) for key, one in made.items()}
+
+
+def of_seeds(replicas: dict[Key, Replica], first: int, count: int, **change: Any) -> xr.DataTree:
+    """The map of some of the seeds."""
+    settings = replace(SETTINGS, first_seed=first, seeds=count, **change)
+    own = points_of_part(settings)
+    chosen = {(p, s - first): x for (p, s), x in replicas.items() if first <= s < first + count and p in own}
+    return map_dataset(settings, chosen, RUN)
+
+
+def assert_one_run(merged: xr.DataTree, whole: xr.DataTree, but: tuple[str, ...] = ()) -> None:
+    """All numbers to the bit, and all attributes but the times and those of the command."""
+    but = ("history", "command", "wall_time_seconds", "replica_steps_per_second", "workers", *but)
+    assert merged.equals(whole)
+    for node in whole.subtree:
+        there = merged[node.path].attrs
+        assert there.keys() - set(but) == node.attrs.keys() - set(but)
+        for name in node.attrs.keys() - set(but):
+            np.testing.assert_array_equal(there[name], node.attrs[name], err_msg=name)
+
+
+def test_the_files_of_parts_make_the_map_of_one_run(replicas, tmp_path: Path) -> None:
+    whole, files = of_seeds(replicas, 0, 3), []
+    for part in ("1/4", "2/4", "3/4", "4/4"):
+        data = of_seeds(replicas, 0, 3, part=part)
+        assert is_finished(data) and not bad_points(data).get("not_run")
+        files.append(tmp_path / f"part-{part[0]}.nc")
+        data.to_netcdf(files[-1])
+    assert_one_run(merge_maps(files), whole)
+    missing = merge_maps(files[1:])
+    outside = points_of_part(replace(SETTINGS, part="1/4"))
+    assert np.flatnonzero(missing.status.values.ravel() == -1).tolist() == outside
+    assert len(bad_points(missing)["not_run"]) == len(outside)
+
+
+def test_maps_of_other_seeds_make_the_map_of_all_seeds_with_the_scatter_between_them(replicas) -> None:
+    first, second = of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)
+    merged = merge_maps([second, first])
+    assert_one_run(merged, of_seeds(replicas, 0, 3))
+    assert merged.attrs["wall_time_seconds"] == 4.0
+    assert merged["seeds"].sizes["seed"] == 3 and not merged.force_ratio_stderr.equals(first.force_ratio_stderr)
+
+
+def earlier(data: xr.DataTree) -> xr.DataTree:
+    """The same map, made with an earlier version of JAX."""
+    data.attrs["version_jax"] = "0.1"
+    return data
+
+
+REFUSED: dict[str, Any] = {
+    "grains is 64 in map 0 and 128 in map 1": lambda x: [of_seeds(x, 0, 1), of_seeds({}, 1, 1, grains=128)],
+    "map 0 and map 1 have seed 1 of point 0": lambda x: [of_seeds(x, 0, 2), of_seeds(x, 1, 2)],
+    "seed 1 is missing": lambda x: [of_seeds(x, 0, 1), of_seeds(x, 2, 1)],
+    "by their number of seeds": lambda x: [of_seeds(x, 0, 1, error=0.1), of_seeds(x, 1, 1, error=0.1)],
+    "version_jax is '0.1' in map 0": lambda x: [earlier(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
+    "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
+    "a list of at least one map": lambda _: [],
+    "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_does_not_belong_together_is_refused(replicas, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        merge_maps(REFUSED[words](replicas))
+    assert one_sentence(str(caught.value))
+
+
+@given(st.integers(1, 12))
+def test_every_point_is_in_one_part_and_parts_cost_alike(count: int) -> None:
+    settings = replace(SETTINGS, packing_fraction=(0.5, 0.6, 0.7, 0.8), timestep=5e-4)
+    parts = [points_of_part(replace(settings, part=f"{k + 1}/{count}")) for k in range(count)]
+    assert sorted(point for part in parts for point in part) == list(range(12))
+    costs = [predicted_cost(flow) for flow in settings.flows()]
+    totals = [sum(costs[point] for point in part) for part in parts]
+    assert max(totals) - min(totals) <= max(costs)
+
+
+@pytest.mark.parametrize("part", ["0/3", "4/3", "1/7", "one", 3, "1/0"])
+def test_a_part_that_is_none_is_refused(part: Any) -> None:
+    with pytest.raises(InputError, match="part must be K/N") as caught:
+        replace(SETTINGS, part=part)
+    assert one_sentence(str(caught.value))
+
+
+def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -> None:
+    """The commands of the batch script, each in a process of its own, on a map of a few grains."""
+    lines = CLUSTER.read_text(encoding="utf-8").splitlines()
+    task = next(line for line in lines if line.startswith("jaxgran map") and "--part" in line)
+    merge = next(line for line in lines if line.startswith("jaxgran merge"))
+    tiny = "--restitution 0.5,0.9 --packing-fraction 0.5,0.6 --grains 16 --seeds 1 --equilibrate 0 --strain 0.32"
+    task = task.replace("--preset paper", tiny).replace("$SLURM_ARRAY_TASK_COUNT", "2")
+    (tmp_path / "parts").mkdir()
+    for number in "12":
+        words = shlex.split(task.replace("$SLURM_ARRAY_TASK_ID", number))
+        outcome = in_a_process(tmp_path, *words[1:])
+        assert outcome.status == 3, outcome.err  # so short a preparation is not steady
+        assert "not run" not in outcome.err
+    merged = in_a_process(tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/2.nc"))[1:])
+    assert merged.status == 3 and "Force ratio" in merged.out and "not run" not in merged.err
+    whole = in_a_process(tmp_path, "map", *tiny.split(), "--workers", "1", "--output", "whole.nc")
+    assert whole.status == 3
+    assert_one_run(open_map(tmp_path / "paper.nc"), open_map(tmp_path / "whole.nc"))
+    again = in_a_process(tmp_path, *shlex.split(merge.replace("parts/*.nc", "parts/1.nc parts/1.nc"))[1:])
+    assert again.status == 2 and "--output 'paper.nc' already exists" in again.err
+
+
+@pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
+def test_a_map_of_a_users_observable_is_merged_with_its_function() -> None:
+    def observe(seen) -> dict[str, Any]:
+        return {"side": seen.state.side, "normals": (seen.contacts.normals * seen.impulses[:, None]).sum(0)}
+
+    given: dict[str, Any] = {"grains": 16, "equilibrate": 0.0, "strain": 0.32, "observe": observe, "workers": 1}
+    maps = [ratio_map([0.9], [0.5, 0.6], **given, seeds=1, first_seed=seed) for seed in (0, 1)]
+    assert_one_run(merge_maps(maps, observe=observe), ratio_map([0.9], [0.5, 0.6], **given, seeds=2))
+    for other in (None, lambda _: {"a": 1.0}):
+        with pytest.raises(InputError, match="observe must be the function of the maps, which is normals, side: "):
+            merge_maps(maps, observe=other)

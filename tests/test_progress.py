@@ -1,0 +1,64 @@
+"""Progress of a map: the share of its work that is done, and the time that the rest takes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxgran.maps.batches import predicted_cost
+from jaxgran.maps.parameters import MapParameters
+from jaxgran.maps.progress import Meter, progress
+from jaxgran.maps.replica import Advance
+from jaxgran.maps.settings import chosen_settings
+
+MAP: dict[str, Any] = {"restitution": (0.2, 0.9), "packing_fraction": (0.8,), "grains": 64, "timestep": 1e-4}
+SETTINGS, _ = chosen_settings(MapParameters(**MAP, seeds=2, strain=4.0, equilibrate=1.0))
+
+
+def shares(meter: Meter) -> tuple[str, str]:
+    """Points that are done, and the share of the work."""
+    line = meter._line().split(", ")
+    return line[0], line[1]
+
+
+def test_a_map_whose_points_are_all_unfinished_has_done_a_part_of_its_work() -> None:
+    meter = Meter(SETTINGS, quiet=True)
+    assert shares(meter) == ("0/2 points", "0 % done") and "unknown time left" in meter._line()
+    keys = [(0, 0), (0, 1), (1, 0), (1, 1)]
+    for timestep, strain in ((1e-3, 1.0), (1e-4, 0.5), (1e-4, 2.0)):
+        meter.advanced(Advance(keys, np.full(4, timestep), np.full(4, strain / timestep)))
+    coarse, fine = (predicted_cost(SETTINGS.flows()[0], timestep) for timestep in (1e-3, 1e-4))
+    expected = (coarse + 2.5 * fine) / (coarse + 4.5 * fine)
+    assert shares(meter) == ("0/2 points", f"{100 * expected:.0f} % done")
+    assert meter.done_steps == pytest.approx(4 * 26_000)
+
+
+def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> None:
+    meter = Meter(SETTINGS, quiet=True)
+    for _ in range(100):
+        meter.advanced(Advance([(0, 0)], [1e-4], [10_000]))
+    cost = meter.costs[0] / meter.total
+    assert shares(meter) == ("0/2 points", f"{95 * cost:.0f} % done")
+    meter.finished((0, 0))
+    meter.finished((0, 1))
+    assert shares(meter) == ("1/2 points", f"{200 * cost:.0f} % done")
+
+
+def test_time_left_is_that_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    meter = Meter(SETTINGS, quiet=True)
+    meter.resumed([(0, 0), (0, 1)])
+    now[0] = 60.0
+    meter.finished((1, 0))
+    assert meter._line().endswith("0:01:00 left")
+
+
+def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    with progress(SETTINGS, quiet=False) as meter:
+        for now[0] in (1.0, 11.0, 12.0, 22.5):
+            meter.advanced(Advance([(0, 0)], [1e-3], [100]))
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 4 and lines[0] == "0/2 points, compiling"

@@ -1,0 +1,113 @@
+"""The sizes of the grains of a map: measured with the discs that are given, kept in the file, and repeated from it."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from command_line import jaxgran
+from synthetic import one_sentence
+
+import jaxgran as jg
+from jaxgran.maps.ratio_map import ratio_map
+from jaxgran.maps.settings import MapSettings
+from jaxgran.model.checks import InputError
+from jaxgran.sampling.enskog_factors import FACTORS
+from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
+
+MAP: dict[str, Any] = {
+    "restitution": [0.9],
+    "packing_fraction": [0.6],
+    "grains": 32,
+    "seeds": 1,
+    "equilibrate": 0.5,
+    "strain": 1.6,
+}
+RATIO = 1.4
+pytestmark = pytest.mark.filterwarnings("ignore::jaxgran.maps.status_report.BadPoints")
+
+
+@pytest.fixture(scope="module")
+def bidisperse(tmp_path_factory: pytest.TempPathFactory) -> xr.DataTree:
+    """A map of two sizes, read from its file."""
+    output = tmp_path_factory.mktemp("sizes") / "map.nc"
+    ratio_map(**MAP, diameters=[1.0, RATIO], snapshots=True, output=output)
+    data = jg.open_map(output)
+    data.attrs["file"] = str(output)
+    return data
+
+
+def test_the_grains_are_those_that_are_given_at_the_packing_fraction(bidisperse: xr.DataTree) -> None:
+    seen = bidisperse["snapshots"]
+    sizes = 2 * np.sort(seen.radius.values.ravel())
+    np.testing.assert_allclose(sizes, np.repeat([1.0, RATIO], 16) / (1 + RATIO) * 2, rtol=1e-3)
+    assert (np.pi / 4 * (sizes**2).sum() / seen.side.item() ** 2) == pytest.approx(0.6, rel=1e-3)
+
+
+def test_theory_is_that_of_the_mixture(bidisperse: xr.DataTree) -> None:
+    small, large = np.array([1.0, RATIO]) * 2 / (1 + RATIO)
+    diameters = np.array([small, large])
+    theory = mixture_moments(0.9, 0.6, 1.0, diameters, diameters**2)
+    there = bidisperse["theory"]
+    for name in ("granular_temperature", "pressure", "shear_stress", "collision_rate"):
+        np.testing.assert_allclose(there[name].item(), getattr(theory, name), rtol=1e-6)
+    measured = {name: f"contact_{name}" for name in ("pressure", "shear_stress")}
+    for rate, name in (measured | {"dissipation_rate": "dissipation_rate"}).items():
+        factors = [there[f"enskog_factor_{rate}_{factor}"].item() for factor in FACTORS]
+        assert np.prod(factors) * there[f"enskog_{rate}"].item() == pytest.approx(
+            bidisperse[f"stresses/{name}"].item(), rel=1e-9
+        )
+
+
+def test_a_map_is_repeated_from_its_file_to_the_bit(bidisperse: xr.DataTree) -> None:
+    again = ratio_map(from_map=bidisperse.attrs["file"])
+    assert again.equals(bidisperse)
+    assert again.attrs["diameters"] == [1.0, RATIO] and "polydispersity" not in again.attrs
+    uniform = ratio_map(from_map=bidisperse.attrs["file"], polydispersity=0.26, snapshots=False)
+    assert uniform.force_ratio.equals(ratio_map(**MAP).force_ratio)
+
+
+def test_the_width_of_the_uniform_distribution_is_a_setting_of_a_map(bidisperse: xr.DataTree) -> None:
+    wide = ratio_map(**MAP, polydispersity=0.5, snapshots=True)
+    assert wide["snapshots"].radius.max().item() == pytest.approx(0.75 * (1 - 1 / 96), rel=1e-3)
+    assert wide.attrs["polydispersity"] == 0.5
+    theory = gaussian_moments(0.9, 0.6, 1.0, 0.5)
+    assert wide["theory/pressure"].item() == pytest.approx(float(theory.pressure), rel=1e-6)
+
+
+def test_other_sizes_are_another_map(bidisperse: xr.DataTree) -> None:
+    output = bidisperse.attrs["file"]
+    with pytest.raises(InputError, match=r"has a map with diameters .1\.0, 1\.4. and not .1\.0, 2\.0."):
+        ratio_map(**MAP, diameters=[1.0, 2.0], snapshots=True, output=output)
+    with pytest.raises(InputError, match=r"has a map with diameters .1\.0, 1\.4. and not None"):
+        ratio_map(**MAP, snapshots=True, output=output)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        ({"diameters": [1.0, 1.4, 2.0]}, "diameters must be a list whose length divides the number of grains, 32"),
+        ({"diameters": [1.0, -1.0]}, "diameters must be a list of positive numbers"),
+        ({"diameters": 1.4}, "diameters must be a list"),
+        ({"diameters": [1.0] * 31 + [9.0]}, "the largest diameter"),
+        ({"polydispersity": 0.6}, "polydispersity must be between 0 and 0.5"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused_before_the_map_runs(sizes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        ratio_map(**MAP, **sizes)
+    assert one_sentence(str(caught.value))
+
+
+def test_masses_of_a_mixture_are_those_of_its_area() -> None:
+    settings = MapSettings((0.9,), (0.6,), grains=32, strain=2.0, diameters=(1.0, RATIO))
+    grains = jax.tree.map(np.asarray, settings.grains_of(32, 1))
+    assert grains.masses.sum() == pytest.approx(32 * (1 + RATIO**2) / 2 / ((1 + RATIO) / 2) ** 2)
+
+
+def test_sizes_are_options_of_the_command_line(bidisperse: xr.DataTree, tmp_path) -> None:
+    words = "map --restitution 0.9 --packing-fraction 0.6 --grains 32 --seeds 1 --equilibrate 0.5 --strain 1.6"
+    outcome = jaxgran(tmp_path, *words.split(), "--diameters", "1,1.4", "--part", "1/1", "-o", "map.nc", "-q")
+    assert outcome.status in (0, 3), outcome.err
+    assert jg.open_map(tmp_path / "map.nc").force_ratio.equals(bidisperse.force_ratio)

@@ -1,0 +1,117 @@
+"""States, flows, samples and snapshots are values: compared, indexed and counted, and their averages are attributes."""
+
+from dataclasses import fields, is_dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import one_sentence, random_tally, snapshot_of
+
+import jaxgran as jg
+from jaxgran.model.batches import equal_values
+from jaxgran.model.checks import InputError
+from jaxgran.model.status import Status
+from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS, Average, Averages
+from jaxgran.sampling.sample import BLOCKS, Sample
+
+TIMES = 4
+FLOWS = jg.ShearFlow(16, [0.5, 0.9], 0.6, 1e-3)
+SERIES = snapshot_of(np.random.default_rng(0).uniform(0, 40, (TIMES, 5, 2)), [[(0, 1, 0.1)], [], [], [(2, 3, 0.2)]])
+SAMPLES = Sample(random_tally(np.random.default_rng(1), 2, BLOCKS), np.full(2, 81.0), np.ones(2), 16)
+VALUES = {"ShearFlow": FLOWS, "State": SERIES.state, "Grains": SERIES.state.grains, "Snapshot": SERIES}
+VALUES |= {"Sample": SAMPLES, "Tally": SAMPLES.tally}
+INDEXED = ("ShearFlow", "State", "Snapshot", "Sample")
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_a_value_equals_its_copy_and_nothing_else(name: str) -> None:
+    value = VALUES[name]
+    copy = jax.tree.map(jnp.array, value)
+    assert (value == copy) is True and (value != copy) is False
+    leaves, structure = jax.tree.flatten(value)
+    other = jax.tree.unflatten(structure, [*leaves[:-1], np.asarray(leaves[-1]) + 1])
+    shorter = jax.tree.map(lambda x: x[:1], value)
+    assert (value == other) is False and (value == shorter) is False and value != 3
+
+
+def test_nan_equals_nan_and_the_number_of_grains_counts() -> None:
+    lost = replace(SAMPLES, area=np.array([np.nan, 1.0]))
+    assert lost == jax.tree.map(jnp.asarray, lost) and lost != SAMPLES
+    assert replace(SAMPLES, grains=17) != SAMPLES
+
+
+def test_equal_flows_have_equal_hashes_however_they_name_the_rule() -> None:
+    named, numbered = (jg.ShearFlow(16, 0.5, 0.6, 1e-3, activation=rule) for rule in ("midpoint", 0.5))
+    assert named == numbered and len({named, numbered}) == 1
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(FLOWS)
+
+
+def test_values_that_jax_traces_are_not_compared() -> None:
+    with pytest.raises(InputError, match="cannot be compared while JAX traces them") as refused:
+        jax.jit(lambda state: state == SERIES.state)(SERIES.state)
+    assert one_sentence(str(refused.value))
+
+
+def test_no_public_value_compares_arrays_by_their_truth() -> None:
+    public = (getattr(jg, name) for name in jg.__all__)
+    values = [one for one in public if isinstance(one, type) and is_dataclass(one)]
+    of_arrays = [one for one in values if any("rray" in str(field.type) for field in fields(one))]
+    assert len(of_arrays) > 12 and {jg.State, jg.Tracks, jg.Fields} <= {*of_arrays}
+    solvers = {one for one in of_arrays if issubclass(one, jg.ProjectedMethod)}  # they hold single numbers
+    assert {one for one in of_arrays if one.__eq__ is not equal_values} <= solvers
+
+
+@pytest.mark.parametrize("name", INDEXED)
+def test_a_value_with_an_axis_is_indexed_sliced_counted_and_iterated(name: str) -> None:
+    value = VALUES[name]
+    count = len(value)
+    assert count == (2 if name in ("ShearFlow", "Sample") else TIMES)
+    each = list(value)
+    assert len(each) == count and value[-1] == each[-1] == value[count - 1] != value[0]
+    assert len(value[1:]) == count - 1 and value[1:][0] == value[1] == value[[1, 0]][0]
+    with pytest.raises(IndexError):
+        value[count]
+    with pytest.raises(InputError, match=f"this is one {name}, not a"):
+        value[0][0]
+    with pytest.raises(TypeError, match=f"this is one {name}, not a"):
+        len(value[0])
+    assert value and value[0]
+
+
+def test_every_average_is_an_attribute_with_its_meaning() -> None:
+    named = [name for name, value in vars(Averages).items() if isinstance(value, Average)]
+    assert named == list(OBSERVABLES) and {*OBSERVABLES} <= {*dir(SAMPLES)}
+    for name in OBSERVABLES:
+        np.testing.assert_array_equal(getattr(SAMPLES, name), SAMPLES.averages[name])
+    assert "shear stress over pressure, unit 1" in (Sample.macroscopic_friction.__doc__ or "")
+    np.testing.assert_allclose(SAMPLES.strain, SAMPLES.tally.duration.sum(axis=1))
+
+
+def test_shown_numbers_of_a_sample_are_attributes() -> None:
+    line = repr(SAMPLES[0]).removeprefix("Sample(")
+    shown = [part.split("=")[0] for part in line.split(", ")]
+    assert "macroscopic_friction" in shown and all(hasattr(SAMPLES, name) for name in shown)
+
+
+@pytest.mark.parametrize("one", [SAMPLES, SAMPLES[1]], ids=["batch", "one"])
+def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> None:
+    data, errors = one.to_dataset(), one.errors()
+    axes = ("replica",) if one is SAMPLES else ()
+    for name, (meaning, unit) in OBSERVABLES.items():
+        np.testing.assert_array_equal(data[name], one.averages[name])
+        np.testing.assert_array_equal(data[f"{name}_stderr"], errors[name])
+        assert data[name].dims == (*axes, *(("axis_a", "axis_b") if name in TENSORS else ()))
+        assert data[name].attrs["long_name"] == meaning and data[name].attrs.get("reduced_unit", "1") == unit
+        assert ("standard deviation" in data[f"{name}_stderr"].long_name) == (name in EXTREME_OBSERVABLES)
+    np.testing.assert_array_equal(data.strain, one.strain)
+    assert data.status.flag_meanings.split()[int(np.max(data.status))] == Status(int(np.max(one.status))).name
+
+
+def test_observed_tells_what_is_missing() -> None:
+    with pytest.raises(InputError, match="made without") as without:
+        SAMPLES[0].observed()
+    with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
+        replace(SAMPLES, tally=replace(SAMPLES.tally, observed={"x": np.ones((2, BLOCKS))})).observed()
+    assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
