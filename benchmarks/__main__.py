@@ -2,7 +2,9 @@
 
 import argparse
 import ast
+import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -19,15 +21,47 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.name is None:
         print("\n".join(map(listing, BENCHMARKS)))
         return
-    benchmark = next(one for one in BENCHMARKS if one.name == chosen.name)
-    set_up(benchmark.one_core)
+    benchmark = next((one for one in BENCHMARKS if one.name == chosen.name), None)
+    set_up(benchmark is not None and benchmark.one_core)
     from benchmarks.output import Output, refusal
 
     if not (chosen.quick or chosen.allow_uncommitted) and (why := refusal()):
-        print(f"{benchmark.name}: {why}", file=sys.stderr)
+        print(f"{chosen.name}: {why}", file=sys.stderr)
         raise SystemExit(2)
+    if benchmark is None:
+        raise SystemExit(run_all(chosen))
     options = {name: value for name, value in vars(chosen).items() if name not in SHARED and value is not None}
     import_module(benchmark.module_name).run(Output(chosen.output, chosen.quick), **options)
+
+
+def run_all(chosen: argparse.Namespace) -> int:
+    """Run every benchmark in a process of its own; 1 if one of them fails.
+
+    What is done is noted beside the results with the commit, so that a second call goes on where the first one ended.
+    """
+    from benchmarks.output import hardware
+
+    state = f"{'quick ' if chosen.quick else ''}{hardware()['commit']}"
+    output = chosen.output.resolve()
+    output.mkdir(parents=True, exist_ok=True)
+    ledger = output / ".all"
+    done = set(ledger.read_text().splitlines()) if ledger.exists() else set()
+    flags = [f"--{name.replace('_', '-')}" for name in ("quick", "allow_uncommitted") if getattr(chosen, name)]
+    failed = 0
+    for benchmark in BENCHMARKS:
+        note = f"{state} {benchmark.name}"
+        if note in done:
+            continue
+        print(f"{benchmark.name}: {benchmark.question}", flush=True)
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "benchmarks", benchmark.name, "--output", str(output), *flags]
+        code = subprocess.run(command, cwd=ROOT).returncode
+        print(f"{benchmark.name}: status {code}, {(time.perf_counter() - start) / 60:.1f} minutes", flush=True)
+        failed |= code != 0
+        if not (code or state.endswith("-dirty")):
+            with ledger.open("a") as file:
+                file.write(f"{note}\n")
+    return int(failed)
 
 
 def listing(benchmark: Benchmark) -> str:
@@ -48,6 +82,8 @@ def parser() -> argparse.ArgumentParser:
     shared.add_argument(
         "--allow-uncommitted", action="store_true", help="write results although the tree has uncommitted changes"
     )
+    about = "run all of them, one after the other; a second call goes on where the first one ended"
+    names.add_parser("all", parents=[shared], help=about, description=about)
     for benchmark in BENCHMARKS:
         one = names.add_parser(
             benchmark.name,

@@ -17,14 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, PercentFormatter, StrMethodFormatter
 
 import jaxgran as jg
-from benchmarks.output import Output
+from benchmarks.output import Output, rounded
 from jaxgran.environment import usable_cores
 from jaxgran.inference.closure import LAWS
 from jaxgran.inference.cross_validation import leave_one_out
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import read_dataset
 
-SMALLER = {"grains": 64, "seeds": 1, "strain": 4.0}
+SMALLER = {"grains": 64, "seeds": 1, "strain": 20.0}
 NAMES = ("pressure", "shear_stress", "force_ratio")
 TARGETS = {"pressure": 0.05, "force_ratio": 0.08}
 STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v"))  # of the restitutions, in turn
@@ -49,7 +49,7 @@ def run(output: Output, dataset: Path | None = None) -> None:
     print(f"  pulls, rms: {summary['restitution']['pull']:.2f}")
     made_by = {k: str(v) for k, v in data.attrs.items()}
     head = {"run": made_by, "closure": coefficients(closure), "summary": summary}
-    output.write_rows("closure", rounded(head), "points", rounded(rows(data, errors)))
+    output.write_rows("closure", rounded(head, 5), "points", rounded(rows(data, errors), 5))
     output.write_picture(draw(data, errors), "closure")
 
 
@@ -127,15 +127,6 @@ def rows(data: xr.Dataset, errors: xr.Dataset) -> list[dict]:
         for nu in errors.packing_fraction.values
         for alpha in errors.restitution.values
     ]
-
-
-def rounded(value):
-    """Numbers to five digits, anywhere within lists and dictionaries."""
-    if isinstance(value, dict):
-        return {k: rounded(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [rounded(v) for v in value]
-    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def draw(data: xr.Dataset, errors: xr.Dataset) -> Figure:

@@ -160,7 +160,9 @@ def draw(rows: list[dict]) -> Figure:
         axes.set_ylim(0.8, 1.0)
         axes.tick_params(labelsize=8)
         axes.set_title(name.replace("_", " "), fontsize=8)
-    panels[0].set_ylabel("95 % intervals that cover", fontsize=8)
-    panels[0].set_xlabel("strain / correlation strain", fontsize=8)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower right", ncols=3, fontsize=7, frameon=False)
+        axes.set_xlabel("strain / correlation strain", fontsize=7.5)
+    panels[0].set_ylabel("coverage of 95 % intervals", fontsize=8)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=7, frameon=False
+    )
     return figure

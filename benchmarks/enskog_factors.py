@@ -1,6 +1,6 @@
 """Which assumption of kinetic theory fails, against the time step and the number of grains: what survives the limits?
 
-Five flows, midpoint rule. The contact pressure and shear stress over Enskog's are split into four factors, see
+Five flows, midpoint rule. Contact stresses and dissipation rate over Enskog's are split into five factors, see
 ``jaxgran.sampling.enskog_factors``. Against dt at N = 256, from 1e-2 to 1e-5: each seed reaches its steady state at
 dt = 1e-3; from there the coarser step is sampled, then the finer ones in turn, each after a strain of 0.5. Against
 N at dt = 1e-3, from 100 to 1600. A seed is sampled over a strain of 2√N, as the correlation strain of a flow grows
@@ -26,13 +26,15 @@ from matplotlib.lines import Line2D
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
+from jaxgran.maps.theory_variables import LENGTHS
 from jaxgran.plotting.drawing import curve_styles
-from jaxgran.sampling.enskog_factors import FACTORS, STRESSES, stress_factors
+from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
 from jaxgran.sampling.sample import estimates
 
 START = 1e-3  # time step of the steady state, and of all numbers of grains
 RELAXATION = 0.5
 TITLES = {
+    "local_temperature": "local\ntemperature",
     "anisotropy": "anisotropy\nof the temperature",
     "chaos": "chaos: squared\nspeed of approach",
     "pairs": "pair correlation\nat contact",
@@ -106,10 +108,15 @@ def samples(plan: Plan, task: tuple[int, tuple[float, float], int]) -> dict[floa
 
 def row(flow: jg.ShearFlow, seeds: list[jg.Sample]) -> dict:
     """The factors of one flow with their standard errors, and what else is known of it."""
-    value, error = (found | more for found, more in zip(stress_factors(flow, seeds), estimates(seeds), strict=True))
+    value, error = (
+        found | more for found, more in zip(measured_over_enskog(flow, seeds), estimates(seeds), strict=True)
+    )
     warm = value["local_granular_temperature"] / value["granular_temperature"]
     numbers = {"force_ratio": [value["force_ratio"], error["force_ratio"]]}
-    numbers |= {name: [value[name], error[name]] for name in (f"{s}_{f}" for s in STRESSES for f in FACTORS)}
+    numbers |= {
+        name: [value[name], error[name]]
+        for name in (*(f"{rate}_{factor}" for rate in RATES for factor in FACTORS), *LENGTHS)
+    }
     return {
         "alpha": flow.restitution,
         "nu": flow.packing_fraction,
@@ -131,7 +138,7 @@ def line(one: dict) -> str:
 
 def draw(plan: Plan, rows: list[dict]) -> Figure:
     """The factors of the pressure: a row for each, against dt on the left and N on the right, a line for each flow."""
-    figure = Figure(figsize=(7.4, 8.4), layout="constrained")
+    figure = Figure(figsize=(7.4, 9.6), layout="constrained")
     grid = figure.subplots(len(FACTORS), 2, sharex="col", sharey="row")
     sides = (("timestep", "grains", plan.size_of_timesteps), ("grains", "timestep", START))
     for panels, factor in zip(grid, FACTORS, strict=True):

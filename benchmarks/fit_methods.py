@@ -25,6 +25,7 @@ from benchmarks.fit_coverage import CONTACT_DURATION, FRACTION, GRAINS, peculiar
 from benchmarks.fit_rivals import Noise, by_hand, by_simulations, pairs_of
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
+from jaxgran.plotting.drawing import label_log_axis
 
 RESTITUTIONS = (0.6, 0.9)  # the second with FEW_FRAMES alone
 NOISES = ((0.01, 1e-4), (0.05, 1e-3))  # of velocities over their root mean square, of positions in σ
@@ -121,7 +122,7 @@ def report_line(row: dict) -> str:
 def draw(rows: list[dict]) -> Figure:
     """Errors against frames, against the interval between frames, and against seconds; a row of panels a noise."""
     noises = sorted({(row["velocity_noise"], row["position_noise"]) for row in rows})
-    figure = Figure(figsize=(10.8, 3.3 * len(noises) + 0.5), layout="constrained")
+    figure = Figure(figsize=(6.7, 2.1 * len(noises) + 0.5), layout="constrained")
     panels = figure.subplots(len(noises), 3, sharey="row", squeeze=False)
     for noise, line in zip(noises, panels, strict=True):
         here = [r for r in rows if (r["velocity_noise"], r["position_noise"]) == noise]
@@ -131,23 +132,26 @@ def draw(rows: list[dict]) -> Figure:
             more = sorted((r for r in mine if r["interval"] == INTERVAL), key=lambda r: r["frames"])
             apart = sorted((r for r in mine if r["frames"] == FEW_FRAMES), key=lambda r: r["interval"])
             open_mark = "hand" in name
-            style = {"marker": marker, "ls": dashes, "color": grey, "ms": 5, "mfc": "white" if open_mark else grey}
+            style = {"marker": marker, "ls": dashes, "color": grey, "ms": 4, "mfc": "white" if open_mark else grey}
             for axis, x, some in ((line[0], "frames", more), (line[1], "interval", apart), (line[2], "seconds", more)):
                 error = [min(r["error_stderr"], 0.7 * r["error"]) for r in some]
                 axis.errorbar([r[x] for r in some], [r["error"] for r in some], error, label=name, **style)
         for axis in line:
             axis.set(xscale="log", yscale="log")
+            axis.tick_params(labelsize=7.5)
         for axis, x in zip(line, ("frames", "interval"), strict=False):
             axis.set_xticks(sorted({r[x] for r in here}), minor=False)
             axis.set_xticks([], minor=True)
             axis.xaxis.set_major_formatter("{x:g}")
-        line[0].set_ylabel("error of α (rms)")
-        line[0].set_title(f"velocities {100 * noise[0]:g} %, positions {noise[1]:g} σ", fontsize=10, loc="left")
-    panels[-1, 0].set_xlabel(f"frames, a strain of {INTERVAL:g} apart")
-    panels[-1, 1].set_xlabel(f"strain between frames, {FEW_FRAMES} frames")
-    panels[-1, 2].set_xlabel("seconds of one trajectory")
+        label_log_axis(line[0].yaxis)
+        line[0].set_ylabel(r"rms error of $\alpha$", fontsize=8)
+        title = rf"noise of velocities {100 * noise[0]:g} %, of positions {noise[1]:g} $\sigma$"
+        line[0].set_title(title, fontsize=8, loc="left")
+    panels[-1, 0].set_xlabel(f"frames, a strain of {INTERVAL:g} apart", fontsize=8)
+    panels[-1, 1].set_xlabel(f"strain between frames, {FEW_FRAMES} frames", fontsize=8)
+    panels[-1, 2].set_xlabel("time of a fit (s)", fontsize=8)
     figure.legend(
-        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9
+        *panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=7.5
     )
     return figure
 
@@ -169,4 +173,4 @@ def run(output: Output) -> None:
             print(report_line(rows[-1]), flush=True)
     head = {"grains": GRAINS, "packing_fraction": FRACTION, "contact_duration": CONTACT_DURATION}
     output.write_rows("fit_methods", head, "rows", rows)
-    output.write_picture(draw(rows), "fit_methods")
+    output.write_picture(draw(rows), "fit_methods", dpi=200)

@@ -106,8 +106,8 @@ MISTAKES = (
     Mistake(
         "matrix of the other grain",
         "jaxgran/contact/delassus.py",
-        "bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.j] * contacts.inverse_mass_j",
-        "bound = largest[contacts.i] * contacts.inverse_mass_i + largest[contacts.i] * contacts.inverse_mass_j",
+        "taken(largest, contacts.j) * contacts.inverse_mass_j",
+        "taken(largest, contacts.i) * contacts.inverse_mass_j",
         "the diagonal bounds the Delassus operator, without which a solve may diverge",
         ("test_solver.py", "test_networks.py"),
     ),

@@ -27,6 +27,15 @@ def uncommitted() -> list[str]:
     return [line[3:] for line in lines]
 
 
+def rounded(value: Any, digits: int) -> Any:
+    """The numbers to some digits, anywhere within lists and dictionaries."""
+    if isinstance(value, dict):
+        return {name: rounded(x, digits) for name, x in value.items()}
+    if isinstance(value, list):
+        return [rounded(x, digits) for x in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
+
+
 def refusal() -> str | None:
     """Why a full run would write results that no commit stands for, and what to do; None where it would not."""
     changed = uncommitted()

@@ -67,6 +67,12 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "dissipation",
+        "How much less than Enskog's is the dissipation rate, and do a theory's errors follow from it?",
+        (1, 0.5),
+        ("dissipation.json", "dissipation.png"),
+    ),
+    Benchmark(
         "quick_map",
         "What does `jaxgran map` draw when it is given no option?",
         (0.5, 0.4),
@@ -77,6 +83,12 @@ BENCHMARKS = (
         "Do dense flows obey one friction law of the inertial number, and with which exponents?",
         (20, 3),
         ("dense_rheology.json", "dense_rheology.png"),
+    ),
+    Benchmark(
+        "dense_limit",
+        "Are dense flows compatible with the exponents that are published for the jamming transition?",
+        (0.1, 0.1),
+        ("dense_limit.json",),
     ),
     Benchmark(
         "closure_study",
@@ -207,6 +219,18 @@ BENCHMARKS = (
             Option("--largest", "leaves out flows of more grains", int),
             Option("--folder", "where the flows that are done are kept", Path),
         ),
+    ),
+    Benchmark(
+        "size_limits",
+        "What are the averages of a large system, and by which law are they approached?",
+        (0.1, 0.1),
+        ("size_limits.json",),
+    ),
+    Benchmark(
+        "layering",
+        "Do flows separate into layers where their friction grows with the packing fraction?",
+        (40, 0.5),
+        ("layering.json", "layering.png"),
     ),
     Benchmark(
         "coverage",

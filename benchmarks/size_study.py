@@ -95,7 +95,7 @@ def one_seed(flow: jg.ShearFlow, before: float, strain: float, seed: int) -> dic
         state, sample = jg.sample(flow, state, strain / BLOCKS, blocks=1)
         tallies.append(jax.tree.map(lambda x: np.asarray(x[0]), sample.tally))
         structures.append(structure(state))
-    tally = {f"tally_{name}": np.stack([getattr(one, name) for one in tallies]) for name in vars(tallies[0])}
+    tally = {f"tally_{name}": np.stack([getattr(one, name) for one in tallies]) for name in TABLE}
     found = {name: np.stack([one[name] for one in structures]) for name in structures[0]}
     return {"area": np.asarray(state.side) ** 2, **tally, **found}
 

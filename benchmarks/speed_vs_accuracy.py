@@ -13,6 +13,7 @@ import math
 import multiprocessing
 import time
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -26,6 +27,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
+from jaxgran.plotting.drawing import scientific
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.steady_state import prepare_batch
@@ -107,10 +109,12 @@ def samples_of_seed(plan: Plan, task: tuple[tuple[float, float], int]) -> dict[C
     samples = {}
     for config in dict.fromkeys((plan.reference, *plan.configs)):
         strain = plan.reference_strain if config == plan.reference else plan.strain
-        here = jg.ShearFlow(plan.grains, alpha, nu, config.timestep, tolerance=config.tolerance, activation=config[2])
-        relaxed, _ = jax.block_until_ready(jg.sample(here, state, RELAXATION))  # so it is compiled before it is timed
+        here = jg.ShearFlow(plan.grains, alpha, nu, config.timestep, activation=config.activation)
+        solver = jg.BarzilaiBorwein(tolerance=config.tolerance)
+        sampled = partial(jg.sample, here, solver=solver)
+        relaxed, _ = jax.block_until_ready(sampled(state, RELAXATION))  # so it is compiled before it is timed
         begin = time.process_time()
-        _, sample = jax.block_until_ready(jg.sample(here, relaxed, strain))
+        _, sample = jax.block_until_ready(sampled(relaxed, strain))
         seconds = (time.process_time() - begin) / strain
         samples[config] = jax.tree.map(np.asarray, sample), seconds, int(sample.status)
     return samples
@@ -219,8 +223,14 @@ def draw(flows: list[dict], name: str = "pressure") -> Figure:
     panels[0].set_ylabel(f"|relative error| of the {name.replace('_', ' ')}", fontsize=9)
     style = {"linestyle": "none", "markersize": 5, "color": "0.3"}
     handles = [
-        *(Line2D([], [], marker=marker[dt], label=rf"$\Delta t={dt:g}$", **style) for dt in timesteps),
-        *(Line2D([], [], marker="o", label=f"tolerance {t:g}", **{**style, "color": grey[t]}) for t in tolerances),
+        *(
+            Line2D([], [], marker=marker[dt], label=rf"$\Delta t={scientific(dt)}/\dot\gamma$", **style)
+            for dt in timesteps
+        ),
+        *(
+            Line2D([], [], marker="o", label=f"tolerance ${scientific(t)}$", **{**style, "color": grey[t]})
+            for t in tolerances
+        ),
         Line2D([], [], marker="o", label="touching rule", markerfacecolor="white", **style),
         Line2D([], [], marker="x", label="status not ok", **{**style, "color": "#b2182b"}),
         Line2D([], [], marker="*", label="default", **{**style, "markersize": 11, "color": FRONT}),

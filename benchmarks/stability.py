@@ -204,7 +204,7 @@ def gains(tally: jg.Tally, rise: float, rounding: float) -> bool:
 def accepts(alpha: float, nu: float, dt: float) -> bool:
     """Whether a map would run this flow."""
     try:
-        MapSettings((alpha,), (nu,), GRAINS, timestep=dt, strain=1e4)
+        MapSettings((alpha,), (nu,), grains=GRAINS, timestep=dt, strain=1e4)
     except InputError:
         return False
     return True

@@ -28,7 +28,6 @@ def run(output: Output) -> None:
         grains=128 if output.quick else 400,
         seeds=2,
         timestep="auto",
-        strain=8.0,
         error=0.15 if output.quick else 0.03,  # of which sampling takes a standard error of a third
         workers=usable_cores(),
     )

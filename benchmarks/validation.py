@@ -96,7 +96,7 @@ def compared(data: xr.Dataset, point: tuple[float, float], names: tuple[str, ...
                 "error": error,
                 "reference": reference,
                 "percent": 100 * (value / reference - 1),
-                "sigmas": (value - reference) / error,
+                "sigmas": (value - reference) / error if error else float("nan"),
                 "status": meanings[values.index(int(here.status))],
             }
         )

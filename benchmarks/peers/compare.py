@@ -78,7 +78,7 @@ def run(output: Output) -> None:
         "flows": flows,
     }
     output.write_json("peers", result)
-    output.write_picture(draw(flows), "peers")
+    output.write_picture(draw(flows), "peers", dpi=200)
 
 
 def compare_peers(plan: Plan, case: Case, peers: list) -> dict:

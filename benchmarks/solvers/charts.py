@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from benchmarks.profiles import STYLES
 from benchmarks.solvers.groups import CONSTRUCTED, FLOW_GROUPS
 from benchmarks.solvers.measure import LIMIT
+from jaxgran.plotting.drawing import scientific
 
 DRAWN = (
     *("numba engine", "barzilai-borwein", "Gauss–Seidel"),
@@ -35,7 +36,7 @@ def draw_times(summary: Sequence[Mapping[str, Any]], targets: Sequence[float] = 
             style = {"color": colour, "marker": marker, "linestyle": "none", "ms": 6 if ours else 4.5}
             axes.plot(1e3 * times, range(len(groups)), label=name, **style, mfc=colour if ours else "none")
         axes.set(xscale="log", xlim=(1e-3, 1e3 * LIMIT))
-        axes.set_title(f"to a residual of {target:.0e}", fontsize=9)
+        axes.set_title(f"to a residual of ${scientific(target)}$", fontsize=9)
         axes.set_xlabel("median time of a solve (ms)", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.grid(alpha=0.3)
