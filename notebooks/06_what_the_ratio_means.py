@@ -48,12 +48,13 @@ table.round(4).to_dataframe().reset_index().drop(columns="packing_fraction")
 # %% [markdown]
 # ## The stress, taken apart
 #
-# Enskog's theory has a contact pressure at the measured temperature. Four factors lead from it to the measured one: the
-# anisotropy of the temperature, the speeds at which grains approach (one if velocities are independent: molecular
-# chaos), the pairs that are there, and the impulses (one if collisions are binary). Their product is exact.
+# Enskog's theory has a contact pressure at the measured temperature. Five factors lead from it to the measured one: the
+# temperature of neighbours in place of that of all grains, its anisotropy, the speeds at which grains approach (one if
+# velocities are independent: molecular chaos), the pairs that are there, and the impulses (one if collisions are
+# binary). Their product is exact.
 
 # %%
-factors = ["anisotropy", "chaos", "pairs", "binary"]
+factors = ["local_temperature", "anisotropy", "chaos", "pairs", "binary"]
 loss = {name: flows[f"theory/enskog_factor_pressure_{name}"].sel(packing_fraction=0.6) for name in factors}
 whole = (flows["stresses/contact_pressure"] / flows["theory/enskog_pressure"]).sel(packing_fraction=0.6)
 split = xr.Dataset(loss).assign(product=whole)
@@ -64,22 +65,20 @@ split.round(3).to_dataframe().reset_index().drop(columns="packing_fraction")
 # lose goes over into more pairs that approach more slowly.
 
 # %%
-error = abs(whole / (loss["anisotropy"] * loss["chaos"] * loss["pairs"] * loss["binary"]) - 1)
+error = abs(whole / split[factors].to_array().prod("variable") - 1)
 assert float(error.max()) < 1e-9
 print("product at the finest over that at the coarsest time step, α = 0.2 and 0.5:")
 print((whole.isel(timestep=-1) / whole.isel(timestep=0)).values.round(3))
 
 # %% [markdown]
-# Against the number of grains: long waves of velocity heat the granular temperature, not the collisions. So chaos falls
-# with N as the local temperature over the granular one does.
+# Against the number of grains: long waves of velocity heat the granular temperature, not the collisions. So the factor
+# of the local temperature falls with N, and chaos does not.
 
 # %%
 sizes = [64, 128] if quick else [100, 400, 1600]
 grown = jg.ratio_map([0.5], [0.6], grains=sizes, seeds=1, **chosen).isel(packing_fraction=0, restitution=0)
-share = grown.local_granular_temperature / grown.granular_temperature
-xr.Dataset(
-    {"chaos": grown["theory/enskog_factor_pressure_chaos"], "local over granular temperature": share}
-).to_dataframe().round(3)
+both = {name: grown[f"theory/enskog_factor_pressure_{name}"] for name in ("local_temperature", "chaos")}
+xr.Dataset(both).to_dataframe().round(3)
 
 # %% [markdown]
 # ## Where which assumption fails
