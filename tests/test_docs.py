@@ -1,6 +1,7 @@
 """The documentation is complete: pages, names and links exist; examples of docstrings, pages and README run."""
 
 import ast
+import copy
 import doctest
 import os
 import re
@@ -10,10 +11,12 @@ from importlib import import_module
 from pathlib import Path
 
 import jax
+import jinja2
 import netCDF4
 import pytest
 
 import jaxgran
+from benchmarks import pages
 
 ROOT = Path(jaxgran.__file__).parents[1]
 PAPER = ROOT / "docs" / "paper"
@@ -93,6 +96,28 @@ def test_every_name_in_backticks_exists() -> None:
     assert not unknown, "\n".join(f"{place} has {', '.join(found)}" for place, found in unknown.items())
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("benchmarks/")])
+def test_measured_numbers_of_a_page_come_from_files(page: str) -> None:
+    text = (DOCS / page).read_text(encoding="utf-8")
+    filled = pages.filled(text)
+    assert "{%" not in filled and "{{" not in filled
+    written = re.sub(r"{{.*?}}|{%.*?%}", "", text)  # what remains was typed
+    assert not re.search(r"\d ± \d|[−+]\d[\d.]* %", written)
+
+
+def test_a_changed_result_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (DOCS / "benchmarks" / "speed.md").read_text(encoding="utf-8")
+    before = pages.filled(text)
+    changed = copy.deepcopy(pages.read("step_cost"))
+    changed["points"][0]["jaxgran_us"] *= 1.5
+    monkeypatch.setattr(pages, "read", lambda name, read=pages.read: changed if name == "step_cost" else read(name))
+    lines = zip(before.splitlines(), pages.filled(text).splitlines(), strict=True)
+    changed_lines = [one for one, other in lines if one != other]
+    assert len(changed_lines) == 1 and changed_lines[0].startswith("| 0.9 | 0.56 |")
+    with pytest.raises(jinja2.UndefinedError):
+        pages.filled("{{ results.step_cost.no_such_name }}")
+
+
 def test_every_public_name_is_in_the_reference() -> None:
     pages = [page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md")]
     shown = re.findall(r"^::: jaxgran\.(\w+)$", "\n".join(pages), re.MULTILINE)
@@ -100,7 +125,7 @@ def test_every_public_name_is_in_the_reference() -> None:
     assert len(shown) == len(set(shown))
 
 
-@pytest.mark.parametrize("module", MODULES)
+@pytest.mark.parametrize("module", [*MODULES, "benchmarks.pages"])
 def test_examples_of_docstrings_hold(module: str) -> None:
     outcome = doctest.testmod(import_module(module))
     assert outcome.attempted > 0

@@ -4,13 +4,14 @@ Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` o
 from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
 ``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
 the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPTIONS COMMAND}`` for its options, and ``{BENCHMARKS}`` for the table of
-``benchmarks/registry.py``.
+``benchmarks/registry.py``. Pages of benchmarks are templates, see ``benchmarks/pages.py``.
 """
 
 import ast
 import importlib
 import re
 import runpy
+import sys
 from pathlib import Path
 
 import architecture
@@ -27,6 +28,8 @@ from jaxgran.maps.results import read_dataset
 from jaxgran.page.explore import explore
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+from benchmarks import pages  # noqa: E402 - not installed, but beside the package
 CHARTS = ROOT / "benchmarks" / "results"
 CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.png)"[^>]*>)')
 PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "security.md": "SECURITY.md"}
@@ -52,6 +55,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put in the tables of what is measured and of the benchmarks."""
+    if page.file.src_uri.startswith("benchmarks/"):
+        markdown = pages.filled(markdown)
     charts = "../" * page.file.src_uri.count("/") + "charts/"
     markdown = re.sub(r"\{OPTIONS (\w+)\}", lambda mark: options(mark[1]), markdown)
     for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():

@@ -1,0 +1,199 @@
+"""Measured numbers of a page, filled in from ``benchmarks/results`` when the site is built.
+
+A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a value with its standard error, and a loop
+over the rows of a result makes a table, so that neither can differ from the file. A name that a file does not have
+stops the build. Markdown needs braces for itself: comments of Jinja are ``{=# … #=}``.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from benchmarks.output import RESULTS
+from benchmarks.peers import front
+from benchmarks.solvers.groups import GROUPS
+from jaxgran.maps.results import read_dataset
+from jaxgran.model.display import with_error
+
+
+class Results:
+    """The JSON files of ``benchmarks/results``, each by its name as an attribute."""
+
+    def __getattr__(self, name: str) -> Any:
+        return read(name)
+
+
+@cache
+def read(name: str) -> Any:
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def at(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any]:
+    """The one row with these values; an error if there is none, or more than one.
+
+    Examples:
+      >>> at([{"nu": 0.2, "p": 1}, {"nu": 0.6, "p": 4}], nu=0.6)["p"]
+      4
+    """
+    (row,) = (row for row in rows if all(row[name] == value for name, value in conditions.items()))
+    return row
+
+
+def sig(value: float, digits: int = 2) -> str:
+    """A number rounded to some significant digits, with commas between thousands and without an exponent above 1e-4.
+
+    Examples:
+      >>> sig(0.12346), sig(1234.5, 3), sig(99999), sig(3.2e-7), sig(1.0, 3)
+      ('0.12', '1,230', '100,000', '3.2e-07', '1')
+    """
+    if value == 0 or not math.isfinite(value) or abs(value) < 1e-4:
+        return f"{value:.{digits}g}"
+    places = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    return (
+        f"{round(value, places):,.{max(places, 0)}f}".rstrip("0").rstrip(".")
+        if places > 0
+        else f"{round(value, places):,.0f}"
+    )
+
+
+def percent(value: float, digits: int = 2) -> str:
+    """A fraction in percent.
+
+    Examples:
+      >>> percent(0.0123), percent(-0.2)
+      ('1.2 %', '−20 %')
+    """
+    return sig(100 * value, digits).replace("-", "−") + " %"
+
+
+def pm(value: float, error: float) -> str:
+    """A value and its standard error, with a true minus sign.
+
+    Examples:
+      >>> pm(-0.0123, 0.0042)
+      '−0.012 ± 0.004'
+    """
+    return with_error(value, error).replace("-", "−")
+
+
+def duration(seconds: float, digits: int = 2) -> str:
+    """Seconds in the unit that fits.
+
+    Examples:
+      >>> duration(2.4e-6), duration(0.0017), duration(5.0), duration(600)
+      ('2.4 µs', '1.7 ms', '5 s', '10 min')
+    """
+    for unit, size in (("µs", 1e-6), ("ms", 1e-3), ("s", 1.0)):
+        if seconds < 999.5 * size if unit != "s" else seconds < 300:
+            return f"{sig(seconds / size, digits)} {unit}"
+    return f"{sig(seconds / 60, digits)} min"
+
+
+@cache
+def _map(file: str) -> Any:
+    return read_dataset(RESULTS / file)
+
+
+def point(file: str, name: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
+    """A variable of a map at a point, and its standard error; 0 for a prediction, which has none."""
+    data, chosen = _map(file), {"restitution": restitution, "packing_fraction": packing_fraction}
+    error = 0.0 if name.startswith("theory/") else float(data[f"{name}_stderr"].sel(chosen))
+    return float(data[name].sel(chosen)), error
+
+
+def percent_pm(value_and_error: Iterable[float]) -> str:
+    """A fraction with its standard error, in percent.
+
+    Examples:
+      >>> percent_pm((0.0123, 0.0042))
+      '1.2 ± 0.4 %'
+    """
+    return pm(*(100 * x for x in value_and_error)) + " %"
+
+
+def signed(value: float, places: int = 1) -> str:
+    """A number with its sign.
+
+    Examples:
+      >>> signed(-0.42), signed(3.0, 0)
+      ('−0.4', '+3')
+    """
+    return f"{value:+.{places}f}".replace("-", "−")
+
+
+def over(one: Sequence[float], other: Sequence[float]) -> tuple[float, float]:
+    """By how much a value exceeds another, relative to the other, and its standard error; both with their errors.
+
+    Examples:
+      >>> over((1.5, 0.03), (1.0, 0.0))
+      (0.5, 0.03)
+    """
+    quotient = one[0] / other[0]
+    return quotient - 1, quotient * math.hypot(one[1] / one[0], other[1] / other[0])
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root mean square."""
+    return math.sqrt(sum(value**2 for value in values) / len(values))
+
+
+def differences_in_sigmas(rows: Iterable[Mapping[str, Any]], reference: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Differences of the rows of ``validation`` from the flows of ``contact_duration``, in standard errors of both."""
+    pairs = (
+        over((row["value"], row["error"]), at(reference, flow=[row["nu"], row["alpha"]])[row["observable"]])
+        for row in rows
+    )
+    return [difference / error for difference, error in pairs]
+
+
+def farthest_from_one(rows: Iterable[Mapping[str, float]], name: str) -> Mapping[str, float]:
+    """The row whose value is farthest from one."""
+    return max(rows, key=lambda row: abs(row[name] - 1))
+
+
+def ranked(summary: Iterable[Mapping[str, Any]], group: str, target: float) -> list[Mapping[str, Any]]:
+    """The solvers that solve the median problem of a group to a target, the fastest first."""
+    rows = [row for row in summary if row["group"] == group and row["target"] in (target, 0) and row["seconds"]]
+    return sorted(rows, key=lambda row: row["seconds"])
+
+
+def shares_of_clusters(excesses: Iterable[float] = (0.1, 0.25, 0.45, 0.77, 1.6, 4.0)) -> list[tuple[float, float]]:
+    """Excess and share of clusters in the contact pressure, at the points of the paper's map nearest to these."""
+    data = _map("paper.nc")
+    found = np.stack([np.ravel(data.force_ratio - 1), np.ravel(data["stresses/cluster_pressure_share"])], axis=1)
+    return [tuple(min(found.tolist(), key=lambda point: abs(point[0] - excess))) for excess in excesses]
+
+
+def largest_quotient(rows: Iterable[Mapping[str, float]], one: str, other: str) -> float:
+    """The largest relative difference of two columns."""
+    return max(abs(row[one] / row[other] - 1) for row in rows)
+
+
+ENVIRONMENT = jinja2.Environment(
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    comment_start_string="{=#",
+    comment_end_string="#=}",
+    keep_trailing_newline=True,
+    autoescape=False,
+)
+ENVIRONMENT.filters |= {
+    "e": lambda value: f"{float(value):.0e}".replace("e-0", "e-"),
+    "g": lambda value: f"{float(value):g}",
+}
+ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
+ENVIRONMENT.globals |= {
+    one.__name__: one for one in (abs, max, at, point, sig, percent, percent_pm, pm, duration, signed)
+}
+ENVIRONMENT.globals |= {one.__name__: one for one in (over, rms, ranked, shares_of_clusters)}
+ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, largest_quotient, farthest_from_one)}
+
+
+def filled(page: str) -> str:
+    """A page with its numbers."""
+    return ENVIRONMENT.from_string(page).render()
