@@ -169,9 +169,9 @@ def shares_of_clusters(excesses: Iterable[float] = (0.1, 0.25, 0.45, 0.77, 1.6, 
     return [tuple(min(found.tolist(), key=lambda point: abs(point[0] - excess))) for excess in excesses]
 
 
-def largest_quotient(rows: Iterable[Mapping[str, float]], one: str, other: str) -> float:
-    """The largest relative difference of two columns."""
-    return max(abs(row[one] / row[other] - 1) for row in rows)
+def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list[float]:
+    """One column over another."""
+    return [row[one] / row[other] for row in rows]
 
 
 ENVIRONMENT = jinja2.Environment(
@@ -191,7 +191,7 @@ ENVIRONMENT.globals |= {
     one.__name__: one for one in (abs, max, at, point, sig, percent, percent_pm, pm, duration, signed)
 }
 ENVIRONMENT.globals |= {one.__name__: one for one in (over, rms, ranked, shares_of_clusters)}
-ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, largest_quotient, farthest_from_one)}
+ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, quotients, farthest_from_one)}
 
 
 def filled(page: str) -> str:

@@ -4,7 +4,7 @@ Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` o
 from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
 ``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
 the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPTIONS COMMAND}`` for its options, and ``{BENCHMARKS}`` for the table of
-``benchmarks/registry.py``. Pages of benchmarks are templates, see ``benchmarks/pages.py``.
+``benchmarks/registry.py``. Pages are templates, see ``benchmarks/pages.py``.
 """
 
 import ast
@@ -55,8 +55,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put in the tables of what is measured and of the benchmarks."""
-    if page.file.src_uri.startswith("benchmarks/"):
-        markdown = pages.filled(markdown)
+    markdown = pages.filled(markdown)
     charts = "../" * page.file.src_uri.count("/") + "charts/"
     markdown = re.sub(r"\{OPTIONS (\w+)\}", lambda mark: options(mark[1]), markdown)
     for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():
