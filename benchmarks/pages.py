@@ -44,6 +44,16 @@ def at(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any
     return row
 
 
+def found(rows: Iterable[Mapping[str, Any]], **conditions: Any) -> Mapping[str, Any] | None:
+    """The first row with these values, None if there is none."""
+    return next((row for row in rows if all(row[name] == value for name, value in conditions.items())), None)
+
+
+def flows_of(rows: Iterable[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """The pairs of restitution and packing fraction of some rows, each once."""
+    return list(dict.fromkeys((row["restitution"], row["packing_fraction"]) for row in rows))
+
+
 def sig(value: float, digits: int = 2) -> str:
     """A number rounded to some significant digits, with commas between thousands and without an exponent above 1e-4.
 
@@ -190,7 +200,7 @@ ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVE
 ENVIRONMENT.globals |= {
     one.__name__: one for one in (abs, max, at, point, sig, percent, percent_pm, pm, duration, signed)
 }
-ENVIRONMENT.globals |= {one.__name__: one for one in (over, rms, ranked, shares_of_clusters)}
+ENVIRONMENT.globals |= {one.__name__: one for one in (over, rms, found, flows_of, ranked, shares_of_clusters)}
 ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, quotients, farthest_from_one)}
 
 
