@@ -59,16 +59,12 @@ def sig(value: float, digits: int = 2) -> str:
 
     Examples:
       >>> sig(0.12346), sig(1234.5, 3), sig(99999), sig(3.2e-7), sig(1.0, 3)
-      ('0.12', '1,230', '100,000', '3.2e-07', '1')
+      ('0.12', '1,230', '100,000', '3.2e-07', '1.00')
     """
     if value == 0 or not math.isfinite(value) or abs(value) < 1e-4:
         return f"{value:.{digits}g}"
-    places = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    return (
-        f"{round(value, places):,.{max(places, 0)}f}".rstrip("0").rstrip(".")
-        if places > 0
-        else f"{round(value, places):,.0f}"
-    )
+    rounded = float(f"{value:.{digits - 1}e}")
+    return f"{rounded:,.{max(digits - 1 - math.floor(math.log10(abs(rounded))), 0)}f}"
 
 
 def percent(value: float, digits: int = 2) -> str:
@@ -96,7 +92,7 @@ def duration(seconds: float, digits: int = 2) -> str:
 
     Examples:
       >>> duration(2.4e-6), duration(0.0017), duration(5.0), duration(600)
-      ('2.4 µs', '1.7 ms', '5 s', '10 min')
+      ('2.4 µs', '1.7 ms', '5.0 s', '10 min')
     """
     for unit, size in (("µs", 1e-6), ("ms", 1e-3), ("s", 1.0)):
         if seconds < 999.5 * size if unit != "s" else seconds < 300:
