@@ -108,7 +108,7 @@ def _map(file: str) -> Any:
 def point(file: str, name: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
     """A variable of a map at a point, and its standard error; 0 for a prediction, which has none."""
     data, chosen = _map(file), {"restitution": restitution, "packing_fraction": packing_fraction}
-    error = 0.0 if name.startswith("theory/") else float(data[f"{name}_stderr"].sel(chosen))
+    error = float(data[f"{name}_stderr"].sel(chosen)) if f"{name}_stderr" in data else 0.0
     return float(data[name].sel(chosen)), error
 
 
