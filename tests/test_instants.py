@@ -18,8 +18,8 @@ from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.replicas import replicas
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
+from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.status import Status
@@ -56,11 +56,11 @@ def window() -> Iterator[float]:
 
 @pytest.fixture(scope="module")
 def with_instants(window) -> dict[Key, Replica]:
-    return dict(replicas(replace(SETTINGS, snapshots=True), batch=2))
+    return dict(run_replicas(replace(SETTINGS, snapshots=True), batch=2))
 
 
 def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_instants) -> None:
-    plain = dict(replicas(SETTINGS, batch=2))
+    plain = dict(run_replicas(SETTINGS, batch=2))
     assert all(replica.instant is None for replica in plain.values())
     for key, replica in with_instants.items():
         jax.tree.map(np.testing.assert_array_equal, replica._replace(instant=None), plain[key])
