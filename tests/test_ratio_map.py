@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from synthetic import random_replica
 
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps import replicas as replicas_module
+from jaxgran.maps import run_replicas as run_replicas_module
 from jaxgran.maps.batches import batches, predicted_cost
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.interruption import Interrupted
@@ -115,8 +115,8 @@ def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> 
 
 def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
     mixed = [
-        *replicas_module._run_task(settings, [(1, 1), (0, 0)]),
-        *replicas_module._run_task(settings, [(1, 0), (0, 1)]),
+        *run_replicas_module._run_task(settings, [(1, 1), (0, 0)]),
+        *run_replicas_module._run_task(settings, [(1, 0), (0, 1)]),
     ]
     assert_same_bits(dict(mixed), results)
 
@@ -149,15 +149,17 @@ def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_st
         statuses = {(0, 1): Status.capacity if refinement == 1 else second, (1, 1): Status.infeasible}
         return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
 
-    monkeypatch.setattr(replicas_module, "_measured", measured)
-    done = dict(replicas_module._run_task(settings, task))
+    monkeypatch.setattr(run_replicas_module, "_measured", measured)
+    done = dict(run_replicas_module._run_task(settings, task))
     assert calls == [(task, 1), ([(0, 1)], 2)]
     assert list(done) == task
     assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0, Status.infeasible]
 
 
 def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
-    (key, refined), *_ = replicas_module._measured(settings, [(0, 0)], replicas_module.advance_batch, refinement=2)
+    (key, refined), *_ = run_replicas_module._measured(
+        settings, [(0, 0)], run_replicas_module.advance_batch, refinement=2
+    )
     assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
     assert refined.sample.pressure != results[key].sample.pressure
     data = map_dataset(settings, {**results, key: refined}, {})
@@ -168,7 +170,7 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest, sizes = replicas_module._measured, 1, []
+    measured, largest, sizes = run_replicas_module._measured, 1, []
 
     def bounded(settings, task, advance, refinement: int = 1):
         sizes.append(len(task))
@@ -176,24 +178,24 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
         return measured(settings, task, advance, refinement)
 
-    monkeypatch.setattr(replicas_module, "_measured", bounded)
+    monkeypatch.setattr(run_replicas_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    halved = replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
+    halved = run_replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
     assert sizes == [4, 2, 1, 1, 2, 1, 1]
     assert [key for key, _ in halved] == tasks
     assert_same_bits(dict(halved), results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        replicas_module._run_task(settings, tasks)
+        run_replicas_module._run_task(settings, tasks)
 
 
 def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken_device(*_, **__):
         raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
 
-    monkeypatch.setattr(replicas_module, "prepare_batch", broken_device)
+    monkeypatch.setattr(run_replicas_module, "prepare_batch", broken_device)
     with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
-        replicas_module._run_task(settings, [(0, 0), (0, 1)])
+        run_replicas_module._run_task(settings, [(0, 0), (0, 1)])
 
 
 def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:

@@ -46,7 +46,7 @@ class Contacts:
 class PairMotion(NamedTuple):
     """Separations r_i − r_j of pairs in σ, and relative velocities in the laboratory frame in σγ̇, (pairs,) each.
 
-    The components stand apart, since XLA takes vectors of them to vector instructions.
+    Each component is an array of its own, which XLA vectorises.
     """
 
     x: Float[Array, " pairs"]

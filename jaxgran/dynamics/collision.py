@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgran.contact.delassus import contact_numbers, diagonal, grain_impulses
+from jaxgran.contact.delassus import diagonal, grain_impulses, loads_of_grains
 from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, PairMotion, contact_network, first_contact_time, is_contact
@@ -213,10 +213,10 @@ def _impulses(
     flow: ShearFlow, network: Contacts, grains: Grains, impulses: Array, response: Array, *outcome: Array
 ) -> Impulses:
     """What a solve gives, from the impulses p₀ at restitution zero and their response W p₀."""
-    one_plus_alpha, count = 1 + flow.restitution, grains.radii.size
+    one_plus_alpha = 1 + flow.restitution
     impulses = one_plus_alpha * impulses
-    loaded = contact_numbers(network, impulses > 0, count)
-    return Impulses(impulses, one_plus_alpha * response, grain_impulses(network, impulses, count), loaded, *outcome)
+    on_grains = loads_of_grains(network, impulses, grains.radii.size)
+    return Impulses(impulses, one_plus_alpha * response, *on_grains, *outcome)
 
 
 def _binary_impulses(flow: ShearFlow, network: Contacts) -> Float[Array, " contacts"]:
