@@ -10,7 +10,7 @@ from typing import Any
 
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as the command line does, before JAX is imported
 
-from jaxgran.maps import batches, journal, replicas
+from jaxgran.maps import batches, journal, run_replicas
 
 PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as long as something needs to happen to it
 journal.SECONDS = 0.1  # so that its batches have journals
@@ -18,7 +18,7 @@ batches.batch_size = lambda *_: 2
 figures: Any = SimpleNamespace(save_figures=lambda *_: [])  # drawing takes as long as such a map
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
-advance_batch = replicas.advance_batch
+advance_batch = run_replicas.advance_batch
 FAULT = os.environ.get("FAULT", "")
 
 
@@ -27,7 +27,7 @@ def advance_slowly(*arguments):
     return advance_batch(*arguments)
 
 
-replicas.advance_batch = advance_slowly
+run_replicas.advance_batch = advance_slowly
 
 if FAULT == "disc full":
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -58,11 +58,11 @@ def made_up_film(frames: int = 5) -> Film:
     seen = snapshot_of(rng.uniform(0, 5, (1, 16, 2)), [[(0, 1, 2.0), (1, 2, 1.0), (5, 6, 1.0)]], side=5.0)
     frame = jax.tree.map(lambda x: x[0], seen)
     state: Any = SimpleNamespace(side=np.array([5.0]))
-    recorder: Any = SimpleNamespace(recording=lambda drive: drive)
-    drive = film.recording(recorder)(lambda flow, numerics, state, steps: (state, random_tally(rng, 1)))
+    recorder: Any = SimpleNamespace(recording=lambda advance: advance)
+    advance = film.recording(recorder)(lambda flow, numerics, state, steps: (state, random_tally(rng, 1)))
     for step in steps:
         if step:
-            drive(flow, DEFAULT_NUMERICS, state, np.array([1]))
+            advance(flow, DEFAULT_NUMERICS, state, np.array([1]))
         film.frames.keep(frame, 10 * step)
     return film
 

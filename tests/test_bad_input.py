@@ -70,7 +70,7 @@ def nothing_runs() -> Iterator[None]:
             (steady_state, "prepare_batch"),
             (steady_state, "_heated"),
             (free_cooling, "_cooling"),
-            (ratio_map_module, "replicas"),
+            (ratio_map_module, "run_replicas"),
         ):
             patch.setattr(module, name, would_run)
         patch.setattr(map_settings, "_temperature", cold)
@@ -331,7 +331,7 @@ def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, m
 def accepts_or_refuses(*arguments: str) -> Outcome:
     """Give a command that does not run; nothing is left, and it is accepted or refused in one sentence."""
     with TemporaryDirectory() as name, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ratio_map_module, "replicas", ends)
+        patch.setattr(ratio_map_module, "run_replicas", ends)
         outcome = jaxgran(Path(name), *arguments)
         assert not os.listdir(name)
     if outcome.status != WOULD_RUN:
@@ -520,7 +520,7 @@ def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, t
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     write_few_variables(monkeypatch, *theory.SHARES)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
     for drawing in ("ratio_curves", "cluster_shares"):

@@ -720,7 +720,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
             ((0, seed), random_replica(np.random.default_rng(seed), settings)) for seed in range(settings.seeds)
         )
 
-    monkeypatch.setattr(ratio_map_module, "replicas", notes)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", notes)
     flow = ("run", "--restitution", "0.5", "--packing-fraction", "0.6", "--strain", "20", "--quiet")
     words = "--seeds 2 --first-seed 7 --tolerance 1e-6 --solver jacobi --activation touching"
     assert jaxgran(tmp_path, *flow, *words.split()).status == 0
@@ -730,7 +730,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
 
 def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--quiet")
     assert outcome.status == 0
     assert "points" not in outcome.err
@@ -741,7 +741,7 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
     points = dict(enumerate(Status))
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda *_: None)
     monkeypatch.setattr(
-        ratio_map_module, "replicas", made_up_replicas({(k, 0): status for k, status in points.items()})
+        ratio_map_module, "run_replicas", made_up_replicas({(k, 0): status for k, status in points.items()})
     )
     words = ("--restitution", f"0:0.9:{len(points)}", "--packing-fraction", "0.6", "--seeds", "1")
     outcome = jaxgran(tmp_path, "map", *words)
@@ -762,7 +762,7 @@ def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_poin
     write_without_drawing(monkeypatch)
     write_few_variables(monkeypatch, "large_system/pressure")
     statuses = {(point, 0): Status.ok for point in range(7)} | {(7, 0): Status.deep_overlap}
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(statuses))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(statuses))
     words = [*POINTS, "--seeds", "1", "--grains", "64,128", "--timestep", "1e-3,1e-4"]
     outcome = jaxgran(tmp_path, "map", *words)
     assert outcome.status == 3 and "8/8 points" in outcome.err
@@ -794,7 +794,7 @@ def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_poin
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_few_variables(monkeypatch)
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130
     assert files(tmp_path) == {"half.nc", "half.nc.unfinished"}
@@ -813,7 +813,7 @@ def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch
     class Inside(SystemError):
         __cause__ = KeyboardInterrupt()
 
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, Inside))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
     assert outcome.status == 130 and outcome.err.rstrip().endswith("--output half.nc --resume")
     monkeypatch.setattr("jaxgran.maps.results.read_dataset", Mock(side_effect=Inside))
@@ -828,7 +828,7 @@ def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "old.nc").write_bytes(b"old")
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({}, KeyboardInterrupt))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc", "--overwrite")
     assert outcome.status == 130
     assert (tmp_path / "old.nc").read_bytes() == b"old"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran.contact.network import contact_network, first_contact_time, is_contact
+from jaxgran.contact.network import PairMotion, contact_network, first_contact_time, is_contact
 from jaxgran.model.grains import Grains
 
 EPS = np.finfo(float).eps
@@ -27,6 +27,11 @@ def flights(seed: int, speed: float = 10.0):
     return separations, speed * rng.normal(size=(PAIRS, 2)), reach
 
 
+def motion(separations, velocities) -> PairMotion:
+    """The pairs of these separations and relative velocities."""
+    return PairMotion(*np.transpose(separations), *np.transpose(velocities))
+
+
 def excess(separations, velocities, reach, times):
     """Squared distance less squared reach along the flight (..., pairs)."""
     return np.sum((separations + times[..., None] * velocities) ** 2, axis=-1) - reach**2
@@ -37,7 +42,9 @@ def excess(separations, velocities, reach, times):
 @example(352, 0.1)  # a pair whose closest approach comes before the first instant
 def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
     separations, velocities, reach = flights(seed)
-    contact, approaching = (np.asarray(found) for found in compiled_rule(separations, velocities, reach, look_ahead))
+    contact, approaching = (
+        np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, look_ahead)
+    )
     times = np.linspace(0, look_ahead, INSTANTS)
     along = excess(separations, velocities, reach, times[:, None] * np.ones(PAIRS))
     towards = np.sum(separations * velocities, axis=1) < 0  # even if the closest approach is before the next instant
@@ -54,7 +61,7 @@ def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
 @seeds
 def test_touching_rule_reads_the_gap_alone(seed):
     separations, velocities, reach = flights(seed)
-    contact, _ = compiled_rule(separations, velocities, reach, 0.0)
+    contact, _ = compiled_rule(motion(separations, velocities), reach, 0.0)
     gap = np.linalg.norm(separations, axis=1) - reach
     np.testing.assert_array_equal(contact, gap <= 0)
 
@@ -63,8 +70,10 @@ def test_touching_rule_reads_the_gap_alone(seed):
 @seeds
 def test_looking_ahead_keeps_the_approaching_contacts_and_drops_those_that_part(seed):
     separations, velocities, reach = flights(seed)
-    contact, approaching = (np.asarray(found) for found in compiled_rule(separations, velocities, reach, 0.0))
-    ahead, approaching_ahead = (np.asarray(found) for found in compiled_rule(separations, velocities, reach, 1e-2))
+    contact, approaching = (np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 0.0))
+    ahead, approaching_ahead = (
+        np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 1e-2)
+    )
     assert np.all(approaching_ahead[approaching])
     receding = np.sum(separations * velocities, axis=1) >= 0
     assert np.all(contact[ahead & receding])
@@ -75,7 +84,7 @@ def test_looking_ahead_keeps_the_approaching_contacts_and_drops_those_that_part(
 @seeds
 def test_time_of_first_contact_is_exact(seed):
     separations, velocities, reach = flights(seed)
-    time, closest = (np.asarray(found) for found in compiled_time(separations, velocities, reach))
+    time, closest = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
     closing = np.sum(separations * velocities, axis=1)
     assert np.all((closest > 0) == (closing < 0))
     slope = closing + closest * np.sum(velocities**2, axis=1)
@@ -99,19 +108,19 @@ def test_time_of_first_contact_is_exact(seed):
 def test_rule_and_time_of_first_contact_agree(seed):
     """An approaching pair is a contact just when its first contact comes within the look-ahead time."""
     separations, velocities, reach = flights(seed)
-    time, _ = (np.asarray(found) for found in compiled_time(separations, velocities, reach))
+    time, _ = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
     for look_ahead in (1e-3, 1e-2):
-        _, approaching = compiled_rule(separations, velocities, reach, look_ahead)
+        _, approaching = compiled_rule(motion(separations, velocities), reach, look_ahead)
         decided = ~np.isfinite(time) | (np.abs(time - look_ahead) > 64 * EPS)
         np.testing.assert_array_equal(np.asarray(approaching)[decided], (time <= look_ahead)[decided])
 
 
 def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
     separations, reach = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.9]]), np.array([1.0, 0.99, 1.0])
-    contact, approaching = is_contact(separations, np.zeros((3, 2)), reach, jnp.asarray(1e-2))
+    contact, approaching = is_contact(motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2))
     np.testing.assert_array_equal(contact, [True, False, True])
     assert not np.any(approaching)
-    time, _ = first_contact_time(separations, np.zeros((3, 2)), reach)
+    time, _ = first_contact_time(motion(separations, np.zeros((3, 2))), reach)
     assert np.all(np.isinf(time))
 
 
@@ -123,8 +132,8 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     i, j = rng.integers(0, 64, (2, PAIRS))
     picked = np.array([200, 3, 77])
     index = np.concatenate([picked, np.zeros(slots - 3, int)])
-    slots_of = (x[index] for x in (i, j, separations, velocities))
-    network = jax.tree.map(np.asarray, compiled_network(np.arange(slots) < 3, *slots_of, grains))
+    pairs = motion(separations[index], velocities[index])
+    network = jax.tree.map(np.asarray, compiled_network(np.arange(slots) < 3, i[index], j[index], pairs, grains))
     np.testing.assert_array_equal(network.used, np.arange(slots) < 3)
     np.testing.assert_array_equal(network.i[:3], i[picked])
     np.testing.assert_array_equal(network.j[:3], j[picked])
@@ -143,5 +152,5 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
 
 
 def test_empty_slot_of_the_pair_list_is_no_contact():
-    contact, _ = is_contact(np.array([[1e6, 0.0]]), np.array([[-1e9, 0.0]]), np.array([0.0]), jnp.asarray(0.1))
+    contact, _ = is_contact(motion([[1e6, 0.0]], [[-1e9, 0.0]]), np.array([0.0]), jnp.asarray(0.1))
     assert not np.any(contact)

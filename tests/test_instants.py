@@ -12,14 +12,14 @@ from synthetic import random_instant, random_replica, snapshot_of
 
 from jaxgran.analysis.instant import averaged, instant_of
 from jaxgran.maps import instants
-from jaxgran.maps import replicas as replicas_module
+from jaxgran.maps import run_replicas as run_replicas_module
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.replicas import replicas
 from jaxgran.maps.results import choices_of, read_dataset, write_dataset
+from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.status import Status
@@ -56,11 +56,11 @@ def window() -> Iterator[float]:
 
 @pytest.fixture(scope="module")
 def with_instants(window) -> dict[Key, Replica]:
-    return dict(replicas(replace(SETTINGS, snapshots=True), batch=2))
+    return dict(run_replicas(replace(SETTINGS, snapshots=True), batch=2))
 
 
 def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_instants) -> None:
-    plain = dict(replicas(SETTINGS, batch=2))
+    plain = dict(run_replicas(SETTINGS, batch=2))
     assert all(replica.instant is None for replica in plain.values())
     for key, replica in with_instants.items():
         jax.tree.map(np.testing.assert_array_equal, replica._replace(instant=None), plain[key])
@@ -68,7 +68,7 @@ def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_insta
 
 def test_first_good_seed_of_every_point_has_an_instant_in_any_batch(with_instants) -> None:
     assert {key for key, replica in with_instants.items() if replica.instant} == {(0, 0), (1, 0)}
-    alone = replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)])
+    alone = run_replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)])
     jax.tree.map(np.testing.assert_array_equal, dict(alone)[1, 0], with_instants[1, 0])
 
 
@@ -157,5 +157,5 @@ def test_instant_of_a_batch_that_continues_from_its_journal_is_the_same(
     monkeypatch.setattr("jaxgran.maps.journal.SECONDS", 0.0)
     for journal_there in (False, True):
         assert (tmp_path / "journal.nc").exists() == journal_there
-        done = dict(replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
+        done = dict(run_replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
         jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_instants[1, 0])

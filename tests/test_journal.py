@@ -28,23 +28,23 @@ class CutOff(Exception):
     pass
 
 
-def cut_after(drive, calls: int):
-    """A drive that dies after a number of calls."""
+def cut_after(advance, calls: int):
+    """An advance that dies after a number of calls."""
 
-    def driven(*arguments):
+    def counted(*arguments):
         nonlocal calls
         if calls == 0:
             raise CutOff
         calls -= 1
-        return drive(*arguments)
+        return advance(*arguments)
 
-    return driven
+    return counted
 
 
-def measured(drive) -> Any:
+def measured(advance) -> Any:
     flow = stack([ShearFlow(GRAINS, alpha, 0.6, 1e-2) for alpha in (0.5, 0.9)])
-    batch = prepare_batch(flow, jax.random.split(jax.random.PRNGKey(0), 2), 0.5, drive)
-    return sample_batch(batch, 0.64, drive)
+    batch = prepare_batch(flow, jax.random.split(jax.random.PRNGKey(0), 2), 0.5, advance)
+    return sample_batch(batch, 0.64, advance)
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +75,10 @@ def small_state() -> State:
     return State(Grains(ones, ones), jnp.zeros((2, 4, 2)), jnp.zeros((2, 4, 2)), jnp.ones(2), jnp.zeros(2))
 
 
-def walk(drive, calls: int) -> list:
+def walk(advance, calls: int) -> list:
     state, seen = small_state(), []
     for k in range(calls):
-        state, tally = drive(None, None, state, np.array([k, k]))
+        state, tally = advance(None, None, state, np.array([k, k]))
         seen.append(jax.tree.map(np.asarray, tally))
     return [seen, jax.tree.map(np.asarray, state)]
 

@@ -28,7 +28,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
     """
     write_without_drawing(patch)
     write_few_variables(patch, *BUDGET, *SHARES)
-    patch.setattr(ratio_map_module, "replicas", made_up_replicas(BOTH))
+    patch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +77,7 @@ def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
 
 
 def test_a_finished_map_is_taken_from_its_file_by_resume(finished: bytes, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", None)  # nothing is run
+    monkeypatch.setattr(ratio_map_module, "run_replicas", None)  # nothing is run
     (tmp_path / "jaxgran_map_curves.png").unlink()
     outcome = jaxgran(tmp_path, *MAP, "--resume")
     assert outcome.status == 0
@@ -90,7 +90,7 @@ def test_a_finished_map_is_taken_from_its_file_by_resume(finished: bytes, tmp_pa
 
 def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp_path: Path, monkeypatch) -> None:
     half = dict(list(BOTH.items())[:1])
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(half, KeyboardInterrupt))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
     for words in ([], ["--grains", "64", "--overwrite"]):
         outcome = jaxgran(tmp_path, *MAP, *words)
         assert outcome.status == 130
@@ -111,14 +111,16 @@ def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> N
 
 
 def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)}))
+    monkeypatch.setattr(
+        ratio_map_module, "run_replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)})
+    )
     names = {"jaxgran_map_curves.png", "jaxgran_map_timestep.png", "jaxgran_map_clusters.png"}
     assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3,1e-4").status == 0
     assert files(tmp_path) >= names
     (tmp_path / "jaxgran_map_notes.png").touch()
     assert jaxgran(tmp_path, "plot", "jaxgran_map.nc").status == 0
     assert files(tmp_path) >= names
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas(BOTH))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
     assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
     pictures = {name for name in files(tmp_path) if name.endswith(".png")}
     assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
@@ -164,7 +166,7 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
 
 
 def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", made_up_replicas({(0, 0): Status.ok}))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
     first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
     outcome = jaxgran(tmp_path, *RUN)
     assert_one_sentence(outcome)

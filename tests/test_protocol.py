@@ -107,7 +107,7 @@ def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
 def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
-    def chunk(batch: Batch, strain: np.ndarray, drive):
+    def chunk(batch: Batch, strain: np.ndarray, advance):
         sheared.append(strain)
         return batch, None
 
@@ -139,7 +139,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
 def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     record = []
 
-    def sheared(batch: Batch, strain: np.ndarray, drive):
+    def sheared(batch: Batch, strain: np.ndarray, advance):
         record.append((np.asarray(batch.flow.timestep), strain))
         return batch
 

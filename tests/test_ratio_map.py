@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from synthetic import random_replica
 
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps import replicas as replicas_module
+from jaxgran.maps import run_replicas as run_replicas_module
 from jaxgran.maps.batches import batches, predicted_cost
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import RunParameters
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.replica import Advance, Key, Replica
-from jaxgran.maps.replicas import replicas
 from jaxgran.maps.results import choices_of, read_dataset
+from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.checks import InputError
@@ -57,7 +57,7 @@ def reported() -> list[Advance]:
 @pytest.fixture(scope="module")
 def results(settings, reported) -> dict[Key, Replica]:
     """The replicas of a map, run in pairs."""
-    return dict(replicas(settings, batch=2, report=reported.append))
+    return dict(run_replicas(settings, batch=2, report=reported.append))
 
 
 def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
@@ -110,13 +110,13 @@ def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_num
 
 
 def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> None:
-    assert_same_bits(dict(replicas(settings, batch=1)), results)
+    assert_same_bits(dict(run_replicas(settings, batch=1)), results)
 
 
 def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
     mixed = [
-        *replicas_module._run_task(settings, [(1, 1), (0, 0)]),
-        *replicas_module._run_task(settings, [(1, 0), (0, 1)]),
+        *run_replicas_module._run_task(settings, [(1, 1), (0, 0)]),
+        *run_replicas_module._run_task(settings, [(1, 0), (0, 1)]),
     ]
     assert_same_bits(dict(mixed), results)
 
@@ -132,7 +132,7 @@ def test_every_step_of_every_replica_is_reported(results, reported) -> None:
 
 def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
     told: list[Advance] = []
-    assert_same_bits(dict(replicas(settings, batch=2, workers=2, report=told.append)), results)
+    assert_same_bits(dict(run_replicas(settings, batch=2, workers=2, report=told.append)), results)
     assert_every_step_is_reported(told)
 
 
@@ -144,20 +144,22 @@ def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_st
     rng, calls = np.random.default_rng(0), []
     task = [(0, 0), (0, 1), (1, 0), (1, 1)]
 
-    def measured(_, keys, drive, refinement: int = 1):
+    def measured(_, keys, advance, refinement: int = 1):
         calls.append((list(keys), refinement))
         statuses = {(0, 1): Status.capacity if refinement == 1 else second, (1, 1): Status.infeasible}
         return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
 
-    monkeypatch.setattr(replicas_module, "_measured", measured)
-    done = dict(replicas_module._run_task(settings, task))
+    monkeypatch.setattr(run_replicas_module, "_measured", measured)
+    done = dict(run_replicas_module._run_task(settings, task))
     assert calls == [(task, 1), ([(0, 1)], 2)]
     assert list(done) == task
     assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0, Status.infeasible]
 
 
 def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
-    (key, refined), *_ = replicas_module._measured(settings, [(0, 0)], replicas_module.advance_batch, refinement=2)
+    (key, refined), *_ = run_replicas_module._measured(
+        settings, [(0, 0)], run_replicas_module.advance_batch, refinement=2
+    )
     assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
     assert refined.sample.pressure != results[key].sample.pressure
     data = map_dataset(settings, {**results, key: refined}, {})
@@ -168,36 +170,36 @@ def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
     settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
-    measured, largest, sizes = replicas_module._measured, 1, []
+    measured, largest, sizes = run_replicas_module._measured, 1, []
 
-    def bounded(settings, task, drive, refinement: int = 1):
+    def bounded(settings, task, advance, refinement: int = 1):
         sizes.append(len(task))
         if len(task) > largest:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
-        return measured(settings, task, drive, refinement)
+        return measured(settings, task, advance, refinement)
 
-    monkeypatch.setattr(replicas_module, "_measured", bounded)
+    monkeypatch.setattr(run_replicas_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]
-    halved = replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
+    halved = run_replicas_module._run_task(settings, tasks, tmp_path / "journal.nc")
     assert sizes == [4, 2, 1, 1, 2, 1, 1]
     assert [key for key, _ in halved] == tasks
     assert_same_bits(dict(halved), results)
     largest = 0
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        replicas_module._run_task(settings, tasks)
+        run_replicas_module._run_task(settings, tasks)
 
 
 def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken_device(*_, **__):
         raise jax.errors.JaxRuntimeError("INTERNAL: the device is on fire.")
 
-    monkeypatch.setattr(replicas_module, "prepare_batch", broken_device)
+    monkeypatch.setattr(run_replicas_module, "prepare_batch", broken_device)
     with pytest.raises(jax.errors.JaxRuntimeError, match="on fire"):
-        replicas_module._run_task(settings, [(0, 0), (0, 1)])
+        run_replicas_module._run_task(settings, [(0, 0), (0, 1)])
 
 
 def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
-    second = dict(replicas(replace(settings, seeds=1, first_seed=1), batch=2))
+    second = dict(run_replicas(replace(settings, seeds=1, first_seed=1), batch=2))
     assert_same_bits(second, {(point, 0): results[point, 1] for point in range(2)})
 
 
@@ -206,7 +208,7 @@ def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.Monkey
         yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
         yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
 
-    monkeypatch.setattr(ratio_map_module, "replicas", found)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", found)
     sentence = r"^1 of 2 points failed: deep overlap at \(restitution 0.5, packing fraction 0.6\)"
     with pytest.warns(BadPoints, match=sentence):
         ratio_map(**{**SETTINGS, "seeds": 1}, progress=True)
@@ -231,7 +233,7 @@ def test_a_map_that_is_cut_off_is_continued_and_written_once(settings, results, 
     assert data.attrs["resumed_replicas"] == 2 and not folder.exists()
     expected = map_dataset(settings, results, {})
     np.testing.assert_array_equal(data["seeds/force_ratio"], expected["seeds/force_ratio"])
-    monkeypatch.setattr(ratio_map_module, "replicas", None)  # nothing is run
+    monkeypatch.setattr(ratio_map_module, "run_replicas", None)  # nothing is run
     again = ratio_map(**SETTINGS, output=output, resume=True)
     np.testing.assert_array_equal(again["seeds/force_ratio"], expected["seeds/force_ratio"])
     with pytest.raises(InputError, match="already exists and has a map with solver"):
@@ -243,7 +245,7 @@ def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch:
         yield (1, 0), random_replica(np.random.default_rng(0), settings)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ratio_map_module, "replicas", some)
+    monkeypatch.setattr(ratio_map_module, "run_replicas", some)
     with pytest.raises(Interrupted) as caught:
         ratio_map(**SETTINGS, output=tmp_path / "map.nc", attributes={"project": "mine"})
     assert np.isfinite(caught.value.data.force_ratio[0, 1]) and np.isnan(caught.value.data.force_ratio[0, 0])
@@ -269,7 +271,7 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
 
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
-    both = dict(replicas(some, batch=8))
+    both = dict(run_replicas(some, batch=8))
     assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
     xr.testing.assert_equal(data.isel(timestep=0), alone)
@@ -294,7 +296,7 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
 
 @pytest.mark.parametrize("grains", [[64, 128], (64, 128), np.array([64, 128])], ids=["list", "tuple", "array"])
 def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: (_ for _ in ()))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", lambda *_: (_ for _ in ()))
     data = ratio_map(**{**SETTINGS, "grains": grains, "timestep": [1e-3, 5e-4]})
     assert data.force_ratio.dims == ("grains", "timestep", "packing_fraction", "restitution")
     assert data["large_system/pressure"].dims == ("timestep", "packing_fraction", "restitution")
@@ -306,7 +308,7 @@ def test_ratio_map_takes_any_list_of_numbers_of_grains(grains, monkeypatch: pyte
     "timestep", [[1e-3, 5e-4], (1e-3, 5e-4), np.array([1e-3, 5e-4])], ids=["list", "tuple", "array"]
 )
 def test_ratio_map_takes_any_list_of_time_steps(timestep, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "replicas", lambda *_: (_ for _ in ()))
+    monkeypatch.setattr(ratio_map_module, "run_replicas", lambda *_: (_ for _ in ()))
     data = ratio_map(**{**SETTINGS, "timestep": timestep, "strain": 4.0})
     assert data.force_ratio.dims == ("timestep", "packing_fraction", "restitution")
     assert data.attrs["timestep"] == data.timestep.values.tolist() == [1e-3, 5e-4]

@@ -24,7 +24,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.law import largest_eigenvalue
 from jaxgran.contact.network import Contacts
@@ -40,10 +40,13 @@ def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grai
     return _gathered(contacts, along, -along, grains)
 
 
-def contact_numbers(contacts: Contacts, counted: Bool[Array, " contacts"], grains: int) -> Float[Array, " grains"]:
-    """How many of the counted contacts every grain has."""
-    one = counted.astype(contacts.normals.dtype)[:, None]
-    return _gathered(contacts, one, one, grains)[:, 0]
+def loads_of_grains(
+    contacts: Contacts, impulses: Float[Array, " contacts"], grains: int
+) -> tuple[Float[Array, "grains 2"], Float[Array, " grains"]]:
+    """Total impulse on every grain, and how many of its contacts have one; one scatter costs less than two."""
+    along, loaded = contacts.normals * impulses[:, None], (impulses > 0).astype(impulses.dtype)[:, None]
+    total = _gathered(contacts, *(jnp.concatenate([x, loaded], axis=1) for x in (along, -along)), grains)
+    return total[:, :2], total[:, 2]
 
 
 @singledispatch
@@ -64,7 +67,8 @@ def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
 @singledispatch
 def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
     """Diagonal D with W ⪯ D from the numbers of contacts of the grains."""
-    count = contact_numbers(contacts, contacts.used, grains)
+    one = contacts.used.astype(contacts.normals.dtype)[:, None]
+    count = _gathered(contacts, one, one, grains)[:, 0]
     bound = taken(count, contacts.i) * contacts.inverse_mass_i + taken(count, contacts.j) * contacts.inverse_mass_j
     return jnp.where(contacts.used, bound, 1)
 

@@ -220,16 +220,35 @@ def _capacity(pairs_per_grain: int, count: int) -> int:
     return min(pairs_per_grain * count, count * (count - 1) // 2)
 
 
-def _select(gaps: Float[Array, " m"], largest_skin: Array, capacity: int):
-    """Pairs with a gap within the largest skin that a buffer allows: where they stand, which slots of the buffer they
-    fill, that skin, and whether the buffer overflows."""
-    skins = largest_skin * jnp.asarray(_SKIN_SHARES, gaps.dtype)
-    counts = jnp.sum(gaps[:, None] <= skins[None, :], axis=0, dtype=jnp.int32)
-    fits = counts <= capacity
-    skin = skins[jnp.argmax(fits)]
-    index = first_true(gaps <= skin, capacity)
+def _select(
+    gaps: Float[Array, " m"], largest_skin: Array, capacity: int
+) -> tuple[Int[Array, " pairs"], Bool[Array, " pairs"], Array, Array]:
+    """Pairs with a gap within the largest skin for which a buffer has room: the first skin tried nearly always fits.
+
+    Returns:
+      Where the pairs stand among the gaps, which slots of the buffer they fill, the skin, and whether even the smallest
+      skin leaves pairs out.
+    """
+    gaps, largest_skin = jax.lax.stop_gradient((gaps, largest_skin))  # the choice of pairs has no derivative
+    shares = jnp.asarray(_SKIN_SHARES, gaps.dtype)
+
+    def unfinished(tried: Array, words: Array) -> Array:
+        return (tried == 0) | (_overflows(words, capacity) & (tried < len(_SKIN_SHARES)))
+
+    def next_skin(tried: Array, words: Array) -> tuple[Array, Array]:
+        new = tried + 1, bit_words(gaps <= largest_skin * shares.at[tried].get(mode="clip"))
+        return where_active(unfinished(tried, words), new, (tried, words))
+
+    start = jnp.int32(0), jnp.zeros(-(-gaps.size // _WORD), jnp.uint32)
+    tried, words = jax.lax.while_loop(lambda now: any_replica(unfinished(*now)), lambda now: next_skin(*now), start)
+    index = set_bits(words, capacity, gaps.size)
     filled = index < gaps.size
-    return jnp.where(filled, index, 0), filled, skin, ~jnp.any(fits)
+    return jnp.where(filled, index, 0), filled, largest_skin * shares[tried - 1], _overflows(words, capacity)
+
+
+def _overflows(words: UInt32[Array, " words"], capacity: int) -> Bool[Array, ""]:
+    """Whether more bits are set than a buffer has slots."""
+    return jnp.sum(jax.lax.population_count(words).astype(jnp.int32), dtype=jnp.int32) > capacity
 
 
 def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> PairList:

@@ -1,6 +1,7 @@
 """Contacts: the compact contact network of one step, and the rule that makes a pair a contact."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -42,11 +43,24 @@ class Contacts:
     __eq__ = equal_values
 
 
+class PairMotion(NamedTuple):
+    """Separations r_i − r_j of pairs in σ, and relative velocities in the laboratory frame in σγ̇, (pairs,) each.
+
+    Each component is an array of its own, which XLA vectorises.
+    """
+
+    x: Float[Array, " pairs"]
+    y: Float[Array, " pairs"]
+    ux: Float[Array, " pairs"]
+    uy: Float[Array, " pairs"]
+
+    def moved(self, time: Array) -> "PairMotion":
+        """The pairs after free flight for a time."""
+        return self._replace(x=self.x + time * self.ux, y=self.y + time * self.uy)
+
+
 def is_contact(
-    separations: Float[Array, "pairs 2"],
-    velocities: Float[Array, "pairs 2"],
-    reach: Float[Array, " pairs"],
-    look_ahead: float | Array,
+    pairs: PairMotion, reach: Float[Array, " pairs"], look_ahead: float | Array
 ) -> tuple[Bool[Array, " pairs"], Bool[Array, " pairs"]]:
     """Which pairs are contacts, and which of them approach.
 
@@ -55,66 +69,56 @@ def is_contact(
     whichever comes first; a receding pair is judged at θ·dt.
 
     Args:
-      separations: (pairs, 2) in σ.
-      velocities: relative velocities in the laboratory frame, (pairs, 2) in σγ̇.
-      reach: sums of the radii, (pairs,).
+      pairs: how the pairs move.
+      reach: sums of the radii, (pairs,) in σ; 0 in an empty slot.
       look_ahead: θ·dt.
 
     Examples:
       Discs of diameter one, a diameter apart, that close at unit speed:
 
-      >>> apart, closing, reach = jnp.array([[2.0, 0.0]]), jnp.array([[-1.0, 0.0]]), jnp.array([1.0])
-      >>> [bool(is_contact(apart, closing, reach, time)[0][0]) for time in (0.9, 1.1)]
+      >>> pairs = PairMotion(jnp.array([2.0]), jnp.zeros(1), jnp.array([-1.0]), jnp.zeros(1))
+      >>> [bool(is_contact(pairs, jnp.array([1.0]), time)[0][0]) for time in (0.9, 1.1)]
       [False, True]
     """
-    contact, approaching = overlaps_within(*_gaps(separations, velocities, reach), look_ahead)
+    contact, approaching = overlaps_within(*gap_coefficients(*pairs, reach), look_ahead)
     contact = contact & (reach > 0)
     return contact, contact & approaching
 
 
 def first_contact_time(
-    separations: Float[Array, "pairs 2"], velocities: Float[Array, "pairs 2"], reach: Float[Array, " pairs"]
+    pairs: PairMotion, reach: Float[Array, " pairs"]
 ) -> tuple[Float[Array, " pairs"], Float[Array, " pairs"]]:
     """Time at which free flight makes a pair touch, and time of its closest approach.
 
     The time is negative for an approaching pair that overlaps already and infinite for a pair that never touches.
 
     Examples:
-      >>> time, closest = first_contact_time(jnp.array([[2.0, 0.0]]), jnp.array([[-1.0, 0.0]]), jnp.array([1.0]))
+      >>> pairs = PairMotion(jnp.array([2.0]), jnp.zeros(1), jnp.array([-1.0]), jnp.zeros(1))
+      >>> time, closest = first_contact_time(pairs, jnp.array([1.0]))
       >>> float(time[0]), float(closest[0])
       (1.0, 2.0)
     """
-    return time_to_touch(*_gaps(separations, velocities, reach))
-
-
-def _gaps(separations: Array, velocities: Array, reach: Array) -> tuple[Array, Array, Array]:
-    return gap_coefficients(separations[:, 0], separations[:, 1], velocities[:, 0], velocities[:, 1], reach)
+    return time_to_touch(*gap_coefficients(*pairs, reach))
 
 
 def contact_network(
     used: Bool[Array, " contacts"],
     i: Int[Array, " contacts"],
     j: Int[Array, " contacts"],
-    separations: Float[Array, "contacts 2"],
-    velocities: Float[Array, "contacts 2"],
+    pairs: PairMotion,
     grains: Grains,
 ) -> Contacts:
     """The network of the pairs of grains i and j that are contacts (``used``), a slot for each pair."""
-    distances = jnp.sqrt(_dot(separations, separations))
-    normals = jnp.where(used, 1 / distances, 0)[:, None] * separations
-    inverse_masses = 1 / grains.masses
+    distances = jnp.sqrt(pairs.x * pairs.x + pairs.y * pairs.y)
+    inverse_distances, inverse_masses = jnp.where(used, 1 / distances, 0), 1 / grains.masses
+    nx, ny = inverse_distances * pairs.x, inverse_distances * pairs.y
     return Contacts(
         i=i,
         j=j,
-        normals=normals,
+        normals=jnp.stack([nx, ny], axis=-1),
         distances=distances,
-        approach=_dot(normals, velocities),
+        approach=nx * pairs.ux + ny * pairs.uy,
         inverse_mass_i=jnp.where(used, taken(inverse_masses, i), 0),
         inverse_mass_j=jnp.where(used, taken(inverse_masses, j), 0),
         used=used,
     )
-
-
-def _dot(a: Float[Array, "n 2"], b: Float[Array, "n 2"]) -> Float[Array, " n"]:
-    """Scalar products, written out so that they fuse with what surrounds them."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]

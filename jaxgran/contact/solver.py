@@ -67,7 +67,8 @@ def solve(
     """
     b, own = contacts.approach, diagonal(contacts, grains)
     bound = solver.bound(contacts, grains)
-    scale = jnp.sqrt(dot(jnp.minimum(b, 0), jnp.minimum(b, 0)))
+    closing = jnp.minimum(b, 0)
+    scale = jnp.sqrt(dot(closing, closing))
     target = residual_target(scale, solver.tolerance, shear_rate, jnp.finfo(b.dtype).eps)
 
     def as_numbers(values: Any) -> Any:

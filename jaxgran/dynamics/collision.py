@@ -9,13 +9,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxgran.contact.delassus import contact_numbers, diagonal, grain_impulses
+from jaxgran.contact.delassus import diagonal, grain_impulses, loads_of_grains
 from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
-from jaxgran.contact.network import Contacts, contact_network, first_contact_time, is_contact
+from jaxgran.contact.network import Contacts, PairMotion, contact_network, first_contact_time, is_contact
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import solve
-from jaxgran.dynamics.flight import PairMotion, pairs_now
+from jaxgran.dynamics.flight import pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
 from jaxgran.model.control_flow import switch_replica
@@ -57,18 +57,17 @@ class Touching(NamedTuple):
     motion: PairMotion
     contact: Array
 
-    def picked(self, size: int) -> "Touching":
-        """The first contacts in a buffer of a size."""
+    def picked(self, size: int, words: Array) -> "Touching":
+        """The first contacts in a buffer of a size; ``words`` are those of ``bit_words(contact)``."""
         pairs = self.contact.size
-        index = set_bits(bit_words(self.contact), size, pairs)
+        index = set_bits(words, size, pairs)
         used = index < pairs
         i, j, reach, motion = jax.tree.map(lambda x: taken(x, jnp.where(used, index, 0)), self[:-1])
         return Touching(i, j, reach, motion, used)
 
     def network(self, grains: Grains) -> Contacts:
         """The contact network."""
-        separations, velocities = self.motion.separations(), self.motion.velocities()
-        return contact_network(self.contact, self.i, self.j, separations, velocities, grains)
+        return contact_network(self.contact, self.i, self.j, self.motion, grains)
 
 
 def contacts_now(flow: ShearFlow, state: State) -> Contacts:
@@ -76,15 +75,17 @@ def contacts_now(flow: ShearFlow, state: State) -> Contacts:
     lists = pair_lists(state.positions, state.grains, state.side, state.tilt)
     pairs = pairs_now(lists, state.velocities, flow.shear_rate)
     look_ahead = flow.activation_fraction * flow.timestep
-    contact, _ = is_contact(pairs.separations(), pairs.velocities(), lists.near.reach, look_ahead)
+    contact, _ = is_contact(pairs, lists.near.reach, look_ahead)
     touching = Touching(lists.near.i, lists.near.j, lists.near.reach, pairs, contact)
-    return touching.picked(MOST_CONTACTS * state.grains.radii.size).network(state.grains)
+    return touching.picked(MOST_CONTACTS * state.grains.radii.size, bit_words(contact)).network(state.grains)
 
 
 class Impulses(NamedTuple):
-    """What a solve gives: impulses of contacts and grains, contacts with an impulse of each grain, and how it went."""
+    """What a solve gives: impulses of the contacts, the change of their velocities u⁺ − u⁻, impulses of the grains,
+    contacts with an impulse of each grain, and how it went."""
 
     contacts: Float[Array, " contacts"]
+    changes: Float[Array, " contacts"]
     grains: Float[Array, "grains 2"]
     loaded: Float[Array, " grains"]
     iterations: Array
@@ -128,15 +129,16 @@ def collide(
     in time (see ``jax_engine``). None where this derivative is not asked for.
     """
     look_ahead, zero = flow.activation_fraction * flow.timestep, jnp.zeros_like(sums.largest[0])
-    contact, approaching = is_contact(pairs.separations(), pairs.velocities(), near.reach, look_ahead)
+    contact, approaching = is_contact(pairs, near.reach, look_ahead)
     meets = meets & jnp.any(bit_words(approaching) > 0)
     contact, moved, delays = contact & meets, pairs, None
     if options.moving_contacts:
         delays = _delays(pairs, near.reach, approaching, flow.timestep)
         apart = jnp.where(_alone(near, contact, grains), delays, 0)
-        moved = pairs._replace(x=pairs.x + apart * pairs.ux, y=pairs.y + apart * pairs.uy)
+        moved = pairs.moved(apart)
     touching = Touching(near.i, near.j, near.reach, moved, contact)
-    contacts = jnp.sum(lax.population_count(bit_words(contact)).astype(jnp.int32), dtype=jnp.int32)
+    words = bit_words(contact)
+    contacts = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
 
     def acted(touching: Touching, network: Contacts, found: Impulses, delays: Array | None = None) -> Collision:
         added, deepest = _contact_sums(flow, touching, network, found)
@@ -147,17 +149,17 @@ def collide(
             own = jnp.minimum(found.contacts, _binary_impulses(flow, network))
             delayed = grain_impulses(network, own * jnp.where(network.used, delays, 0), grains.radii.size)
             shift = -delayed / grains.masses[:, None]
-        return Collision(found.grains, added, deepest, *found[3:], user_sums, shift)
+        return Collision(found.grains, added, deepest, *found[4:], user_sums, shift)
 
     def of_few(active: Array) -> Collision:
-        picked = touching.picked(options.buffers[0])
+        picked = touching.picked(options.buffers[0], words)
         network = picked.network(grains)
         none = _no_impulses(network, grains)
         programs = [partial(_of_single, flow, network, grains), partial(_solved, flow, network, grains, options.solver)]
         return acted(picked, network, switch_replica(jnp.where(active, 1 + _above(contacts, 1), 0), none, programs))
 
     def in_buffer(size: int, active: Array) -> Collision:
-        picked = touching.picked(size)
+        picked = touching.picked(size, words)
         network = picked.network(grains)
         return acted(picked, network, _solved(flow, network, grains, options.solver, active))
 
@@ -188,28 +190,33 @@ def _above(contacts: Array, *limits: int) -> Array:
 def _no_impulses(network: Contacts, grains: Grains) -> Impulses:
     zeros, zero = jnp.zeros_like(network.approach), jnp.zeros((), network.approach.dtype)
     on_grains = jnp.zeros((grains.radii.size, 2), zero.dtype)
-    return Impulses(zeros, on_grains, on_grains[:, 0], jnp.int32(0), zero, jnp.int32(0))
+    return Impulses(zeros, zeros, on_grains, on_grains[:, 0], jnp.int32(0), zero, jnp.int32(0))
 
 
 def _of_single(flow: ShearFlow, network: Contacts, grains: Grains, _: Array) -> Impulses:
     """The closed form of a single contact, for which the iteration would need one product."""
-    impulses = jnp.maximum(0, -network.approach / diagonal(network, grains.radii.size))
+    own = diagonal(network, grains.radii.size)
+    impulses = jnp.maximum(0, -network.approach / own)
     status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
-    return _impulses(flow, network, grains, impulses, jnp.int32(1), jnp.zeros((), impulses.dtype), status)
+    outcome = jnp.int32(1), jnp.zeros((), impulses.dtype), status
+    return _impulses(flow, network, grains, impulses, own * impulses, *outcome)
 
 
 def _solved(flow: ShearFlow, network: Contacts, grains: Grains, solver: ProjectedMethod, active: Array) -> Impulses:
     """The impulses of a network, by iteration."""
     solution = solve(network, grains.radii.size, flow.shear_rate, solver, active)
     outcome = solution.iterations, solution.residual, solution.status
-    return _impulses(flow, network, grains, solution.impulses, *outcome)
+    return _impulses(flow, network, grains, solution.impulses, solution.response, *outcome)
 
 
-def _impulses(flow: ShearFlow, network: Contacts, grains: Grains, impulses: Array, *outcome: Array) -> Impulses:
-    """What a solve gives, from the impulses p₀ at restitution zero."""
-    impulses, count = (1 + flow.restitution) * impulses, grains.radii.size
-    loaded = contact_numbers(network, impulses > 0, count)
-    return Impulses(impulses, grain_impulses(network, impulses, count), loaded, *outcome)
+def _impulses(
+    flow: ShearFlow, network: Contacts, grains: Grains, impulses: Array, response: Array, *outcome: Array
+) -> Impulses:
+    """What a solve gives, from the impulses p₀ at restitution zero and their response W p₀."""
+    one_plus_alpha = 1 + flow.restitution
+    impulses = one_plus_alpha * impulses
+    on_grains = loads_of_grains(network, impulses, grains.radii.size)
+    return Impulses(impulses, one_plus_alpha * response, *on_grains, *outcome)
 
 
 def _binary_impulses(flow: ShearFlow, network: Contacts) -> Float[Array, " contacts"]:
@@ -223,10 +230,6 @@ def _contact_sums(flow: ShearFlow, touching: Touching, network: Contacts, found:
     nx, ny = network.normals[:, 0], network.normals[:, 1]
     impulses, dtype = found.contacts, found.contacts.dtype
     overlap = jnp.where(network.used, jnp.maximum(touching.reach - network.distances, 0), 0)
-    x, y = found.grains.T
-    xi, yi, xj, yj = taken(x, network.i), taken(y, network.i), taken(x, network.j), taken(y, network.j)
-    mi, mj = network.inverse_mass_i, network.inverse_mass_j
-    half_change = (nx * (xi * mi - xj * mj) + ny * (yi * mi - yj * mj)) / 2
     loaded = impulses > 0
     clustered = loaded & (taken(found.loaded, network.i) + taken(found.loaded, network.j) > 2)
     flags = (flag.astype(dtype) for flag in (network.used, loaded, network.approach < 0))
@@ -236,7 +239,7 @@ def _contact_sums(flow: ShearFlow, touching: Touching, network: Contacts, found:
         network.distances,
         overlap,
         network.approach,
-        half_change,
+        found.changes / 2,
         1 + flow.restitution,
         impulses,
         _binary_impulses(flow, network),
@@ -265,7 +268,7 @@ def _with_collision(sums: RunningSums, collision: Collision, meets: Array) -> Ru
 @jax.custom_jvp
 def _sums_of(terms: tuple[Array, ...]) -> list[Array]:
     """The sum of each vector, in one pass over all of them: a reduction of each takes XLA two to four times as long."""
-    zeros = [jnp.zeros((), term.dtype) for term in terms]
+    zeros = [jnp.zeros((), terms[0].dtype)] * len(terms)
     return lax.reduce(list(terms), zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,))
 
 
@@ -279,7 +282,7 @@ def _delays(pairs: PairMotion, reach: Array, approaching: Array, timestep: float
 
     Contacts that began long before belong to clusters. They have no moment of contact that could move.
     """
-    time, _ = first_contact_time(pairs.separations(), pairs.velocities(), reach)
+    time, _ = first_contact_time(pairs, reach)
     begins = approaching & (jnp.abs(time) <= timestep)
     time = jnp.where(begins, time, 0)
     return time - lax.stop_gradient(time)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxgran.contact.law import first_step, flight_of, kinetic_means
 from jaxgran.contact.near_pairs import Frame, PairLists, refresh, separations_now
-from jaxgran.contact.network import first_contact_time
+from jaxgran.contact.network import PairMotion, first_contact_time
 from jaxgran.dynamics.tally import RunningSums
 from jaxgran.model.cell import relative_velocity
 from jaxgran.model.control_flow import where_active
@@ -16,21 +16,6 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 
 LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
-
-
-class PairMotion(NamedTuple):
-    """Near pairs in flight: separations and relative laboratory velocities, (pairs,) each, x and y apart for speed."""
-
-    x: Array
-    y: Array
-    ux: Array
-    uy: Array
-
-    def separations(self) -> Float[Array, "pairs 2"]:
-        return jnp.stack([self.x, self.y], axis=-1)
-
-    def velocities(self) -> Float[Array, "pairs 2"]:
-        return jnp.stack([self.ux, self.uy], axis=-1)
 
 
 class Carry(NamedTuple):
@@ -85,7 +70,7 @@ def with_new_lists(now: Carry, flow: ShearFlow, grains: Grains, side: Array, sta
 
 def steps_to_contact(pairs: PairMotion, reach: Array, flow: ShearFlow, least: Array) -> Float[Array, ""]:
     """Number of steps, at least ``least``, after which some pair first is an approaching contact; may be infinite."""
-    time, closest = first_contact_time(pairs.separations(), pairs.velocities(), reach)
+    time, closest = first_contact_time(pairs, reach)
     steps = jnp.maximum(first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype))
     return smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
 

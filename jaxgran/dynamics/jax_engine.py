@@ -213,7 +213,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         sums = sums if observe_now is None else sums._replace(user_sums=with_flight(sums.user_sums, observe_now, jump))
         frame, velocities = fly(lists.frame, now.velocities, flight, shear_rate)
         lists, slack = replace(lists, frame=frame), slack - loss * flight
-        pairs = pairs._replace(x=pairs.x + flight * pairs.ux, y=pairs.y + flight * pairs.uy)
+        pairs = pairs.moved(flight)
         step = now.step + jump
         meets = go & (step < steps)
         observe_now = observer_at(lists, velocities)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import equal_values
+from jaxgran.model.indexing import taken
 from jaxgran.model.status import DEEP_SHARE, Status
 
 RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
@@ -178,7 +179,7 @@ class RunningSums(NamedTuple):
         kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
         begin = span_of(kind).start
         numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
-        return numbers[jnp.asarray([0, 1, 1, 2])].reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
+        return taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
 
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:

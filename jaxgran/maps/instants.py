@@ -75,8 +75,8 @@ def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
     """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
     steps = _steps((np.asarray(flow.timestep) * np.asarray(flow.shear_rate)).item())
     found: list[Instant] = []
-    drive = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
-    drive(
+    advance = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
+    advance(
         flow, numerics, state, jnp.array([steps - 1], jnp.int32)
     )  # a snapshot has the forces of the step that it begins
     return averaged(found) if len(found) == steps else None

@@ -1,4 +1,4 @@
-"""Journal of a batch: the tallies of all calls of its drive, and the last state.
+"""Journal of a batch: the tallies of all its advances, and the last state.
 
 The next step of a batch depends on its tallies only. So an interrupted batch is repeated from the start with the
 tallies from its journal, which takes almost no time. It then continues from the last state, with the same results bit
@@ -30,20 +30,20 @@ _LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of large
 
 
 class Journal:
-    """An ``ObserveBatch`` that keeps a journal of another drive, and first repeats the journal of an earlier run.
+    """An ``ObserveBatch`` that keeps a journal of another one, and first repeats the journal of an earlier run.
 
     Args:
       path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
       keys: point and seed of each replica of the batch, in order.
-      drive: drive that advances the batch after the end of the journal.
+      advance: advances the batch after the end of the journal.
       seconds: time between two writes; None for ``SECONDS``, or longer if a write itself takes long.
 
     Raises:
       CorruptFile: the file is the journal of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], drive: ObserveBatch, seconds: float | None = None):
-        self.path, self.drive, self.seconds = path, drive, seconds
+    def __init__(self, path: Path, keys: Sequence[Sequence[int]], advance: ObserveBatch, seconds: float | None = None):
+        self.path, self.advance, self.seconds = path, advance, seconds
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
         self.tallies: list[np.ndarray] = []
@@ -60,7 +60,7 @@ class Journal:
             if np.array_equal(self.steps[k], steps):
                 return self._repeated(k, state, None if observe is None else observed_shapes(observe, flow))
             raise CorruptFile(f"{self.path.name} is the journal of another run")
-        state, tally = self.drive(flow, numerics, state, steps, observe)
+        state, tally = self.advance(flow, numerics, state, steps, observe)
         self.steps.append(np.asarray(steps))
         self.tallies.append(flat_tally(tally, np.shape(steps)))
         if time.monotonic() >= self.next:

@@ -23,7 +23,7 @@ from jaxgran.maps.output import check_output, remove_pictures
 from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
 from jaxgran.maps.replica import Advance, Key, Replica
-from jaxgran.maps.replicas import replicas
+from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole, short_repr
 
@@ -181,7 +181,7 @@ def _run(
             if callable(run.progress):
                 run.progress(float(np.sum(advance.steps)))
 
-        running = replicas(settings, "auto", workers, report, checkpoint, warnings.warn, run.scheduler, run.record)
+        running = run_replicas(settings, "auto", workers, report, checkpoint, warnings.warn, run.scheduler, run.record)
         try:
             with closing(running):
                 for key, replica in running:

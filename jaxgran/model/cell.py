@@ -52,11 +52,12 @@ def displacement(
 
 def wrap(positions: Float[Array, "grains 2"], side: Array, tilt: Array) -> Float[Array, "grains 2"]:
     """The images of the positions that have x and y in [0, L)."""
-    rows = jnp.floor(positions[:, 1] / side)
-    rows = jnp.where(positions[:, 1] - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
-    x = positions[:, 0] - rows * tilt * side
+    x, y = positions[:, 0], positions[:, 1]
+    rows = jnp.floor(y / side)
+    rows = jnp.where(y - rows * side >= side, rows + 1, rows)  # L plus a tiny negative y rounds to L
+    x = x - rows * tilt * side
     x = x - side * jnp.floor(x / side)
-    return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(positions[:, 1] - rows * side, 0)], axis=-1)
+    return jnp.stack([jnp.where(x >= side, 0, x), jnp.maximum(y - rows * side, 0)], axis=-1)
 
 
 def sheared(vectors: Float[Array, "*n 2"], strain: Array) -> Float[Array, "*n 2"]:

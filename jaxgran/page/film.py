@@ -44,19 +44,19 @@ class Film:
         self.frames = Frames(self._seen)
 
     def recording(self, recorder: Recorder) -> AdvanceWrapper:
-        """What records a drive with the recorder, and keeps the sums of the time steps up to each frame."""
-        return lambda drive: recorder.recording(self._summed(drive))
+        """A wrapper that records frames with the recorder, and keeps the sums of the time steps up to each frame."""
+        return lambda advance: recorder.recording(self._summed(advance))
 
-    def _summed(self, drive: AdvanceBatch) -> AdvanceBatch:
+    def _summed(self, advance: AdvanceBatch) -> AdvanceBatch:
         self._sum = None
 
-        def driven(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
-            state, tally = drive(flow, numerics, state, steps)
+        def advance_and_sum(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
+            state, tally = advance(flow, numerics, state, steps)
             self._sum = tally if self._sum is None else self._sum + tally
             self.flow, self._area = flow, np.asarray(state.side) ** 2
             return state, tally
 
-        return driven
+        return advance_and_sum
 
     def _seen(self, frame: Snapshot) -> _Seen:
         if self._sum is None or self.flow is None:

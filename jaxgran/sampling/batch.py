@@ -212,14 +212,14 @@ def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, step
     return jax.tree.map(lambda *x: np.concatenate(x), *(shares[k] for k in sorted(shares)))
 
 
-def reporting(drive: ObserveBatch, report: Report) -> ObserveBatch:
+def reporting(advance: ObserveBatch, report: Report) -> ObserveBatch:
     """The same advance with a report after each call."""
 
-    def driven(
+    def advance_and_report(
         flow: ShearFlow, numerics: Numerics, state: State, steps: Array, observe: Observable | None = None
     ) -> tuple[State, Tally]:
-        state, tally = drive(flow, numerics, state, steps, observe)
+        state, tally = advance(flow, numerics, state, steps, observe)
         report(flow.timestep, tally.steps)
         return state, tally
 
-    return driven
+    return advance_and_report

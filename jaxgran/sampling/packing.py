@@ -5,6 +5,7 @@ The discs are slightly inflated. FIRE (Bitzek et al., Phys. Rev. Lett. 97, 17020
 the inflated discs overlap by less than the inflation, the true discs do not overlap.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -171,7 +172,6 @@ def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire
     velocities = mixed + step * forces
     stride = jnp.where(overlap < allowed, 0, step)
     moved = Frame(neighbours.frame.displacements + stride * velocities, neighbours.frame.strain)
-    neighbours = PairLists(
-        neighbours.outer, neighbours.near, moved, neighbours.near_frame, neighbours.positions, neighbours.tilt
+    return _Fire(
+        replace(neighbours, frame=moved), velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts
     )
-    return _Fire(neighbours, velocities, step, mixing, downhill, overlap, now.iterations + 1, now.attempts)

@@ -37,20 +37,20 @@ class Recorder:
         self.every, self.keep = every, keep
         self.frames = self.steps = 0
 
-    def recording(self, drive: AdvanceBatch) -> AdvanceBatch:
+    def recording(self, advance: AdvanceBatch) -> AdvanceBatch:
         """The advance of a batch of one replica, recording frames; the first call starts a new series."""
         self.frames = self.steps = 0
-        return partial(self._driven, drive)
+        return partial(self._advance, advance)
 
-    def _driven(
-        self, drive: AdvanceBatch, flow: ShearFlow, numerics: Numerics, state: State, steps: Array
+    def _advance(
+        self, advance: AdvanceBatch, flow: ShearFlow, numerics: Numerics, state: State, steps: Array
     ) -> tuple[State, Tally]:
         every = max(1, round(self.every / (np.asarray(flow.shear_rate) * np.asarray(flow.timestep)).item()))
         if self.frames == 0:
             self._record(flow, numerics, state)
         tallies = []
         for part in _parts(self.steps, np.asarray(steps).item(), every):
-            state, tally = drive(flow, numerics, state, jnp.full_like(steps, part))
+            state, tally = advance(flow, numerics, state, jnp.full_like(steps, part))
             tallies.append(tally)
             self.steps += part
             if part > 0 and self.steps % every == 0 and np.asarray(tally.status).item() < Status.nonfinite:

@@ -159,7 +159,7 @@ def prepare_batch(
     flow: ShearFlow,
     keys: Array,
     equilibrate: float | None = None,
-    drive: AdvanceBatch = advance_batch,
+    advance: AdvanceBatch = advance_batch,
     coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
     heat: float = 1.0,
@@ -183,24 +183,24 @@ def prepare_batch(
     batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
     batch = batch._replace(memory=_memory(batch, predictions))
     if equilibrate is None:
-        batch = _until_steady(batch, drive)
+        batch = _until_steady(batch, advance)
     elif equilibrate > 0:
-        batch = _sheared(batch, np.full(len(status), equilibrate), drive, measure=True)
+        batch = _sheared(batch, np.full(len(status), equilibrate), advance, measure=True)
     if equilibrate is not None:
         too_short = equilibrate < batch.memory
         batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
-    return _shortened(batch, flow, drive)
+    return _shortened(batch, flow, advance)
 
 
 def sample_batch(
-    batch: Batch, strain: float | None, drive: AdvanceBatch = advance_batch, error: float | None = None
+    batch: Batch, strain: float | None, advance: AdvanceBatch = advance_batch, error: float | None = None
 ) -> tuple[Batch, Sample]:
     """Sample every replica of a batch in blocks whose numbers of time steps differ by one at most.
 
     Args:
       batch: prepared replicas.
       strain: strain to sample, or None for six correlation strains of each flow, at least 8.
-      drive: advances the batch.
+      advance: advances the batch.
       error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica is
         doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 correlation strains. None samples ``strain`` only.
     """
@@ -210,13 +210,13 @@ def sample_batch(
         else np.full_like(batch.memory, strain)
     )
     longest = np.maximum(LONGEST_STRAIN, LONGEST_MEMORIES * batch.memory)
-    batch, tally = _blocks(batch, strains, BLOCKS, drive)
+    batch, tally = _blocks(batch, strains, BLOCKS, advance)
     while error is not None:
         worst = np.array([relative_error(one) for one in _as_sample(batch, tally)])
         extended = (worst > error) & (2 * strains <= longest) & (batch.status < GIVEN_UP)
         if not extended.any():
             break
-        batch, more = _blocks(batch, np.where(extended, strains, 0), BLOCKS // 2, drive)
+        batch, more = _blocks(batch, np.where(extended, strains, 0), BLOCKS // 2, advance)
         strains = np.where(extended, 2 * strains, strains)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
@@ -299,9 +299,9 @@ def _heated_replica(
 _heated = batch_program(_heated_replica)
 
 
-def _chunk(batch: Batch, strain: np.ndarray, drive: AdvanceBatch) -> tuple[Batch, Tally]:
+def _chunk(batch: Batch, strain: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain."""
-    return _advanced(batch, _steps(batch, strain), drive)
+    return _advanced(batch, _steps(batch, strain), advance)
 
 
 def _steps(batch: Batch, strain: np.ndarray) -> Float[np.ndarray, " replicas"]:
@@ -309,21 +309,21 @@ def _steps(batch: Batch, strain: np.ndarray) -> Float[np.ndarray, " replicas"]:
     return np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
 
 
-def _advanced(batch: Batch, steps: np.ndarray, drive: AdvanceBatch) -> tuple[Batch, Tally]:
+def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own number of time steps; one that is given up stays as it is."""
     going_on = batch.status < GIVEN_UP
     counts = jax.device_put(np.where(going_on, steps, 0).astype(np.int32))  # jnp.asarray would compile a program for it
-    state, tally = drive(batch.flow, batch.numerics, batch.state, counts)
+    state, tally = advance(batch.flow, batch.numerics, batch.state, counts)
     tally = jax.tree.map(np.asarray, tally)
     failed = np.where(tally.status >= GIVEN_UP, tally.status, Status.ok)  # the sample reports milder ones
     return batch._replace(state=state, status=np.maximum(batch.status, failed)), tally
 
 
-def _blocks(batch: Batch, strain: np.ndarray, count: int, drive: AdvanceBatch) -> tuple[Batch, Tally]:
+def _blocks(batch: Batch, strain: np.ndarray, count: int, advance: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain in ``count`` blocks, and keep all tallies, (replicas, count)."""
     tallies = []
     for steps in steps_of_blocks(_steps(batch, strain), count).T:
-        batch, tally = _advanced(batch, steps, drive)
+        batch, tally = _advanced(batch, steps, advance)
         tallies.append(tally)
     return batch, jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
 
@@ -345,14 +345,14 @@ def _as_sample(batch: Batch, tally: Tally) -> Sample:
     return Sample(tally, side**2, shear_rate, batch.flow.grains)
 
 
-def _sheared(batch: Batch, strain: np.ndarray, drive: AdvanceBatch, measure: bool = False) -> Batch:
+def _sheared(batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: bool = False) -> Batch:
     """Shear every replica by its own strain, in chunks of at most 1 so that progress can be reported.
 
     With ``measure`` the last chunk gives the correlation strain.
     """
     chunks = max(1, int(np.ceil(np.max(strain))))
     for steps in steps_of_blocks(_steps(batch, strain), chunks).T:
-        batch, tally = _advanced(batch, steps, drive)
+        batch, tally = _advanced(batch, steps, advance)
         if measure:
             batch = batch._replace(memory=_memory(batch, _averages(batch, tally)))
     return batch._replace(strain=batch.strain + strain)
@@ -365,7 +365,7 @@ def _memory(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
     return flow_correlation_strain(averages, batch.flow.grains, mass, area, batch.flow.shear_rate)
 
 
-def _until_steady(batch: Batch, drive: AdvanceBatch) -> Batch:
+def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:
     """Shear in chunks until every replica is steady, or ``_MOST_CHUNKS`` times; steady replicas are not advanced."""
     count = len(batch.status)
     steady, record = np.zeros(count, bool), []
@@ -375,7 +375,7 @@ def _until_steady(batch: Batch, drive: AdvanceBatch) -> Batch:
             break
         chunk = np.maximum(_SHORTEST_CHUNK, batch.memory / 4)
         correlation = np.exp(-2 * chunk / batch.memory)
-        batch, tally = _chunk(batch, np.where(waiting, 0, chunk), drive)
+        batch, tally = _chunk(batch, np.where(waiting, 0, chunk), advance)
         batch = batch._replace(strain=batch.strain + np.where(waiting, 0, chunk))
         means = _averages(batch, tally)
         if chunks <= _MEASURING_CHUNKS:
@@ -390,7 +390,7 @@ def _until_steady(batch: Batch, drive: AdvanceBatch) -> Batch:
     return batch._replace(status=np.maximum(batch.status, status))
 
 
-def _shortened(batch: Batch, flow: ShearFlow, drive: AdvanceBatch) -> Batch:
+def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
     """Shorten the time step geometrically from the coarse one to that of the flow, and relax at the final one.
 
     Every replica has its own series of time steps, which does not depend on the other replicas of the batch. A replica
@@ -402,10 +402,10 @@ def _shortened(batch: Batch, flow: ShearFlow, drive: AdvanceBatch) -> Batch:
         active = np.isfinite(timesteps)
         current = jax.device_put(np.where(active, timesteps, final).astype(batch.state.side.dtype))
         batch = batch._replace(flow=replace(flow, timestep=current))
-        batch = _sheared(batch, np.where(active, _SHORTENING_STRAIN, 0.0), drive)
+        batch = _sheared(batch, np.where(active, _SHORTENING_STRAIN, 0.0), advance)
     batch = batch._replace(flow=flow)
     relaxation = np.where(coarse > final, RELAXATION_STRAIN, 0.0)
-    return _sheared(batch, relaxation, drive) if relaxation.any() else batch
+    return _sheared(batch, relaxation, advance) if relaxation.any() else batch
 
 
 def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:

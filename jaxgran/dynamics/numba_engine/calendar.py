@@ -1,7 +1,7 @@
 """The calendar of pairs: in which steps each near pair will be a contact, as long as neither grain is struck.
 
 Between two impulses both grains of a pair fly freely, so these steps follow from a quadratic equation. The next step to
-visit is the smallest entry, and its contacts are a comparison of whole numbers away.
+visit is the smallest entry, and its contacts follow from comparisons of whole numbers.
 """
 
 import math
@@ -125,7 +125,7 @@ def next_contact_step(blocks, pairs):
 
 @inline_njit
 def contacts_of_step(k, blocks, pairs, met):
-    """Write the pairs that are contacts in a step; more than there is room for are counted, not kept."""
+    """Write the pairs that are contacts in a step; those beyond the room are counted, not written."""
     calendar = pairs.calendar
     contacts, now = 0, np.int32(k)
     for block in range(blocks):

@@ -8,7 +8,7 @@ from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
 
 LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
-_NARROWER = 12  # lists that are tried with ever narrower skins, where pairs are more than there is room for
+_ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
 
@@ -20,7 +20,7 @@ def skin_loss(fastest, rate, distance):
 
 @njit
 def put_in_order(positions, side, tilt, order):
-    """Write an order that keeps neighbours close in memory: row by row, where a flow outgrows the caches."""
+    """Write an order of the grains, row by row, that keeps neighbours close in memory if a flow outgrows the caches."""
     given, cells, starts, count = order.given, order.cells, order.starts, order.given.size
     across = int(max(1.0, min(math.sqrt(count), side / _ROW_HEIGHT))) if count > _CACHED_GRAINS else 1
     for c in range(across * across + 1):
@@ -58,13 +58,13 @@ def bring_into_cell(grains, side, tilt, rate):
 
 @njit
 def search(grains, pairs, side, tilt, largest, skin):
-    """Write the pairs with a gap within a skin, which is made narrower where there is no room for all of them.
+    """Write the pairs with a gap within a skin, which is narrowed until there is room for all of them.
 
     Returns their number, the skin, and whether there was room.
     """
     room = pairs.of_grain.size // 2
     found = 0
-    for _ in range(_NARROWER):
+    for _ in range(_ATTEMPTS):
         found = find_near_pairs(grains, pairs, side, tilt, largest + skin, skin, room)
         if found <= room:
             break
@@ -76,7 +76,7 @@ def search(grains, pairs, side, tilt, largest, skin):
 
 @njit
 def find_near_pairs(grains, pairs, side, tilt, reach, skin, room):
-    """Write the pairs with a gap within the skin, and their images; what there is no room for is only counted."""
+    """Write the pairs with a gap within the skin, and their images; pairs beyond the room are counted, not written."""
     most = math.sqrt(pairs.starts.size - 1)
     up, along = int(min(most, side / reach)), int(min(most, side / (reach * math.sqrt(1.0 + tilt * tilt))))
     if up >= 3 and along >= 3:
@@ -147,7 +147,7 @@ def _pairs_of_cells(pairs, side, tilt, up, along, skin, room):
 
 @inline_njit
 def _pairs_of_all(grains, pairs, side, tilt, skin, room):
-    """Pairs of a cell that is too narrow for others within it, by nearest images."""
+    """Compare all pairs by nearest images, in a periodic cell too small for a grid of 3×3."""
     motion, constants, ends, images = grains.motion, grains.constants, pairs.ends, pairs.images
     found = 0
     for i in range(motion.shape[0]):

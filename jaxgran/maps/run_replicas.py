@@ -37,7 +37,7 @@ from jaxgran.sampling.timestep import COARSE_TIMESTEP
 _REPEATED = Status.capacity, Status.nonfinite  # a jammed packing would be jammed again
 
 
-def replicas(
+def run_replicas(
     settings: MapSettings,
     batch: int | Literal["auto"] = "auto",
     workers: int = 1,
@@ -105,9 +105,9 @@ def _run_task(
     better result is kept.
     """
     measured = _measured if record is None else partial(_measured, record=record)
-    drive = _reporting(task, report)
+    advance = _reporting(task, report)
     try:
-        done = measured(settings, task, drive if journal is None else Journal(journal, task, drive))
+        done = measured(settings, task, advance if journal is None else Journal(journal, task, advance))
         repeated = [key for key, replica in done if replica.status in _REPEATED]
         if not repeated:
             return done
@@ -143,7 +143,7 @@ def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
 def _measured(
     settings: MapSettings,
     task: Sequence[Key],
-    drive: ObserveBatch,
+    advance: ObserveBatch,
     refinement: int = 1,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
@@ -153,10 +153,10 @@ def _measured(
     keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
     coarse = COARSE_TIMESTEP / refinement
     grains = settings.grains_of(flow.grains, len(task))
-    batch = prepare_batch(flow, keys, settings.equilibrate, drive, coarse, grains, numerics=settings.numerics)
+    batch = prepare_batch(flow, keys, settings.equilibrate, advance, coarse, grains, numerics=settings.numerics)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
-    sampling = drive if settings.observe is None else partial(drive, observe=settings.observe)
+    sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)
     batch, sample = sample_batch(batch, settings.strain, sampling if record is None else record(sampling), error)
     instants = first_instants(batch, task) if settings.snapshots else [None] * len(task)
     numbers = zip(batch.status.tolist(), strain_before.tolist(), instants, strict=True)
