@@ -373,11 +373,11 @@ def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> N
         flattened(read_dataset(folder / "flow.nc")).isel(restitution=0, packing_fraction=0),
     )
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
-    for name, (meaning, unit) in OBSERVABLES.items():
+    for name, one in OBSERVABLES.items():
         value, stderr = (np.asarray(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))
         np.testing.assert_array_equal(np.array(found[name]["value"], float), value)  # null is NaN
         np.testing.assert_array_equal(np.array(found[name]["stderr"], float), stderr)
-        assert (found[name]["meaning"], found[name]["unit"]) == (meaning, unit)
+        assert (found[name]["meaning"], found[name]["unit"]) == (one.meaning, one.unit)
     assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
     assert (
         found["theory/pressure"]["value"] == float(data["theory/pressure"]) and not found["theory/pressure"]["stderr"]
