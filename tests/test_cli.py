@@ -56,7 +56,8 @@ from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
-from jaxgran.plotting import map_figures, movie
+from jaxgran.plotting import movie
+from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
@@ -131,7 +132,6 @@ MISTAKES = {  # one for each kind of option, check and file
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
-    "map --output picture.nc": "picture_timestep.png' is a folder",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
     f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
@@ -164,8 +164,7 @@ MISTAKES = {  # one for each kind of option, check and file
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with text files that end in .nc and .gsd, and a folder with the name of a picture."""
-    (tmp_path / "picture_timestep.png").mkdir()
+    """A folder with text files that end in .nc and .gsd."""
     (tmp_path / "text.nc").write_text("not a map")
     (tmp_path / "text.gsd").write_text("not a trajectory")
     return tmp_path
@@ -275,8 +274,8 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
 def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is compared; of the others, which take longer, that there is a file."""
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
-        monkeypatch.setattr(map_figures, draw, lambda _: Figure())
+    for name in set(FIGURES) - {"curves"}:
+        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
     outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
     assert (outcome.status, outcome.out) == (0, "")
     assert files(tmp_path) == PICTURES
@@ -287,8 +286,8 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
-        monkeypatch.setattr(map_figures, draw, ratio_curves)
+    for name in FIGURES:
+        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=ratio_curves))
     words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
     assert jaxgran(folder, *words).status == 0
     assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
