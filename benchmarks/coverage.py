@@ -24,8 +24,8 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.dynamics.tally import Tally
+from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.observables import averages
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.statistics import standard_errors
 

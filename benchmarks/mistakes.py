@@ -137,7 +137,7 @@ MISTAKES = (
     ),
     Mistake(
         "collisions counted by pairs",
-        "jaxgran/sampling/observables.py",
+        "jaxgran/sampling/averages.py",
         '"collision_rate": 2 * tally.collisions / (grains * tally.duration * shear_rate),',
         '"collision_rate": 1 * tally.collisions / (grains * tally.duration * shear_rate),',
         "a collision is one of both of its grains",

@@ -28,8 +28,8 @@ from benchmarks.output import Output
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import DEEP_OVERLAP
+from jaxgran.sampling.averages import averages
 from jaxgran.sampling.batch import stack
-from jaxgran.sampling.observables import averages
 from jaxgran.sampling.prediction import predicted
 
 RESTITUTIONS = (0.0, 0.5, 0.9)

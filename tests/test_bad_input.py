@@ -34,7 +34,8 @@ from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import settings as map_settings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
-from jaxgran.plotting import map_figures, theory
+from jaxgran.plotting import theory
+from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling import free_cooling, sample, steady_state
 from jaxgran.sampling.observe import observed_shapes
 
@@ -523,8 +524,8 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     write_few_variables(monkeypatch, *theory.SHARES)
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"a picture"))
-    for drawing in ("ratio_curves", "cluster_shares"):
-        monkeypatch.setattr(map_figures, drawing, lambda _: Figure())
+    for drawing in ("curves", "clusters"):
+        monkeypatch.setitem(FIGURES, drawing, FIGURES[drawing]._replace(draw=lambda _: Figure()))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", f"--output={name}")
     assert outcome.status == 0, outcome.err
     stem = name.removesuffix(".nc")

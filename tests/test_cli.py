@@ -56,7 +56,8 @@ from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
-from jaxgran.plotting import map_figures, movie
+from jaxgran.plotting import movie
+from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
@@ -131,7 +132,6 @@ MISTAKES = {  # one for each kind of option, check and file
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
-    "map --output picture.nc": "picture_timestep.png' is a folder",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
     f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
@@ -164,8 +164,7 @@ MISTAKES = {  # one for each kind of option, check and file
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with text files that end in .nc and .gsd, and a folder with the name of a picture."""
-    (tmp_path / "picture_timestep.png").mkdir()
+    """A folder with text files that end in .nc and .gsd."""
     (tmp_path / "text.nc").write_text("not a map")
     (tmp_path / "text.gsd").write_text("not a trajectory")
     return tmp_path
@@ -275,8 +274,8 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
 def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first is compared; of the others, which take longer, that there is a file."""
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
-        monkeypatch.setattr(map_figures, draw, lambda _: Figure())
+    for name in set(FIGURES) - {"curves"}:
+        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
     outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
     assert (outcome.status, outcome.out) == (0, "")
     assert files(tmp_path) == PICTURES
@@ -287,8 +286,8 @@ def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
     small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = small_map
-    for draw in ("ratio_contours", "theory_errors", "enskog_factors", "cluster_shares", "dominating_errors"):
-        monkeypatch.setattr(map_figures, draw, ratio_curves)
+    for name in FIGURES:
+        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=ratio_curves))
     words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
     assert jaxgran(folder, *words).status == 0
     assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
@@ -328,7 +327,7 @@ def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
     assert words.startswith(f"32 grains, dt = {data.attrs['timestep']:g} / shear rate, midpoint activation ")
     assert f" engine numba, solver {data.attrs['solver']} " in words
     groups = [line.strip() for line in outcome.out.splitlines()]
-    places = [groups.index(name) for name in ("Forces", "Stresses", "Motion and structure", "Quality of the run")]
+    places = [groups.index(name) for name in ("Stresses", "Diagnostics")]
     assert places == sorted(places)
     assert "recording frames split the run" in outcome.err
     assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
@@ -373,11 +372,11 @@ def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> N
         flattened(read_dataset(folder / "flow.nc")).isel(restitution=0, packing_fraction=0),
     )
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
-    for name, (meaning, unit) in OBSERVABLES.items():
+    for name, one in OBSERVABLES.items():
         value, stderr = (np.asarray(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))
         np.testing.assert_array_equal(np.array(found[name]["value"], float), value)  # null is NaN
         np.testing.assert_array_equal(np.array(found[name]["stderr"], float), stderr)
-        assert (found[name]["meaning"], found[name]["unit"]) == (meaning, unit)
+        assert (found[name]["meaning"], found[name]["unit"]) == (one.meaning, one.unit)
     assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
     assert (
         found["theory/pressure"]["value"] == float(data["theory/pressure"]) and not found["theory/pressure"]["stderr"]

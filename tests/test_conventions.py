@@ -15,7 +15,7 @@ from synthetic import random_instant, random_replica
 from jaxgran.maps.conventions import CONVENTIONS
 from jaxgran.maps.dataset import map_dataset, run_attributes
 from jaxgran.maps.results import read_dataset, write_dataset
-from jaxgran.maps.schema import CORE, path_of
+from jaxgran.maps.schema import path_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES
@@ -98,10 +98,10 @@ def test_units_are_those_of_pure_numbers_and_links_lead_to_variables(kind: str, 
             for linked in variable.attrs.get("ancillary_variables", "").split():
                 there = data if linked.startswith("/") else node
                 assert set(there[linked.strip("/")].dims) <= {*variable.dims, "error_source"}, name
-    for name, (_, unit) in OBSERVABLES.items():
+    for name, one in OBSERVABLES.items():
         whole, by_seed = data[path_of(name)].attrs, data["seeds"][name].attrs
-        assert whole.get("reduced_unit", "1") == by_seed.get("reduced_unit", "1") == unit
-        status = "status" if name in CORE else "/status"
+        assert whole.get("reduced_unit", "1") == by_seed.get("reduced_unit", "1") == one.unit
+        status = "status" if one.group == "/" else "/status"
         assert {f"{name}_stderr", status} <= set(whole["ancillary_variables"].split())
         assert by_seed["ancillary_variables"] == "status"
         assert whole["cell_methods"] == "realization: " + by_seed["cell_methods"]

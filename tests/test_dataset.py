@@ -14,14 +14,14 @@ from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_dataset
-from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES, flattened, has_one_timestep, path_of, timestep_text
+from jaxgran.maps.schema import flattened, has_one_timestep, path_of, timestep_text
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.theory_variables import LENGTHS, THEORY
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
 from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.sampling.observables import GROUPS, OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.sampling.timestep import stress_error
 from jaxgran.theory.gaussian_moments import gaussian_moments
@@ -61,14 +61,15 @@ def few(data) -> xr.DataTree:
 
 def test_every_observable_has_its_dimensions_errors_and_values_by_seed(data) -> None:
     assert data.sizes == {"packing_fraction": 2, "restitution": 2, "axis_a": 2, "axis_b": 2, "error_source": 5}
-    for name in OBSERVABLES:
-        tail, path = ("axis_a", "axis_b") if name in TENSORS else (), path_of(name)
+    for name, one in OBSERVABLES.items():
+        tail, path = one.axes, path_of(name)
         assert data[path].dims == data[f"{path}_stderr"].dims == ("packing_fraction", "restitution", *tail)
         assert data["seeds"][name].dims == ("packing_fraction", "restitution", "seed", *tail)
 
 
-def test_every_observable_has_one_place_and_the_root_is_printed_on_one_screen(data) -> None:
-    assert sorted((*CORE, *STRESSES, *DIAGNOSTICS)) == sorted(OBSERVABLES)
+def test_every_observable_is_in_its_group_and_the_root_is_printed_on_one_screen(data) -> None:
+    for group, names in GROUPS.items():
+        assert {*names} <= {*data[group].data_vars}
     assert len(data.data_vars) <= 35
     assert len(str(data.to_dataset()).splitlines()) <= 45
 
@@ -119,7 +120,9 @@ def test_everything_has_a_long_name_and_numbers_have_units(data) -> None:
 
 def test_every_average_has_the_strain_of_an_independent_sample(data) -> None:
     strains = data["diagnostics/correlation_strain"]
-    assert set(strains.observable.values) == set(OBSERVABLES) - set(TENSORS) - set(EXTREME_OBSERVABLES)
+    assert set(strains.observable.values) == {
+        name for name, one in OBSERVABLES.items() if not (one.tensor or one.extreme)
+    }
     block = data["seeds/strain"].mean("seed") / BLOCKS  # made-up blocks are independent, and no less can be resolved
     lengths = (strains.sel(observable="force_ratio") / block).values[0]
     assert np.all((lengths > 0.8) & (lengths < 4))
@@ -233,8 +236,8 @@ def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: 
     results = {key: random_replica(rng, settings, Status.deep_overlap if key[0] == 2 else Status.ok) for key in keys}
     data = map_dataset(settings, results, {})
     point = ("timestep", "packing_fraction", "restitution")
-    for name in OBSERVABLES:
-        tail = ("axis_a", "axis_b") if name in TENSORS else ()
+    for name, one in OBSERVABLES.items():
+        tail = one.axes
         assert data[path_of(name)].dims == data[f"{path_of(name)}_stderr"].dims == (*point, *tail)
         assert data["seeds"][name].dims == (*point, "seed", *tail)
     assert data.status.dims == point
@@ -400,7 +403,7 @@ def test_table_of_a_map_has_a_row_for_each_point(data: xr.DataTree) -> None:
     assert f"{POINTS_ALONE}.to_dataframe()" in tutorial.read_text(encoding="utf-8")
     table = eval(POINTS_ALONE, {"data": data}).to_dataframe()
     assert len(table) == len(ALPHAS) * len(NUS)
-    assert {name for name in CORE if name not in TENSORS} <= set(table.columns)
+    assert {name for name in GROUPS["/"] if not OBSERVABLES[name].tensor} <= set(table.columns)
     np.testing.assert_array_equal(
         table.loc[0.6, 0.9].pressure, data.pressure.sel(packing_fraction=0.6, restitution=0.9)
     )

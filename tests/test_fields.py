@@ -24,7 +24,7 @@ from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.observables import averages
+from jaxgran.sampling.averages import averages
 
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
 SMOOTH = {"gaussian": gaussian(0.25), "lucy": lucy(1.9)}  # e^-39 of the Gaussian is beyond half the side

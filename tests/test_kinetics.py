@@ -10,7 +10,7 @@ from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_c
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
-from jaxgran.sampling.observables import averages
+from jaxgran.sampling.averages import averages
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.steady_shear import contact_value
 

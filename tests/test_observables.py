@@ -5,7 +5,8 @@ import pytest
 from synthetic import random_tally
 
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, Tally, empty_tally
-from jaxgran.sampling.observables import OBSERVABLES, TENSORS, averages
+from jaxgran.sampling.averages import averages
+from jaxgran.sampling.observables import OBSERVABLES
 
 GRAINS, AREA, SHEAR_RATE, TIMESTEP = 20, 31.0, 2.0, 1e-2
 
@@ -179,7 +180,7 @@ def test_leading_axes_are_kept() -> None:
     tally = random_tally(np.random.default_rng(1), 3, 4)
     found = averages(tally, np.full((3, 4), AREA), GRAINS, np.full((3, 4), SHEAR_RATE))
     for name, value in found.items():
-        assert value.shape == ((3, 4, 2, 2) if name in TENSORS else (3, 4)), name
+        assert value.shape == (3, 4, *OBSERVABLES[name].shape), name
 
 
 def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
@@ -210,6 +211,5 @@ def test_free_flow_has_no_ratio_but_a_pressure() -> None:
 
 def test_every_observable_is_measured_with_a_unit(measured) -> None:
     assert set(measured) == set(OBSERVABLES)
-    assert set(TENSORS) == {name for name, value in measured.items() if value.shape == (2, 2)}
-    for long_name, units in OBSERVABLES.values():
-        assert long_name and units
+    for name, one in OBSERVABLES.items():
+        assert one.meaning and one.unit and measured[name].shape == one.shape

@@ -24,7 +24,7 @@ from jaxgran.page.document import document
 from jaxgran.page.film import AVERAGES
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.sampling.observables import OBSERVABLES
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +49,15 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
     data, by_name = flattened(page_map()).sortby("timestep"), {one["name"]: one for one in found["observables"]}
     dims = ("timestep", "packing_fraction", "restitution")
     strain = data["seeds/strain"].sum("seed")
-    for name, (_, unit) in OBSERVABLES.items():
-        if name in TENSORS:
+    for name, observable in OBSERVABLES.items():
+        if observable.tensor:
             for a, b in np.ndindex(2, 2):
                 assert_same_numbers(
                     by_name[f"{name}_{'xy'[a]}{'xy'[b]}"]["value"], data[path_of(name)].values[..., a, b]
                 )
             continue
         one = by_name[name]
-        assert one["meaning"] == OBSERVABLES[name][0] and (unit == "1") == (one["unit"] == "")
+        assert one["meaning"] == observable.meaning and (observable.unit == "1") == (one["unit"] == "")
         assert_same_numbers(one["value"], data[path_of(name)].transpose(*dims).values)
         assert_same_numbers(one["error"], data[f"{path_of(name)}_stderr"].transpose(*dims).values)
         assert ("theory" in one) == (f"theory/{name}" in data) and ("whole" in one) == (f"{name}_ci95" in data)
@@ -65,7 +65,7 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
             assert_same_numbers(one["theory"], data[f"theory/{name}"].values)
         if "whole" in one:
             assert_same_numbers(one["whole"], data[f"{name}_ci95"].sel(error_source="total").values)
-        if name not in EXTREME_OBSERVABLES:
+        if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
             assert_same_numbers(one["samples"], (strain / correlated).values)
     assert [axis["values"] for axis in found["axes"]] == [[64], [5e-4, 1e-3], [0.5, 0.6], [0.5, 0.7, 0.9]]

@@ -14,7 +14,7 @@ from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.cell import displacement, relative_velocity
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.observables import averages
+from jaxgran.sampling.averages import averages
 
 EPS = np.finfo(float).eps
 # Cases and blocks of steps; the interpreted thread block is slow

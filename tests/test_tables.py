@@ -8,9 +8,7 @@ from io import BytesIO, StringIO, TextIOWrapper
 
 import pytest
 
-from jaxgran.cli.run import _GROUPS
 from jaxgran.cli.tables import Table, print_table, use_plain_letters
-from jaxgran.sampling.observables import OBSERVABLES, TENSORS
 
 RATIOS = [0.1 * k for k in range(1, 8)]
 FRACTIONS = ("0.5", "0.65", "0.7")
@@ -75,9 +73,3 @@ def test_names_of_files_that_are_no_text_keep_their_bytes() -> None:
             [sys.executable, "-c", program], capture_output=True, env=os.environ | {"PYTHONIOENCODING": encoding}
         )
         assert (done.returncode, done.stdout) == (0, b"wrote \xff.nc\n")
-
-
-def test_groups_of_a_run_name_observables() -> None:
-    names = [name for group in _GROUPS.values() for name in group]
-    assert len(set(names)) == len(names)
-    assert set(names) < set(OBSERVABLES) - set(TENSORS)

@@ -7,7 +7,6 @@ the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPT
 ``benchmarks/registry.py``. Pages are templates, see ``benchmarks/pages.py``.
 """
 
-import ast
 import importlib
 import re
 import runpy
@@ -26,6 +25,7 @@ from jaxgran.cli.mistakes import option_name, with_options
 from jaxgran.maps.parameters import options as parameters
 from jaxgran.maps.results import read_dataset
 from jaxgran.page.explore import explore
+from jaxgran.sampling.observables import OBSERVABLES
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
@@ -72,14 +72,11 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
 
 
 def observables() -> str:
-    """A table of what is measured, read from the source: importing it would start JAX."""
-    tree = ast.parse((ROOT / "jaxgran" / "sampling" / "observables.py").read_text(encoding="utf-8"))
-    constants = {name.id: value for name, value in map(_assigned, tree.body) if name is not None}
-    stress_unit = ast.literal_eval(constants["STRESS_UNIT"])
-    rows = ["| name | unit | meaning |", "| --- | --- | --- |"]
-    for name, about in zip(constants["OBSERVABLES"].keys, constants["OBSERVABLES"].values, strict=True):
-        meaning, unit = (stress_unit if isinstance(x, ast.Name) else ast.literal_eval(x) for x in about.elts)
-        rows.append(f"| `{ast.literal_eval(name)}` | {'–' if unit == '1' else unit} | {meaning} |")
+    """A table of what is measured."""
+    rows = ["| name | unit | group in the file of a map | meaning |", "| --- | --- | --- | --- |"]
+    for name, one in OBSERVABLES.items():
+        unit, group = ("–" if text in ("1", "/") else text for text in (one.unit, one.group))
+        rows.append(f"| `{name}` | {unit} | {group} | {one.meaning} |")
     return "\n".join(rows)
 
 
@@ -106,11 +103,3 @@ def benchmarks(charts: str) -> str:
         full, quick = one.minutes
         rows.append(f"| {one.question} | `{one.name}` | {full:g}, {quick:g} | {figures} |")
     return "\n".join(rows)
-
-
-def _assigned(statement: ast.stmt) -> tuple:
-    """Name and value of an assignment to one name; None twice for anything else."""
-    if isinstance(statement, ast.AnnAssign):
-        return statement.target, statement.value
-    one = isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name)
-    return (statement.targets[0], statement.value) if one else (None, None)

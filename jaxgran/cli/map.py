@@ -47,6 +47,10 @@ def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: An
     preset = given.get("preset", "quick")
     output = given.setdefault("output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc"))
     data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
+    if written:
+        from jaxgran.plotting.map_figures import remove_pictures
+
+        remove_pictures(output)
     whole = "part" not in given  # the rest of a map is in other files
     pictures = shown(data, output, format, draw=not interrupted) if whole else []
     finish(data, [*([output] if written else []), *pictures], interrupted, can_resume=True)
@@ -71,9 +75,8 @@ def shown(data, output: Path, format: FileFormat, draw: bool = True) -> list[Pat
 def run_plot_command(
     file: Path, output: Path | None = None, format: FileFormat = "png", dpi: int = 200, caption: bool = True
 ) -> None:
-    from jaxgran.maps.output import remove_pictures
     from jaxgran.maps.results import read_dataset
-    from jaxgran.plotting.map_figures import require_file, save_figures
+    from jaxgran.plotting.map_figures import remove_pictures, require_file, save_figures
 
     require_file(format, dpi)
     data = read_dataset(file)

@@ -26,8 +26,9 @@ def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, 
     configured_jax()
     require_device()
     from jaxgran.maps.merge import merge_maps
-    from jaxgran.maps.output import check_output, remove_pictures
+    from jaxgran.maps.output import check_output
     from jaxgran.maps.results import write_dataset
+    from jaxgran.plotting.map_figures import remove_pictures
 
     check_output(output)
     if os.path.exists(output) and not overwrite:

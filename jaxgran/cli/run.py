@@ -19,20 +19,6 @@ from jaxgran.model.display import unit_text, with_error
 MOST_RECORDED = 100_000  # frames of a trajectory
 _RECORDED_STRAIN = 5.0  # sampled strain where frames are recorded and none is given
 
-_GROUPS = {  # observables that are not here are in the last group
-    "Forces": ("force_ratio", "contact_force", "binary_force", "force_second_moment"),
-    "Stresses": (
-        *("pressure", "contact_pressure", "binary_pressure", "kinetic_pressure"),
-        *("shear_stress", "contact_shear_stress", "binary_shear_stress", "kinetic_shear_stress"),
-        *("bagnold_pressure", "bagnold_shear_stress", "macroscopic_friction", "inertial_number"),
-        *("dissipation_rate", "binary_dissipation_rate"),
-    ),
-    "Motion and structure": (
-        *("granular_temperature", "local_granular_temperature", "longwave_energy_ratio", "collision_rate"),
-        *("coordination_number", "network_size", "cluster_pressure_share", "cluster_shear_share"),
-    ),
-}
-_LAST_GROUP = "Quality of the run"
 _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below the first
     *("force_ratio", "pressure", "shear_stress", "macroscopic_friction", "inertial_number"),
     *("granular_temperature", "local_granular_temperature", "coordination_number", "collision_rate"),
@@ -183,16 +169,16 @@ def _entries(data) -> dict[str, Entry]:
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
         "status": Entry(Status(int(point.status)).name, "worst status", None),
     }
-    for name, (meaning, unit) in OBSERVABLES.items():
+    for name, one in OBSERVABLES.items():
         path = path_of(name)
-        entries[name] = Entry(point[path].values, meaning, unit, point[f"{path}_stderr"].values)
+        entries[name] = Entry(point[path].values, one.meaning, one.unit, point[f"{path}_stderr"].values)
     ratio, error = shear_stress_ratio(point)
     meaning = "contact shear stress over binary shear stress"
     entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
-    for name in OBSERVABLES:
+    for name, one in OBSERVABLES.items():
         if f"theory/{name}" in point:
-            meaning, unit = OBSERVABLES[name]
-            entries[f"theory/{name}"] = Entry(point[f"theory/{name}"].values, f"{meaning}, by kinetic theory", unit)
+            meaning = f"{one.meaning}, by kinetic theory"
+            entries[f"theory/{name}"] = Entry(point[f"theory/{name}"].values, meaning, one.unit)
     return entries
 
 
@@ -200,7 +186,7 @@ def _summary_table(data, all: bool) -> Table:
     """The averages of one flow with errors, units, effective sample sizes and predictions of kinetic theory."""
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
     from jaxgran.maps.theory_variables import LENGTHS
-    from jaxgran.sampling.observables import OBSERVABLES, TENSORS
+    from jaxgran.sampling.observables import GROUPS, OBSERVABLES
 
     grains, timestep, rule = (data.attrs[name] for name in ("grains", "timestep", "activation"))
     title = (
@@ -216,17 +202,16 @@ def _summary_table(data, all: bool) -> Table:
     def number(name: str) -> float:
         return float(point[name]) if name in point else math.nan
 
-    scalars = [name for name in OBSERVABLES if name not in TENSORS]
-    others = [name for name in scalars if name not in sum(_GROUPS.values(), ())]
-    groups = {**_GROUPS, _LAST_GROUP: others} if all else {"": _PHYSICS}
-    for group, names in groups.items():
-        table.rows += [[group]] if group else []
+    for group, names in (GROUPS if all else {"/": _PHYSICS}).items():
+        table.rows += [] if group == "/" else [[group.capitalize()]]
         for name in names:
+            if OBSERVABLES[name].tensor:
+                continue
             value = with_error(number(path_of(name)), number(f"{path_of(name)}_stderr"))
             samples = strain / correlated.get(name, math.nan)
             theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]
-            table.rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name][1]), *texts])
+            table.rows.append([name.replace("_", " "), value, unit_text(OBSERVABLES[name].unit), *texts])
             if name == "force_ratio":
                 ratio = with_error(*map(float, shear_stress_ratio(point)))
                 table.rows.append(["shear-stress ratio", ratio, "", "", ""])

@@ -35,8 +35,7 @@ def confidence_variables(grid: PointGrid, averages: PointAverages, tolerance: fl
     )
     variables = {}
     for name in BUDGET:
-        long_name, units = OBSERVABLES[name]
-        one = budget[name]
+        observable, one = OBSERVABLES[name], budget[name]
         by_source = {
             "total": one.error,
             "sampling": HALF_INTERVAL * one.stderr,
@@ -45,6 +44,6 @@ def confidence_variables(grid: PointGrid, averages: PointAverages, tolerance: fl
             "tolerance": one.tolerance,
         }
         values = np.stack([by_source[source] for source in ERROR_SOURCES], axis=-1)
-        about = {"long_name": f"half-width of the 95 % interval of {long_name}", "units": units}
+        about = {"long_name": f"half-width of the 95 % interval of {observable.meaning}", "units": observable.unit}
         variables[f"{name}_ci95"] = grid.variable(values, about, "error_source")
     return variables

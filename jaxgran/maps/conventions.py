@@ -22,11 +22,10 @@ not in ``units``.
 
 import xarray as xr
 
-from jaxgran.maps.schema import CORE, DIAGNOSTICS, STRESSES
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, unit_attributes
+from jaxgran.sampling.observables import GROUPS, OBSERVABLES, unit_attributes
 
 CONVENTIONS = "CF-1.11"
-_AVERAGES = {"/": CORE, "stresses": STRESSES, "diagnostics": DIAGNOSTICS, "seeds": tuple(OBSERVABLES)}
+_AVERAGES = {**GROUPS, "seeds": tuple(OBSERVABLES)}
 _COMPANIONS = ("stderr", "ci95", "converged")
 _STATUS_NAMES = {"/": "aggregate_quality_flag", "seeds": "quality_flag"}
 
@@ -53,6 +52,6 @@ def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
 
 def _cell_methods(name: str, over: str) -> str:
     """How an observable is an average, in the vocabulary of CF."""
-    if name in EXTREME_OBSERVABLES:
+    if OBSERVABLES[name].extreme:
         return f"{over} maximum"
     return f"{over} median" if name.startswith("median_") else f"{over} mean (ratio of sums over time steps)"

@@ -23,12 +23,13 @@ from jaxgran.maps.large_system import large_system_variables
 from jaxgran.maps.own_observables import identity_of, own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.schema import CORE, ERROR_SOURCES, FORMAT_VERSION, STRESSES
+from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
 from jaxgran.maps.seeds import NOT_RUN, STATUS_FLAGS, replica_statuses, seed_coordinate, seed_variables, worst_status
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.sums import sum_variables
 from jaxgran.maps.theory_variables import theory_variables
 from jaxgran.model.status import Status
+from jaxgran.sampling.observables import GROUPS
 
 _AXES = {
     "grains": {"long_name": "number of grains", "units": "1"},
@@ -60,8 +61,8 @@ def map_dataset(
     ============================  ====================  =============================================================
     root                          dimensions            meaning
     ============================  ====================  =============================================================
-    NAME, NAME_stderr             point                 average over all seeds and its standard error, for each of
-                                                        ``schema.CORE``
+    NAME, NAME_stderr             point                 average over all seeds and its standard error, for each
+                                                        observable of the root
     NAME_ci95                     (point,               half-width of its 95 % interval for a large system, for the
                                   error_source)         names in ``BUDGET``
     NAME, NAME_stderr, NAME_ci95  point, …              only with the setting ``observe``, see ``own_variables``
@@ -72,7 +73,7 @@ def map_dataset(
     ============================  ===================================================================================
     group                         content
     ============================  ===================================================================================
-    stresses                      NAME and NAME_stderr for each of ``schema.STRESSES``
+    stresses                      NAME and NAME_stderr for each observable of this group
     theory                        see ``theory_variables``
     diagnostics                   see ``diagnostic_variables``
     seeds                         see ``seed_variables``
@@ -103,7 +104,7 @@ def map_dataset(
     averages, statuses = point_averages(settings, replicas), replica_statuses(settings, replicas)
     groups = {
         "/": _core(settings, grid, averages, statuses),
-        "stresses": xr.Dataset(grid.averages(STRESSES, averages.values, averages.stderrs)),
+        "stresses": xr.Dataset(grid.averages(GROUPS["stresses"], averages.values, averages.stderrs)),
         "theory": xr.Dataset(theory_variables(grid, averages.samples)),
         "diagnostics": xr.Dataset(
             diagnostic_variables(grid, averages), {"observable": observable_coordinate(averages)}
@@ -128,7 +129,7 @@ def _core(settings: MapSettings, grid: PointGrid, averages: PointAverages, statu
     about_status = {"long_name": "worst status of a point, over all seeds and of their samples together"}
     about_strain = {"long_name": "strain over which the flow is correlated, that of one sample", "units": "1"}
     variables = {
-        **grid.averages(CORE, averages.values, averages.stderrs),
+        **grid.averages(GROUPS["/"], averages.values, averages.stderrs),
         **confidence_variables(grid, averages, settings.solver.tolerance),
         **own_variables(settings, grid, averages.samples),
         "status": grid.variable(worst, {**about_status, **STATUS_FLAGS}),

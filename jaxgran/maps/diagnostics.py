@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.points import PointAverages, PointGrid
-from jaxgran.maps.schema import DIAGNOSTICS
+from jaxgran.sampling.observables import GROUPS
 
 
 def diagnostic_variables(grid: PointGrid, averages: PointAverages) -> dict[str, xr.Variable]:
@@ -13,14 +13,14 @@ def diagnostic_variables(grid: PointGrid, averages: PointAverages) -> dict[str, 
     ===========================  ====================================================================================
     variable                     meaning
     ===========================  ====================================================================================
-    NAME, NAME_stderr            each of ``schema.DIAGNOSTICS``
+    NAME, NAME_stderr            each observable of this group
     correlation_strain           strain of one independent sample of each scalar average, along ``observable``
     friction_error_correlation   correlation of the errors of macroscopic_friction and inertial_number
     ===========================  ====================================================================================
     """
     by_name = averages.observable_correlation
     friction = {"long_name": "correlation of the errors of macroscopic friction and inertial number", "units": "1"}
-    return grid.averages(DIAGNOSTICS, averages.values, averages.stderrs) | {
+    return grid.averages(GROUPS["diagnostics"], averages.values, averages.stderrs) | {
         "correlation_strain": grid.variable(
             np.stack(list(by_name.values()), axis=-1),
             {"long_name": "strain of one independent sample of an observable", "units": "1"},

@@ -106,7 +106,7 @@ def large_system_variables(settings: MapSettings, grid: PointGrid, averages: Poi
         columns = (x[name].reshape(len(sizes), -1).T for x in (averages.values, averages.stderrs))
         found = [large_system_estimate(sizes, x, s, bound) for x, s in zip(*columns, strict=True)]
         value, error, converged = (np.array(part).reshape(shape) for part in zip(*found, strict=True))
-        long_name, units = OBSERVABLES[name]
+        long_name, units = OBSERVABLES[name].meaning, OBSERVABLES[name].unit
         about = {"long_name": f"{long_name} of a large system", "units": units}
         variables[name] = xr.Variable(grid.dims[1:], value, about)
         about = {"long_name": f"half-width of the 95 % interval of the {long_name} of a large system", "units": units}

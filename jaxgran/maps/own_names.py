@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 
-from jaxgran.maps.schema import GROUPS
 from jaxgran.model.checks import InputError, refused, short_repr
-from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.sampling.observables import GROUPS, OBSERVABLES
 from jaxgran.sampling.observe import observed_shapes
 
 if TYPE_CHECKING:

@@ -9,14 +9,13 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings, stack_of_any_size
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.drift import is_drifting
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS
+from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import Sample, correlation_strains, error_correlation_of, estimates
 
 
@@ -55,13 +54,11 @@ class PointGrid:
         """The variables NAME and NAME_stderr of some observables."""
         variables = {}
         for name in names:
-            long_name, units = OBSERVABLES[name]
-            tensor_dims = TENSOR_AXES if name in TENSORS else ()
-            error = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
-            about = {"long_name": long_name, "units": units}
-            variables[name] = self.variable(values[name], about, *tensor_dims)
-            about = {"long_name": f"{error} of {long_name}", "units": units}
-            variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *tensor_dims)
+            one = OBSERVABLES[name]
+            about = {"long_name": one.meaning, "units": one.unit}
+            variables[name] = self.variable(values[name], about, *one.axes)
+            about = {"long_name": one.meaning_of_error, "units": one.unit}
+            variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *one.axes)
         return variables
 
 
@@ -87,19 +84,14 @@ class PointAverages(NamedTuple):
     samples: dict[int, Sequence[Sample]]
 
 
-def tensor_shape(name: str) -> tuple[int, ...]:
-    """Shape of an observable at one point: (2, 2) for a tensor, () for a scalar."""
-    return (2, 2) if name in TENSORS else ()
-
-
 def point_averages(settings: MapSettings, replicas: Mapping[Key, Replica | None]) -> PointAverages:
     """The averages of every point over its replicas that were not given up."""
     flows = settings.flows()
     count = len(flows)
-    scalars = [name for name in OBSERVABLES if name not in EXTREME_OBSERVABLES and name not in TENSORS]
+    scalars = [name for name, one in OBSERVABLES.items() if not (one.extreme or one.tensor)]
     found = PointAverages(
-        values={name: np.full((count, *tensor_shape(name)), np.nan) for name in OBSERVABLES},
-        stderrs={name: np.full((count, *tensor_shape(name)), np.nan) for name in OBSERVABLES},
+        values={name: np.full((count, *one.shape), np.nan) for name, one in OBSERVABLES.items()},
+        stderrs={name: np.full((count, *one.shape), np.nan) for name, one in OBSERVABLES.items()},
         correlation_strain=np.full(count, np.nan),
         observable_correlation={name: np.full(count, np.nan) for name in scalars},
         friction_error_correlation=np.full(count, np.nan),

@@ -19,7 +19,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.interruption import Interrupted, is_interruption
-from jaxgran.maps.output import check_output, remove_pictures
+from jaxgran.maps.output import check_output
 from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
 from jaxgran.maps.replica import Advance, Key, Replica
@@ -95,7 +95,6 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
         data = map_dataset(settings, results, attributes)
         if output is not None and any(results.values()) and not (interruption and finished):
             write_dataset(data, output)
-            remove_pictures(output)
         if interruption is not None:
             raise Interrupted(data) from interruption
         complete = sum(replica is not None for replica in results.values()) == _count(settings)

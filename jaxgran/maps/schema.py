@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.model.checks import InputError
+from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
 FORMAT_VERSION = 2
 """Version of the groups and names in the data of a map; a file of another one is refused."""
@@ -20,58 +21,6 @@ FORMAT_VERSION = 2
 MapData: TypeAlias = xr.DataTree | xr.Dataset
 
 RATIO = ("force_ratio", "force_ratio_stderr")
-CORE = (
-    "force_ratio",
-    "contact_force",
-    "binary_force",
-    "force_second_moment",
-    "stress_ratio",
-    "pressure",
-    "shear_stress",
-    "macroscopic_friction",
-    "inertial_number",
-    "granular_temperature",
-    "local_granular_temperature",
-    "coordination_number",
-    "collision_rate",
-)
-"""Observables in the root."""
-
-STRESSES = (
-    "contact_stress",
-    "binary_stress",
-    "kinetic_stress",
-    "contact_pressure",
-    "binary_pressure",
-    "kinetic_pressure",
-    "contact_shear_stress",
-    "binary_shear_stress",
-    "kinetic_shear_stress",
-    "bagnold_pressure",
-    "bagnold_shear_stress",
-    "dissipation_rate",
-    "binary_dissipation_rate",
-    "cluster_pressure_share",
-    "cluster_shear_share",
-)
-"""Observables in the group ``stresses``."""
-
-DIAGNOSTICS = (
-    "network_size",
-    "iterations",
-    "median_residual",
-    "worst_residual",
-    "unconverged_share",
-    "mean_overlap",
-    "max_overlap",
-    "momentum_drift",
-    "energy_balance_error",
-    "complementarity_power",
-    "longwave_energy_ratio",
-)
-"""Observables in the group ``diagnostics``."""
-
-GROUPS = {"stresses": STRESSES, "diagnostics": DIAGNOSTICS}
 
 ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
 """Coordinate of ``NAME_ci95``."""
@@ -80,7 +29,6 @@ FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
 """Dimensions of a map that has several numbers of grains or time steps, and which of them has the smallest errors."""
 
 _AXES = ("packing_fraction", "restitution")
-TENSOR_AXES = ("axis_a", "axis_b")
 
 
 def require_map(data: Any, *names: str) -> xr.Dataset:
@@ -105,7 +53,8 @@ def flattened(data: MapData) -> xr.Dataset:
 
 def path_of(observable: str) -> str:
     """Where an observable is in the data of a map: ``NAME`` in the root, or ``GROUP/NAME``."""
-    return next((f"{group}/{observable}" for group, names in GROUPS.items() if observable in names), observable)
+    group = OBSERVABLES[observable].group if observable in OBSERVABLES else "/"
+    return observable if group == "/" else f"{group}/{observable}"
 
 
 def what_lacks(data: Any, *names: str) -> str:

@@ -6,12 +6,11 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.own_observables import own_seed_variables
-from jaxgran.maps.points import PointGrid, tensor_shape
+from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.schema import TENSOR_AXES
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import GIVEN_UP, Status
-from jaxgran.sampling.observables import OBSERVABLES, TENSORS
+from jaxgran.sampling.observables import OBSERVABLES
 
 NOT_RUN = -1  # status of a replica without a result
 STATUS_FLAGS = {
@@ -52,7 +51,7 @@ def seed_variables(
     """
     shape = (len(grid.flows), settings.seeds)
     strain, equilibration, timestep = (np.full(shape, np.nan) for _ in range(3))
-    values = {name: np.full((*shape, *tensor_shape(name)), np.nan) for name in OBSERVABLES}
+    values = {name: np.full((*shape, *one.shape), np.nan) for name, one in OBSERVABLES.items()}
     for key, replica in replicas.items():
         if replica is None:
             continue
@@ -71,10 +70,9 @@ def seed_variables(
     }
     variables = {"status": grid.variable(statuses, {"long_name": "status", **STATUS_FLAGS}, "seed")}
     variables |= {name: grid.variable(column, attrs, "seed") for name, (column, attrs) in about.items()}
-    for name, (long_name, units) in OBSERVABLES.items() if settings.seeds > 1 else ():
-        tensor_dims = TENSOR_AXES if name in TENSORS else ()
-        attrs = {"long_name": long_name, "units": units}
-        variables[name] = grid.variable(values[name], attrs, "seed", *tensor_dims)
+    for name, one in OBSERVABLES.items() if settings.seeds > 1 else ():
+        attrs = {"long_name": one.meaning, "units": one.unit}
+        variables[name] = grid.variable(values[name], attrs, "seed", *one.axes)
     return variables | own_seed_variables(settings, grid, replicas)
 
 

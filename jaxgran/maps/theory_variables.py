@@ -42,7 +42,7 @@ def theory_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -
     """
     variables = {}
     for name, values in _predictions(grid.batch, grid.classes).items():
-        long_name, units = OBSERVABLES[name]
+        long_name, units = OBSERVABLES[name].meaning, OBSERVABLES[name].unit
         about = {"long_name": f"kinetic theory's prediction of the {long_name}", "units": units, "theory": _THEORY_NAME}
         variables[name] = grid.variable(values, about)
     return variables | _enskog_variables(grid, samples)
@@ -60,7 +60,7 @@ def _predictions(flows: ShearFlow, classes: Grains | None) -> dict[str, np.ndarr
 def _enskog_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -> dict[str, xr.Variable]:
     """Enskog's rates, the factors between them and the measured ones, correlation lengths, and standard errors."""
     attrs = {
-        f"enskog_{rate}": (f"{words} of Enskog's theory at the measured granular temperature", OBSERVABLES[rate][1])
+        f"enskog_{rate}": (f"{words} of Enskog's theory at the measured granular temperature", OBSERVABLES[rate].unit)
         for rate, words in RATES.items()
     }
     for rate, words in RATES.items():

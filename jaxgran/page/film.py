@@ -16,8 +16,9 @@ from jaxgran.page.document import Page, document
 from jaxgran.page.grain_data import ENCODING, grain_data, scale_of
 from jaxgran.page.map_data import numbers
 from jaxgran.plotting.movie import Frames
+from jaxgran.sampling.averages import averages
 from jaxgran.sampling.batch import AdvanceBatch, AdvanceWrapper
-from jaxgran.sampling.observables import OBSERVABLES, averages
+from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.recorder import Recorder
 
 AVERAGES = ("force_ratio", "pressure", "shear_stress", "granular_temperature")
@@ -83,7 +84,7 @@ class Film:
             "averages": [
                 {
                     "name": name.replace("_", " "),
-                    "unit": unit_text(OBSERVABLES[name][1]),
+                    "unit": unit_text(OBSERVABLES[name].unit),
                     "values": numbers(np.array([one.averages[name] for one in seen])),
                 }
                 for name in AVERAGES

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
+
+import xarray as xr
+from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, MapData, has_one_timestep, require_map
 from jaxgran.model.checks import InputError, require_whole, short_repr
@@ -17,6 +21,27 @@ from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
 
 
+class MapFigure(NamedTuple):
+    """A figure of a map, and whether a map has the data for it."""
+
+    draw: Callable[[MapData], Figure]
+    is_possible: Callable[[xr.Dataset], bool]
+
+
+FIGURES = {
+    "curves": MapFigure(ratio_curves, lambda data: True),
+    "contours": MapFigure(ratio_contours, lambda data: is_plane(data) and has_one_timestep(data)),
+    "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes.get("timestep", 1) >= 2),
+    "size": MapFigure(averages_against_grains, lambda data: data.sizes.get("grains", 1) >= 2),
+    "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
+    "factors": MapFigure(enskog_factors, lambda data: is_plane(data) and has_factors(data)),
+    "clusters": MapFigure(cluster_shares, has_clusters),
+    "errors": MapFigure(dominating_errors, lambda data: is_plane(data) and has_errors(data)),
+    "rheology": MapFigure(friction_figure, has_friction_law),
+}
+"""All figures of a map by the ending of their files, in the order in which they are drawn."""
+
+
 def save_figures(
     data: MapData, stem: Path | str, format: FileFormat = "png", dpi: int = FILE_DPI, caption: bool = True
 ) -> list[Path]:
@@ -24,19 +49,21 @@ def save_figures(
 
     Each file is written whole or not at all. The same map gives the same bytes.
 
-    ======================= ==================================================================
-    file                    written if the map has
-    ======================= ==================================================================
-    `{stem}_curves.png`     always
-    `{stem}_contours.png`   at least two restitutions, two packing fractions, and one time step for all points
-    `{stem}_timestep.png`   at least two time steps
-    `{stem}_size.png`       at least two numbers of grains
-    `{stem}_theory.png`     a plane as for the contours, and the predictions of the theory
-    `{stem}_factors.png`     a plane, and the factors of the error of the theory
-    `{stem}_clusters.png`   the shares of the clusters
-    `{stem}_errors.png`     a plane, and the error budget of its points
-    `{stem}_rheology.png`   enough dense points for :func:`jaxgran.inference.friction_law.friction_law`
-    ======================= ==================================================================
+    =======================  ==========================  ===============================================================
+    file                     function                    written if the map has
+    =======================  ==========================  ===============================================================
+    `{stem}_curves.png`      `ratio_curves`              always
+    `{stem}_contours.png`    `ratio_contours`            at least two restitutions, two packing fractions, and one time
+                                                         step for all points
+    `{stem}_timestep.png`    `ratio_against_timestep`    at least two time steps
+    `{stem}_size.png`        `averages_against_grains`   at least two numbers of grains
+    `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the predictions of the theory
+    `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of the theory
+    `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
+    `{stem}_errors.png`      `dominating_errors`         a plane, and the error budget of its points
+    `{stem}_rheology.png`    `friction_figure`           enough dense points for
+                                                         :func:`jaxgran.inference.friction_law.friction_law`
+    =======================  ==========================  ===============================================================
 
     Args:
       data: as in :func:`ratio_curves` or :func:`ratio_against_timestep`.
@@ -51,19 +78,10 @@ def save_figures(
     data = require_map(data, *RATIO)
     require_file(format, dpi)
     stem = writable_stem(stem)
-    figures = {
-        "curves": (True, ratio_curves),
-        "contours": (is_plane(data) and has_one_timestep(data), ratio_contours),
-        "timestep": (data.sizes.get("timestep", 1) >= 2, ratio_against_timestep),
-        "size": (data.sizes.get("grains", 1) >= 2, averages_against_grains),
-        "theory": (is_plane(data) and has_theory(data), theory_errors),
-        "factors": (is_plane(data) and has_factors(data), enskog_factors),
-        "clusters": (has_clusters(data), cluster_shares),
-        "errors": (is_plane(data) and has_errors(data), dominating_errors),
-        "rheology": (has_friction_law(data), friction_figure),
-    }
     drawn = {
-        stem.with_name(f"{stem.name}_{name}.{format}"): draw for name, (possible, draw) in figures.items() if possible
+        stem.with_name(f"{stem.name}_{name}.{format}"): one.draw
+        for name, one in FIGURES.items()
+        if one.is_possible(data)
     }
     for path in drawn:
         if path.is_dir():
@@ -71,6 +89,16 @@ def save_figures(
     for path, draw in drawn.items():
         write(draw(data), path, dpi, caption)
     return list(drawn)
+
+
+def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
+    """Remove the pictures beside a dataset that show the map there was before: all but some, in whatever format."""
+    kept = {file.with_suffix("") for file in but}
+    for name in FIGURES:
+        for format in get_args(FileFormat):
+            file = path.with_name(f"{path.stem}_{name}.{format}")
+            if file.with_suffix("") not in kept and file.is_file():
+                file.unlink()
 
 
 def require_file(format: Any, dpi: Any) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from jaxgran.sampling.observables import averages
+from jaxgran.sampling.averages import averages
 from jaxgran.sampling.sample import Sample
 from jaxgran.statistics import drift
 

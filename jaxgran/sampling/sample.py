@@ -27,10 +27,11 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses
+from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses, unit_text
 from jaxgran.model.flow import ShearFlow, require_strain
 from jaxgran.model.state import State, require_match, require_state
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, Averages, averages
+from jaxgran.sampling.averages import averages
+from jaxgran.sampling.observables import OBSERVABLES, Averages
 from jaxgran.sampling.observe import Observable, advance_and_observe
 from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
 
@@ -42,15 +43,10 @@ MOST_BLOCKS = 10**6
 ERROR_OBSERVABLES = ("force_ratio", "pressure", "shear_stress")  # a target for the relative error holds for these
 _SMALLEST_MOTION = 20  # of a grain at velocity γ̇σ in one step, in roundings of a position
 
-_UNITS_OF_SHOWN = {
-    "force_ratio": "",
-    "pressure": "m/t²",
-    "shear_stress": "m/t²",
-    "granular_temperature": "mσ²/t²",
-    "coordination_number": "",
-    "macroscopic_friction": "",
-    "inertial_number": "",
-}
+_SHOWN = (
+    *("force_ratio", "pressure", "shear_stress", "granular_temperature"),
+    *("coordination_number", "macroscopic_friction", "inertial_number"),
+)
 
 
 def _rows(sample: "Sample") -> list[Row]:
@@ -64,7 +60,7 @@ def _rows(sample: "Sample") -> list[Row]:
         *[Row("replicas", count) for count in np.shape(here.area)],
         Row("grains", here.grains),
         Row("strain", rounded(here.strain)),
-        *(Row(name, averages[name], unit, errors.get(name)) for name, unit in _UNITS_OF_SHOWN.items()),
+        *(Row(name, averages[name], unit_text(OBSERVABLES[name].unit), errors.get(name)) for name in _SHOWN),
         Row("status", statuses(np.asarray(here.status))),
     ]
 
@@ -211,7 +207,8 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     """
     average, sums = _stacked(seeds)
     values, errors = standard_errors(average, sums)
-    extremes = {name: getattr(sums, field) for name, field in EXTREME_OBSERVABLES.items()}
+    by_block = average(sums)
+    extremes = {name: by_block[name] for name, one in OBSERVABLES.items() if one.extreme}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
     spread = {name: np.asarray(x.std()) for name, x in extremes.items()}
     return values | largest, errors | spread
@@ -234,7 +231,7 @@ def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
     average, sums = _stacked(seeds)
     lengths = correlation_length(average, sums)
     block = np.mean(sums.duration) * np.asarray(seeds[0].shear_rate)
-    return {name: length * block for name, length in lengths.items() if name not in EXTREME_OBSERVABLES}
+    return {name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme}
 
 
 def error_correlation_of(seeds: Sequence[Sample], first: str, second: str) -> float:

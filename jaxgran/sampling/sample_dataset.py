@@ -6,12 +6,10 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.model.status import Status
-from jaxgran.sampling.observables import EXTREME_OBSERVABLES, OBSERVABLES, TENSORS, unit_attributes
+from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES, unit_attributes
 
 if TYPE_CHECKING:
     from jaxgran.sampling.sample import Sample
-
-_AXES = ("axis_a", "axis_b")  # of a tensor: the centre-to-centre vector, the force
 
 
 def dataset_of(sample: "Sample") -> xr.Dataset:
@@ -19,15 +17,14 @@ def dataset_of(sample: "Sample") -> xr.Dataset:
     replicas = ("replica",) * np.ndim(sample.area)
     values, errors = sample.averages, sample.errors()
     variables: dict[str, Any] = {}
-    for name, (meaning, unit) in OBSERVABLES.items():
-        dims = (*replicas, *(_AXES if name in TENSORS else ()))
-        kind = "standard deviation over blocks" if name in EXTREME_OBSERVABLES else "standard error"
-        variables[name] = dims, values[name], _about(meaning, unit)
-        variables[f"{name}_stderr"] = dims, errors[name], _about(f"{kind} of {meaning}", unit)
+    for name, one in OBSERVABLES.items():
+        dims = (*replicas, *one.axes)
+        variables[name] = dims, values[name], _about(one.meaning, one.unit)
+        variables[f"{name}_stderr"] = dims, errors[name], _about(one.meaning_of_error, one.unit)
     flags = {"flag_values": np.array([*Status], np.int8), "flag_meanings": " ".join(status.name for status in Status)}
     variables["strain"] = replicas, sample.strain, _about("sampled strain", "1")
     variables["status"] = replicas, np.asarray(sample.status, np.int8), {"long_name": "status", **flags}
-    coordinates = {axis: ["x", "y"] for axis in _AXES}
+    coordinates = {axis: ["x", "y"] for axis in TENSOR_AXES}
     return xr.Dataset(variables, coordinates, {"grains": sample.grains})
 
 

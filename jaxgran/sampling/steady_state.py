@@ -36,6 +36,7 @@ from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.model.vmapped_in_python import vmapped_in_python
+from jaxgran.sampling.averages import averages
 from jaxgran.sampling.batch import (
     AdvanceBatch,
     advance_batch,
@@ -51,7 +52,6 @@ from jaxgran.sampling.correlation_strain import (
     SAMPLE_MEMORIES,
     flow_correlation_strain,
 )
-from jaxgran.sampling.observables import averages
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error, steps_of_blocks
