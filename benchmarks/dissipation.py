@@ -258,7 +258,7 @@ def misfits(laws: CorrelationLaws, points: Points) -> dict[str, np.ndarray]:
 
 
 def corrected_theory(data: xr.DataTree, points: Points, judged: Points) -> dict:
-    """The laws, and errors with an inner restitution or packing fraction or the densest left out, and at another map."""
+    """The laws, and errors with an inner restitution or packing fraction, or the densest, left out, and elsewhere."""
     laws, of_fit = fitted_laws(points)
     found: dict = {
         "laws": {

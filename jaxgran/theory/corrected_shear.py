@@ -27,9 +27,9 @@ Numbers = Array | np.ndarray
 class CorrelationLaws:
     """Coefficients of the laws of the correlation length and of the pairs at contact, and where they come from.
 
-    =======================  =====  =======================================================================
+    =======================  =====  ==========================================================================
     field                    shape  meaning; all are dimensionless
-    =======================  =====  =======================================================================
+    =======================  =====  ==========================================================================
     length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 − ν/ν_J), in mean
                                     diameters
     length_stderr            (3,)   their standard errors
@@ -38,10 +38,11 @@ class CorrelationLaws:
     pairs_stderr             (3,)   their standard errors
     jamming_fraction         ()     ν_J
     scatter                  (3,)   rms of the errors of ln T, ln p and ln τ at flows that were not fitted
-    restitution_range        (2,)   smallest and largest α of the fitted map
-    packing_fraction_range   (2,)   smallest and largest ν of the fitted map
+    restitution_range        (2,)   smallest and largest α at which the scatter holds; nearly elastic dense flow is more
+                                    viscous than in Enskog's theory
+    packing_fraction_range   (2,)   smallest and largest ν at which the scatter holds
     fitted_to, judged_on            maps, in words; static
-    =======================  =====  =======================================================================
+    =======================  =====  ==========================================================================
     """
 
     length: Float[Numbers, " 3"]
@@ -57,13 +58,13 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.229, 0.014, 1.654]),
-    length_stderr=np.array([0.01, 0.001, 0.05]),
-    pairs=np.array([0.363, 0.01, 1.75]),
-    pairs_stderr=np.array([0.01, 0.001, 0.05]),
+    length=np.array([0.2255, 0.01492, 1.645]),
+    length_stderr=np.array([0.01066, 0.004109, 0.06891]),
+    pairs=np.array([0.3454, 0.0105, 1.745]),
+    pairs_stderr=np.array([0.02789, 0.001003, 0.027]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.118, 0.136, 0.148]),
-    restitution_range=np.array([0.1, 0.98]),
+    scatter=np.array([0.1175, 0.1374, 0.1499]),
+    restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="120 flows of N = 1000, dt = 1e-5",
     judged_on="30 flows of N = 400, dt = 3e-4",
@@ -88,8 +89,7 @@ class CorrectedShear:
     …_stderr              as …     the first three times the scatter of the laws: standard errors of a prediction
     correlation_length    σ        L
     pair_factor           –        R
-    extrapolated          –        true outside the restitutions or packing fractions of the fitted map, where the
-                                   errors are unreliable
+    extrapolated          –        true outside the ranges of the laws, where the errors are unreliable
     ====================  =======  ===========================================================================
     """
 
