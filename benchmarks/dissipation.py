@@ -1,15 +1,18 @@
-"""How far Enskog's dissipation rate is from the measured one, and what of kinetic theory's errors follows from it.
+"""How far Enskog's dissipation rate is from the measured one, and the theory that follows from a law of it.
 
 From the map of the paper (N = 1000, dt = 1e-5): the dissipation rate Γ, which is the power of the shear in a steady
 flow, Enskog's Γ_E at the measured temperature tensor scaled to the local temperature, and the lengths L = Γ_E/Γ and
-L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p. Laws of L are fitted to this map up to ν = 0.75, with each packing
-fraction left out in turn, and judged on the map of 30 points that ``jaxgran map`` makes first (N = 256, dt = 1e-3).
+L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p. Laws of L up to ν = 0.75, and laws of L′ and p/p_E for all flows, are
+fitted to this map, with each restitution or packing fraction left out in turn, and judged on a map of 30 other flows
+(N = 400, dt = 3e-4), which also judges the temperature and the stresses of ``corrected_shear``.
 
-    python -m benchmarks dissipation           # about a minute on two cores
-    python -m benchmarks dissipation --quick   # judged on smaller flows, half a minute
+    python -m benchmarks dissipation           # two minutes on two cores
+    python -m benchmarks dissipation --quick   # judged on smaller flows, one minute
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -18,13 +21,38 @@ from matplotlib.figure import Figure
 from scipy.optimize import least_squares
 
 import jaxgran as jg
-from benchmarks.closure_study import make_map
 from benchmarks.output import RESULTS, Output, rounded
+from jaxgran.environment import usable_cores
+from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import flattened
 from jaxgran.plotting.drawing import curve_styles, label_log_axis
-from jaxgran.theory.enskog import collisional_transfer
+from jaxgran.theory.corrected_shear import (
+    MEASURED_LAWS,
+    CorrelationLaws,
+    corrected_shear,
+    correlation_length,
+    pair_factor,
+)
 from jaxgran.theory.steady_shear import contact_value
 
+JUDGED = {
+    "restitution": (0.15, 0.35, 0.55, 0.75, 0.95),
+    "packing_fraction": (0.15, 0.35, 0.48, 0.58, 0.68, 0.77),
+    "grains": 400,
+    "seeds": 1,
+    "timestep": 3e-4,
+}
+"""A map without a restitution or a packing fraction of the fitted one."""
+SMALLER = {"grains": 64}
+CORRECTIONS = {"length": (correlation_length, "length_from_pressure"), "pairs": (pair_factor, "pair_factor")}
+START = {"length": (0.2, 0.02, 1.5), "pairs": (0.3, 0.02, 1.5)}
+PREDICTED = {
+    "local_temperature": "granular_temperature",
+    "pressure": "pressure",
+    "shear_stress": "shear_stress",
+}
+"""What is measured, by its name here, and the field of the corrected theory that predicts it."""
+corrected = jax.jit(jax.vmap(lambda laws, alpha, nu: corrected_shear(alpha, nu, laws=laws), (None, 0, 0)))
 DENSEST = 0.75  # packing fraction up to which laws of L are fitted
 MODERATE = (0.3, 0.7)  # packing fractions between which errors of pressure and temperature are compared
 WITHIN = (0.05, 0.1, 0.2)  # relative errors of the theory that are counted
@@ -36,85 +64,75 @@ Points = dict[str, np.ndarray]  # numbers of the points of a map, each (points,)
 
 def run(output: Output) -> None:
     """Compare, fit, judge, print, and write JSON and PNG."""
-    data = flattened(jg.open_map(RESULTS / "paper.nc"))
-    small = flattened(make_map(output.quick))
-    points, judged = compared(data), compared(small)
+    tree = jg.open_map(RESULTS / "paper.nc")
+    data = flattened(tree)
+    another = flattened(jg.ratio_map(**JUDGED | (SMALLER if output.quick else {}), workers=usable_cores()))
+    points, judged = compared(data), compared(another)
     result = {
         "counts": counts(points),
         "errors_of_theory": errors_of_theory(points),
-        "laws": laws(points, judged),
-        "made_with_sums": made_with_sums(small, judged),
+        "balance": balance(data),
+        "laws": laws_of_length(points, judged),
+        "corrected_theory": corrected_theory(tree, points, judged),
     }
     for name, one in result.items():
         print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in one.items()), sep="\n")
     print("   ν     α        Γ/Γ_E             L′           L′√chaos   binary   chaos")
-    rows = [{name: rounded(float(x[k]), 4) for name, x in points.items()} for k in range(points["alpha"].size)]
+    rows, judged_rows = (
+        [{name: rounded(float(x[k]), 4) for name, x in some.items()} for k in range(some["alpha"].size)]
+        for some in (points, judged)
+    )
     for one in rows:
         print(
             "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± {dissipation_error:.3f}{length_from_pressure:9.3f} ± "
             "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}{chaos:8.3f}".format(**one)
         )
     maps = {
-        name: {"grains": int(x.attrs["grains"]), "timestep": float(x.attrs["timestep"])}
-        for name, x in (("map", data), ("judged_on", small))
+        name: {"points": some["nu"].size, "grains": int(x.attrs["grains"]), "timestep": float(x.attrs["timestep"])}
+        for name, x, some in (("map", data, points), ("judged_on", another, judged))
     }
-    output.write_rows("dissipation", maps | rounded(result, 4), "points", rows)
-    output.write_picture(draw(points, judged, result["laws"][BEST]["coefficients"]), "dissipation")
+    content = maps | rounded(result, 4) | {"judged_points": [keep(one) for one in judged_rows]}
+    output.write_rows("dissipation", content, "points", rows)
+    output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
+
+
+def keep(row: dict[str, float]) -> dict[str, float]:
+    """What a prediction of the flow is compared with."""
+    return {name: row[name] for name in ("alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor")}
 
 
 def compared(data: xr.Dataset) -> Points:
-    """Measured rates over Enskog's, lengths and temperatures at the points of a map that have the status ok.
-
-    The errors of Γ/Γ_E and L′ are sums of the relative errors of what they are made of, which hold for any correlation
-    of these: shear stress and three halves of the local temperature; friction and half of the local temperature.
-    """
+    """Measured rates over Enskog's, lengths and temperatures at the points of a map that have the status ok."""
     ok = data.status.values == 0
     nu, alpha = (x[ok] for x in np.broadcast_arrays(data.packing_fraction.values[:, None], data.restitution.values))
 
     def value(name: str) -> np.ndarray:
         return data[name].values[ok]
 
-    def relative_error(name: str) -> np.ndarray:
-        return value(f"{name}_stderr") / value(name)
-
-    granular, local = value("granular_temperature"), value("local_granular_temperature")
-    tensor = value("stresses/kinetic_stress") * (granular / value("stresses/kinetic_pressure"))[:, None, None]
-    there = (data, alpha, nu)
-    at_granular, at_local = enskog(tensor, *there), enskog((local / granular)[:, None, None] * tensor, *there)
-    isotropic, isotropic_local = (enskog(x[:, None, None] * np.eye(2), *there)["pressure"] for x in (granular, local))
-    slower = (at_granular["speed"] / at_local["speed"]) ** 2
-    chaos = value("theory/enskog_factor_pressure_chaos")
-    if "theory/enskog_factor_pressure_local_temperature" not in data:  # then that factor is part of this one
-        chaos = chaos * slower
-    contact, binary = value("stresses/contact_pressure"), value("theory/enskog_factor_pressure_binary")
-    dissipation = value("shear_stress") * float(data.attrs["shear_rate"]) / at_local["dissipation_rate"]
-    by_pressure = contact / at_local["pressure"] / dissipation
-    of_temperature = relative_error("local_granular_temperature")
+    local, length = value("local_granular_temperature"), value("theory/correlation_length")
+    by_pressure, chaos = value("theory/correlation_length_from_pressure"), value("theory/enskog_factor_pressure_chaos")
+    of_temperature = value("theory/enskog_factor_pressure_local_temperature")
+    contact, enskog = value("stresses/contact_pressure"), value("theory/enskog_pressure")
     return {
         "alpha": alpha,
         "nu": nu,
-        "dissipation": dissipation,
-        "dissipation_error": dissipation * (relative_error("shear_stress") + 1.5 * of_temperature),
+        "dissipation": 1 / length,
+        "dissipation_error": value("theory/correlation_length_stderr") / length**2,
         "length_from_pressure": by_pressure,
-        "length_from_pressure_error": by_pressure * (relative_error("macroscopic_friction") + of_temperature / 2),
+        "length_from_pressure_error": value("theory/correlation_length_from_pressure_stderr"),
+        "pair_factor": by_pressure / length,
         "times_root_chaos": by_pressure * np.sqrt(chaos),
-        "binary": binary,
+        "binary": value("theory/enskog_factor_pressure_binary"),
         "chaos": chaos,
-        "chaos_granular": chaos / slower,
-        "pressure_over_enskog": contact / isotropic_local,
-        "pressure_over_enskog_granular": contact / isotropic,
+        "chaos_granular": chaos * of_temperature,
+        "pressure_over_enskog": contact / enskog / of_temperature,
+        "pressure_over_enskog_granular": contact / enskog,
         "local_temperature": local,
+        "pressure": value("pressure"),
+        "shear_stress": value("shear_stress"),
         **{f"{name}_over_theory": value(name) / value(f"theory/{name}") for name in THEORY},
         "local_temperature_over_theory": local / value("theory/granular_temperature"),
     }
-
-
-def enskog(tensors: np.ndarray, data: xr.Dataset, alpha: np.ndarray, nu: np.ndarray) -> Points:
-    """Enskog's contact pressure, dissipation rate and speed of approach weighted by pressure, at given tensors."""
-    flow = float(data.attrs["shear_rate"]), float(data.attrs["polydispersity"])
-    found = jax.vmap(lambda *here: collisional_transfer(*here, *flow))(tensors, alpha, nu)
-    pressure, speed = (np.trace(np.asarray(x), axis1=1, axis2=2) / 2 for x in (found.stress, found.speed_stress))
-    return {"pressure": pressure, "speed": speed / pressure, "dissipation_rate": np.asarray(found.dissipation_rate)}
 
 
 def counts(points: Points) -> dict[str, int]:
@@ -152,9 +170,7 @@ LAWS: dict[str, tuple[Callable[[Points, np.ndarray], np.ndarray], tuple[float, .
     "1": (lambda p, c: np.ones_like(p["nu"]), ()),
     "max(1, c G^(1/3) S)": (lambda p, c: np.maximum(1, c[0] * over_shear(p)), (0.5,)),
     "max(1, c X^k)": (lambda p, c: np.maximum(1, c[0] * dissipative_rate(p) ** c[1]), (1.1, 0.3)),
-    "1 + c (1 - α)^a G^b": (lambda p, c: 1 + c[0] * (1 - p["alpha"]) ** c[1] * density(p) ** c[2], (0.3, 2.0, 0.5)),
 }
-BEST = "max(1, c X^k)"
 """Laws of L by their formula, with G = νχ, S = γ̇σ/√(T/m), T the local temperature and X = (1 − α) G^(1/3) S."""
 
 
@@ -173,7 +189,7 @@ def dissipative_rate(points: Points) -> np.ndarray:
     return (1 - points["alpha"]) * over_shear(points)
 
 
-def laws(points: Points, judged: Points) -> dict[str, dict]:
+def laws_of_length(points: Points, judged: Points) -> dict[str, dict]:
     """Coefficients of each law, and the rms of its error in ln L: fitted, with a packing fraction left out, judged."""
     points, judged = (only(one, one["nu"] <= DENSEST) for one in (points, judged))
     found = {}
@@ -212,46 +228,135 @@ def rms(x: np.ndarray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
+# ----------------------------------------------------------------------------------------------- corrected theory
+
+
+def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
+    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and the rms of each."""
+    laws, scatters = MEASURED_LAWS, {}
+    for name in CORRECTIONS:
+        found = least_squares(partial(law_misfit, laws, points, name), START[name], x_scale="jac", bounds=(0, np.inf))
+        scatter = found.fun @ found.fun / (found.fun.size - found.x.size)
+        stderr = np.sqrt(np.diag(scatter * np.linalg.inv(found.jac.T @ found.jac)))
+        laws, scatters[name] = replace(laws, **{name: found.x, f"{name}_stderr": stderr}), rms(found.fun)
+    return laws, scatters
+
+
+def law_misfit(laws: CorrelationLaws, points: Points, name: str, coefficients: np.ndarray | None = None) -> np.ndarray:
+    """Logarithm of a law over what is measured, with other coefficients where they are given."""
+    law, measured = CORRECTIONS[name]
+    laws = laws if coefficients is None else replace(laws, **{name: coefficients})
+    return np.log(np.asarray(law(laws, points["alpha"], points["nu"])) / points[measured])
+
+
+def misfits(laws: CorrelationLaws, points: Points) -> dict[str, np.ndarray]:
+    """Logarithms of the laws over what is measured, and the same of the corrected theory."""
+    shear = corrected(laws, points["alpha"], points["nu"])
+    return {name: law_misfit(laws, points, name) for name in CORRECTIONS} | {
+        name: np.log(np.asarray(getattr(shear, field)) / points[name]) for name, field in PREDICTED.items()
+    }
+
+
+def corrected_theory(data: xr.DataTree, points: Points, judged: Points) -> dict:
+    """The laws, and errors with an inner restitution or packing fraction, or the densest, left out, and elsewhere."""
+    laws, of_fit = fitted_laws(points)
+    found: dict = {
+        "laws": {
+            **{name: np.asarray(getattr(laws, name)).tolist() for name in ("length", "length_stderr")},
+            **{name: np.asarray(getattr(laws, name)).tolist() for name in ("pairs", "pairs_stderr")},
+            "scatter": [rms(misfits(laws, judged)[name]) for name in PREDICTED],
+        },
+        "rms_of_fit": of_fit,
+        "rms_judged": {name: rms(misfits(laws, judged)[name]) for name in CORRECTIONS},
+    }
+    inner, densest = {axis: np.unique(points[axis])[1:-1] for axis in ("alpha", "nu")}, points["nu"].max()
+    for kind, axis, values in (
+        ("alpha_left_out", "alpha", inner["alpha"]),
+        ("nu_left_out", "nu", inner["nu"]),
+        ("densest_left_out", "nu", [densest]),
+    ):
+        left_out = [
+            misfits(fitted_laws(only(points, points[axis] != x))[0], only(points, points[axis] == x)) for x in values
+        ]
+        found[f"rms_{kind}"] = {name: rms(np.concatenate([one[name] for one in left_out])) for name in left_out[0]}
+    none = np.zeros(3)
+    variants = {
+        "enskog": replace(laws, length=none, pairs=none),
+        "length": replace(laws, pairs=none),
+        "length_and_dense_pairs": replace(laws, pairs=np.asarray(laws.pairs) * [0, 1, 1]),
+        "length_and_pairs": laws,
+    }
+    closure = jg.fit_closure(data)
+    for name, some in (("fitted_map", points), ("judged_on", judged)):
+        within = {"all": some["nu"] > 0, "to_0.75": some["nu"] <= DENSEST, "core": in_core(some)}
+        prediction = jg.predict(closure, some["alpha"], some["nu"])
+        errors = {key: misfits(one, some) for key, one in variants.items()} | {
+            "17_coefficients": {
+                key: np.log(np.asarray(getattr(prediction, key)) / some[key]) for key in ("pressure", "shear_stress")
+            }
+        }
+        found[name] = {
+            part: {"points": int(chosen.sum())}
+            | {
+                key: {quantity: summary(one[quantity][chosen]) for quantity in PREDICTED if quantity in one}
+                for key, one in errors.items()
+            }
+            for part, chosen in within.items()
+        }
+    return found
+
+
+def in_core(points: Points) -> np.ndarray:
+    """Flows between the restitutions and packing fractions of the map that ``jaxgran map`` makes first."""
+    spans = (points["alpha"], PRESETS["quick"]["restitution"]), (points["nu"], PRESETS["quick"]["packing_fraction"])
+    inside = [(x >= min(span) - 1e-9) & (x <= max(span) + 1e-9) for x, span in spans]
+    return inside[0] & inside[1]
+
+
+def summary(errors: np.ndarray) -> dict:
+    """Rms of the logarithms of predicted over measured, and numbers of points within relative errors."""
+    return {"rms": rms(errors), "within": [int(np.sum(abs(np.expm1(errors)) < share)) for share in WITHIN]}
+
+
 # ----------------------------------------------------------------------------------------------- checks, output
 
 
-def made_with_sums(data: xr.Dataset, points: Points) -> dict[str, float]:
-    """For a map with sums of dissipation: Γ over the power of the shear, and its own L′ over that of ``compared``."""
+def balance(data: xr.Dataset) -> dict[str, float]:
+    """Γ over the power of the shear, and the share of Γ that binary collisions would have."""
     ok = data.status.values == 0
     dissipation, shear = data["stresses/dissipation_rate"].values[ok], data.shear_stress.values[ok]
     errors = np.hypot(*(data[f"{name}_stderr"].values[ok] for name in ("stresses/dissipation_rate", "shear_stress")))
-    length = data["theory/correlation_length_from_pressure"].values[ok]
     binary = data["stresses/binary_dissipation_rate"].values[ok] / dissipation
     return {
         "points": int(ok.sum()),
         "largest_excess_of_dissipation": float(np.max(abs(dissipation / shear - 1))),
         "the_same_in_standard_errors": float(np.max(abs(dissipation - shear) / errors)),
-        "least_length_over_estimate": float(np.min(length / points["length_from_pressure"])),
-        "largest_length_over_estimate": float(np.max(length / points["length_from_pressure"])),
         "least_share_of_binary_dissipation": float(binary.min()),
+        "share_of_binary_dissipation_within_2_percent": int(np.sum(abs(binary - 1) < 0.02)),
     }
 
 
-def draw(points: Points, judged: Points, coefficients: list[float]) -> Figure:
-    """L′ against the packing fraction, a curve for each restitution; L against X for both maps, and the law."""
+def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
+    """L′ against the packing fraction with its law, and predicted over measured pressure at flows of another map."""
     figure = Figure(figsize=(7.4, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
+    dense = np.linspace(points["nu"].min(), points["nu"].max(), 200)
     for alpha, style in zip(DRAWN, curve_styles(len(DRAWN)), strict=True):
         some = only(points, points["alpha"] == alpha)
-        look = {**style, "markersize": 4, "linewidth": 1, "label": rf"$\alpha$ = {alpha:g}"}
+        look = {**style, "markersize": 4, "linestyle": "none", "label": rf"$\alpha$ = {alpha:g}"}
         left.errorbar(some["nu"], some["length_from_pressure"], some["length_from_pressure_error"], **look)
-    for label, every, marker, colour in (("fitted map", points, "o", "0.6"), ("another map", judged, "s", "0")):
-        some = only(every, every["nu"] <= DENSEST)
-        look = {"linestyle": "none", "markersize": 3.5, "marker": marker, "color": colour, "label": label}
-        right.plot(dissipative_rate(some), 1 / some["dissipation"], **look)
-    x = np.geomspace(5e-4, 4, 200)
-    right.plot(x, np.maximum(1, coefficients[0] * x ** coefficients[1]), "k-", linewidth=1, label="law")
+        law = np.asarray(correlation_length(laws, np.full_like(dense, alpha), dense))
+        left.plot(dense, law, color=style["color"], linestyle="-", linewidth=1)
+    none = replace(laws, length=np.zeros(3), pairs=np.zeros(3))
+    for label, one, face in (("Enskog", none, "none"), ("corrected", laws, "0")):
+        ratio = np.exp(misfits(one, judged)["pressure"])
+        shift = 0.004 if face == "none" else -0.004
+        right.plot(judged["nu"] + shift, ratio, "o", color="0", markerfacecolor=face, markersize=4.5, label=label)
+    right.axhspan(0.9, 1.1, color="0.9", zorder=0, label=r"within 10 %")
     left.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L'/\sigma$")
-    xlabel = r"$X = (1-\alpha)\,G^{1/3}\,\dot\gamma\sigma/\sqrt{T_\mathrm{l}/m}$"
-    right.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=r"correlation length $L/\sigma$")
-    for axes in (left, right):
+    right.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel="predicted / measured pressure")
+    for axes, place in ((left, "upper left"), (right, "lower left")):
         axes.axhline(1, color="0.6", linewidth=0.8, zorder=0)
-        axes.legend(fontsize="small", frameon=False, loc="upper left")
+        axes.legend(fontsize="small", frameon=False, loc=place)
         label_log_axis(axes.yaxis)
-    label_log_axis(right.xaxis)
     return figure

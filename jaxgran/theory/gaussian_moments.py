@@ -50,7 +50,7 @@ def gaussian_moments(
     (2004). Contact values of the mixture: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
     """
     alpha, nu, rate, width = as_floats(restitution, packing_fraction, shear_rate, polydispersity)
-    return _steady(
+    return steady_moments(
         alpha, rate, uniform_mixture(nu, width, size_classes), jnp.log(garzo_dufty(alpha, nu).granular_temperature)
     )
 
@@ -79,22 +79,31 @@ def mixture_moments(
     alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
     fractions = jnp.full(diameters.shape, 1 / diameters.size, nu.dtype)
     guess = jnp.log(garzo_dufty(alpha, nu).granular_temperature * jnp.mean(masses))
-    return _steady(alpha, rate, mixture_of(nu, diameters, masses, fractions), guess)
+    return steady_moments(alpha, rate, mixture_of(nu, diameters, masses, fractions), guess)
 
 
-def _steady(alpha: Float[Array, ""], rate: Float[Array, ""], mixture: Mixture, guess: Float[Array, ""]) -> SteadyShear:
-    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its temperature."""
+def steady_moments(
+    alpha: Float[Array, ""],
+    rate: Float[Array, ""],
+    mixture: Mixture,
+    guess: Float[Array, ""],
+    length: Float[Array, ""] | float = 1.0,
+) -> SteadyShear:
+    """Solve the balance of the moments of a mixture, from a guess of the logarithm of its temperature.
+
+    Collisions lose 1/length of the energy that they lose in Enskog's theory.
+    """
 
     def imbalance(unknowns):
         temperatures = _temperatures(unknowns)
-        return _moment_balance(temperatures, _collisions(temperatures, alpha, mixture))
+        return _moment_balance(temperatures, _collisions(temperatures, alpha, mixture, length))
 
     start = jnp.stack([guess, guess, -0.3 * jnp.ones_like(guess)])[:, None] * jnp.ones_like(mixture.diameters)[None, :]
     solution = jax.lax.custom_root(imbalance, start, _newton, _dense_linear_solve)
 
     # Solved at unit shear rate: there is no other time scale, so temperatures and stresses scale as γ̇²
     temperatures = _temperatures(solution)
-    collisions = _collisions(temperatures, alpha, mixture)
+    collisions = _collisions(temperatures, alpha, mixture, length)
     xx, yy, xy = jnp.sum(mixture.number_densities[None, :] * temperatures, axis=1) + collisions.stress
     kinetic = jnp.sum(mixture.number_densities * (temperatures[0] + temperatures[1])) / 2
     return SteadyShear(
@@ -115,13 +124,20 @@ class _Collisions(NamedTuple):
     rate: Float[Array, ""]  # collisions per grain and unit strain
 
 
-def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""], mixture: Mixture) -> _Collisions:
+def _collisions(
+    temperatures: Float[Array, "3 classes"],
+    alpha: Float[Array, ""],
+    mixture: Mixture,
+    length: Float[Array, ""] | float = 1.0,
+) -> _Collisions:
     """Enskog collision integrals of Gaussian velocities.
 
     Let n be the normal from grain i to grain j. The approach speed w = (v_i − v_j)·n is Gaussian, with mean
     −γ̇ d_ij n_x n_y and variance n·(T_i/m_i + T_j/m_j)·n. A collision adds −J n/m_i to v_i, J = (1+α) μ_ij w, so
     the temperature tensor of class i changes at the rate Σ_j n_j χ_ij d_ij ∮ dn ⟨w [J² n n/m_i − J (n c_i + c_i n)]⟩.
-    The average is over w > 0, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian.
+    The average is over w > 0, where ⟨w² c_i⟩ = 2⟨w⟩ T_i·n/m_i, because c_i and w are jointly Gaussian. Of the energy
+    (1 − α²) μ_ij w²/2 that a collision loses, the part 1 − 1/length is given back: to grain i the share μ_ij/m_i, to
+    both directions alike.
     """
     angle = (jnp.arange(ANGLES, dtype=temperatures.dtype) + 0.5) * (jnp.pi / ANGLES)
     nx, ny = jnp.cos(angle)[None, :], jnp.sin(angle)[None, :]
@@ -140,7 +156,10 @@ def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""]
     loss = arc * jnp.sum((mixture.encounters * impulse)[:, :, None] * first, axis=1)
     gain = arc * jnp.sum((mixture.encounters * impulse**2)[:, :, None] * third, axis=1)
     drag = jnp.stack([2 * nx * push_x, 2 * ny * push_y, nx * push_y + ny * push_x])
-    source = jnp.sum(gain[None] * normals - 2 * loss[None] * drag, axis=2) / mixture.masses[None, :]
+    kept = (1 - 1 / length) * (1 - alpha) / (1 + alpha) * jnp.sum(gain, axis=1)
+    isotropic = jnp.array([0.5, 0.5, 0.0], kept.dtype)[:, None]
+    source = jnp.sum(gain[None] * normals - 2 * loss[None] * drag, axis=2) + isotropic * kept[None, :]
+    source = source / mixture.masses[None, :]
 
     per_area = mixture.number_densities[:, None] * mixture.encounters * arc
     transfer = per_area / 2 * impulse * mixture.contact_diameters  # half: each pair is summed twice
@@ -149,7 +168,7 @@ def _collisions(temperatures: Float[Array, "3 classes"], alpha: Float[Array, ""]
     return _Collisions(
         source=source,
         stress=jnp.sum(normals * jnp.sum(transfer[:, :, None] * second, axis=(0, 1))[None, None, :], axis=(1, 2)),
-        dissipation=jnp.sum(lost[:, :, None] * third),
+        dissipation=jnp.sum(lost[:, :, None] * third) / length,
         rate=jnp.sum(per_grain[:, :, None] * first),
     )
 
