@@ -73,6 +73,12 @@ BENCHMARKS = (
         ("dissipation.json", "dissipation.png"),
     ),
     Benchmark(
+        "approach_speeds",
+        "How fast do colliding grains approach, beside grains with independent velocities?",
+        (10, 0.5),
+        ("approach_speeds.json", "approach_speeds.png"),
+    ),
+    Benchmark(
         "quick_map",
         "What does `jaxgran map` draw when it is given no option?",
         (0.5, 0.4),
