@@ -67,6 +67,12 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "paper_claims",
+        "Do the flows have the properties that the paper names, and what error has an average over 2000 time steps?",
+        (6, 0.5),
+        ("paper_claims.json",),
+    ),
+    Benchmark(
         "dissipation",
         "How much less than Enskog's is the dissipation rate, and do a theory's errors follow from it?",
         (1, 0.5),
