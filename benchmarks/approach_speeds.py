@@ -28,7 +28,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.integrate import simpson
 from scipy.optimize import brentq
-from scipy.special import gamma
+from scipy.special import erf, gamma
 
 import jaxgran as jg
 from benchmarks.output import Output, rounded
@@ -40,6 +40,8 @@ from jaxgran.theory.mixture import uniform_mixture
 
 EDGES = np.geomspace(1e-4, 1e2, 241)  # of the bins of g √μ, in γ̇σ√m; slower and faster ones are in the outer bins
 POWERS = np.arange(4)  # of the sums over the collisions
+SPEEDS = ((0.05, 0.15), (0.4, 0.6), (0.9, 1.1), (1.8, 2.2), (3.5, 4.5))  # x between which pairs are counted
+SLOW = 0.5  # x below which a collision counts as slow
 RELAXATION = 0.5  # strain between two time steps
 ANGLES = 64  # directions of contacts, on the circle
 GRID = np.linspace(0, 12, 1201)  # x where the theory is integrated
@@ -121,13 +123,15 @@ def samples(plan: Plan, task: tuple[float, float, int]) -> list[Sample]:
 def row(nu: float, alpha: float, timestep: float, seeds: list[Sample]) -> dict:
     """Numbers of a flow as [value, standard error], those of independent velocities, and both densities by bin."""
     sums = sums_of(seeds)
-    value, error = standard_errors(partial(estimate, alpha, seeds[0].grains, float(seeds[0].area)), sums)
+    local = np.sum(sums["local_kinetic"]) / np.sum(sums["duration"])
+    scale = np.sqrt(local)
+    still = independent(local * np.eye(2), nu, shear_rate=0.0)["powers"][0]
+    known = partial(estimate, alpha, seeds[0].grains, float(seeds[0].area))
+    value, error = standard_errors(lambda s: known(s) | by_speed(float(seeds[0].area), scale, still, s), sums)
     tensor = value.pop("tensor")
     theory = independent(tensor, nu)
     powers = theory["powers"] / theory["powers"][0]
-    scale = np.sqrt(value["local_temperature"])
-    still = independent(value["local_temperature"] * np.eye(2), nu, shear_rate=0.0)["powers"][0]
-    numbers = {name: [float(value[name]), float(error[name])] for name in value if name != "density"}
+    numbers = {name: [x.tolist(), error[name].tolist()] for name, x in value.items() if name != "density"}
     rate, temperature = (numbers[name][0] for name in ("collisions", "collisional_temperature"))
     shape = numbers["shape"]
     exponents = [exponent(shape[0] + shift * shape[1]) for shift in (0, -1, 1)]
@@ -193,6 +197,23 @@ def estimate(alpha: float, grains: int, area: float, sums: Sums) -> Sums:
         "velocity_kurtosis": fourth / second**2,
         "tensor": tensor * (local / granular)[..., None, None],
         "density": sums["histogram"] / (count[..., None] * np.diff(EDGES)),
+    }
+
+
+def by_speed(area: float, scale: float, still: float, sums: Sums) -> Sums:
+    """Pairs at contact over those of equilibrium in ``SPEEDS``, and shares of slow collisions; ``scale`` is √T_l.
+
+    ``still`` are the collisions of equilibrium per area and time. Sums have any leading axes.
+    """
+    x, edges = midpoints() / scale, EDGES / scale
+    pairs = sums["histogram"] / x / (area * sums["duration"][..., None])
+    at_rest = still * np.sqrt(np.pi / 2) * np.diff(erf(edges / np.sqrt(2)))
+    energy = sums["histogram"] * x**2
+    here = [(x > low) & (x < high) for low, high in SPEEDS]
+    return {
+        "pairs_over_equilibrium": np.stack([pairs[..., k].sum(-1) / at_rest[k].sum() for k in here], axis=-1),
+        "slow_share_of_collisions": sums["histogram"][..., x < SLOW].sum(-1) / sums["histogram"].sum(-1),
+        "slow_share_of_energy": energy[..., x < SLOW].sum(-1) / energy.sum(-1),
     }
 
 

@@ -10,7 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxgran as jg
-from benchmarks.approach_speeds import EDGES, estimate, exponent, independent, midpoints, observe, sums_of
+from benchmarks.approach_speeds import (
+    EDGES,
+    SLOW,
+    SPEEDS,
+    by_speed,
+    estimate,
+    exponent,
+    independent,
+    midpoints,
+    observe,
+    sums_of,
+)
 from jaxgran.statistics import standard_errors
 from jaxgran.theory.enskog import collisional_transfer
 
@@ -46,6 +57,20 @@ def test_dissipation_of_independent_velocities_is_enskogs() -> None:
     square = independent(TENSOR, nu)["powers"][2]
     enskog = collisional_transfer(jnp.asarray(TENSOR), alpha, nu).dissipation_rate
     assert (1 - alpha**2) / 2 * square == pytest.approx(float(enskog), rel=1e-5)
+
+
+def test_collisions_of_equilibrium_are_those_of_its_pairs_at_any_speed() -> None:
+    temperature, area, duration, count = 0.7, 50.0, 3.0, 1e6
+    x = EDGES / np.sqrt(temperature)
+    histogram = -count * np.diff(np.exp(-(x**2) / 2))  # of the density x exp(−x²/2)
+    sums = {"histogram": histogram, "duration": np.float64(duration)}
+    found = by_speed(area, np.sqrt(temperature), count / (area * duration), sums)
+    fastest, width = (
+        SPEEDS[-1][-1],
+        np.log(EDGES[1] / EDGES[0]),
+    )  # a bin is (x · width)² wide in x²
+    np.testing.assert_allclose(found["pairs_over_equilibrium"], 1, atol=(fastest * width) ** 2 / 12)
+    assert found["slow_share_of_collisions"] == pytest.approx(1 - np.exp(-(SLOW**2) / 2), rel=0.1)
 
 
 @given(st.floats(0.3, 8.0), st.floats(0.1, 10.0))
