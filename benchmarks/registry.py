@@ -67,10 +67,22 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "paper_claims",
+        "Do the flows have the properties that the paper names, and what error has an average over 2000 time steps?",
+        (6, 0.5),
+        ("paper_claims.json",),
+    ),
+    Benchmark(
         "dissipation",
         "How much less than Enskog's is the dissipation rate, and does a theory with a law of it predict other flows?",
         (2, 1),
         ("dissipation.json", "dissipation.png"),
+    ),
+    Benchmark(
+        "approach_speeds",
+        "How fast do colliding grains approach, beside grains with independent velocities?",
+        (10, 0.5),
+        ("approach_speeds.json", "approach_speeds.png"),
     ),
     Benchmark(
         "quick_map",
