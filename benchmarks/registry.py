@@ -67,6 +67,12 @@ BENCHMARKS = (
         ),
     ),
     Benchmark(
+        "reference_runs",
+        "What are stresses and temperatures at random points that no table of `jg.validity` has seen?",
+        (10, 0.5),
+        ("reference_runs.json",),
+    ),
+    Benchmark(
         "dissipation",
         "How much less than Enskog's is the dissipation rate, and do a theory's errors follow from it?",
         (1, 0.5),
