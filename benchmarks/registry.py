@@ -73,6 +73,17 @@ BENCHMARKS = (
         ("reference_runs.json",),
     ),
     Benchmark(
+        "reference",
+        "Which table does `jg.validity` answer from, and do its intervals hold?",
+        (1, 1),
+        ("reference.json", "reference.png"),
+        (
+            Option("dataset", "that of a map, as NetCDF, in place of the paper's", Path),
+            Option("--other", "a map of the same points with another time step", Path),
+        ),
+        one_core=True,
+    ),
+    Benchmark(
         "dissipation",
         "How much less than Enskog's is the dissipation rate, and do a theory's errors follow from it?",
         (1, 0.5),
