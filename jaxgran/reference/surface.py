@@ -55,27 +55,27 @@ class Surface:
     shape: Shape
 
     @cached_property
-    def _precision(self) -> np.ndarray:
+    def _whitening(self) -> np.ndarray:
+        """The inverse of the lower Cholesky factor of the covariance: the inverse itself would lose small variances."""
         noise = np.diag((self.shape.noise * self.stderrs) ** 2)
-        return np.linalg.inv(self.shape.covariance(self.points, self.points) + noise)
+        return np.linalg.inv(np.linalg.cholesky(self.shape.covariance(self.points, self.points) + noise))
 
     @cached_property
     def _weights(self) -> np.ndarray:
-        return self._precision @ self.values
+        return self._whitening.T @ (self._whitening @ self.values)
 
     def __call__(self, where: Any, xp: Any = np) -> tuple[Any, Any]:
         """Value and standard error at coordinates (..., 2)."""
         with_points = self.shape.covariance(where, self.points, xp)
-        known = xp.sum((with_points @ self._precision) * with_points, axis=-1)
+        known = xp.sum((with_points @ self._whitening.T) ** 2, axis=-1)
         spread = xp.sqrt(xp.maximum(self.shape.variance(where, xp) - known, _TINY))
         return with_points @ self._weights, self.shape.leave_one_out * spread
 
     def left_out(self) -> tuple[np.ndarray, np.ndarray]:
         """Errors at the points where each is left out in turn, and their expected standard deviations."""
-        own = np.diag(self._precision)
+        own = np.sum(self._whitening**2, axis=0)
         return self._weights / own, self.shape.leave_one_out / np.sqrt(own)
 
     def log_likelihood(self) -> float:
         """Logarithm of the probability density of the values, up to a constant."""
-        _, determinant = np.linalg.slogdet(self._precision)
-        return float(determinant - self.values @ self._weights) / 2
+        return float(np.sum(np.log(np.diag(self._whitening))) - self.values @ self._weights / 2)

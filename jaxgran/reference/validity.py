@@ -15,12 +15,12 @@ from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import FACTORS, MEASURED, Table, excess_from_surface, shipped_table, theory_of
 
 _NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
-_CAUSES = {
-    "local_temperature": "the granular temperature is not that of neighbours, as long waves of velocity add to it",
-    "anisotropy": "velocities are anisotropic",
-    "chaos": "velocities of colliding grains are correlated",
-    "pairs": "the pairs at contact are not those of equilibrium",
-    "binary": "grains collide in clusters",
+_CAUSES = {  # what is said where a factor is below one, and where it is above
+    "local_temperature": ("long waves of velocity raise the granular temperature",) * 2,
+    "anisotropy": ("velocities are anisotropic",) * 2,
+    "chaos": ("velocities of colliding grains are correlated",) * 2,
+    "pairs": ("fewer pairs are at contact than in equilibrium", "more pairs are at contact than in equilibrium"),
+    "binary": ("grains collide in clusters",) * 2,
 }
 
 
@@ -78,14 +78,16 @@ class Validity(NamedTuple):
         error, ci95 = (100 * float(np.asarray(x["pressure"])[place]) for x in (self.error, self.error_ci95))
         if abs(error) > ci95:
             side = "over" if error > 0 else "under"
-            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
+            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %: "
         else:
-            start = f"Kinetic theory agrees with the pressure within its interval ({with_error(error, ci95)} %)"
+            start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %), although "
         if first == "none":
+            start = start.replace(", although ", "; ")
             cause = "no assumption changes the contact pressure by more than 2 %"
         else:
             factor = float(np.asarray(self.factors[first])[place])
-            cause = f"first of all, {_CAUSES[first]} (a factor of {factor:.2g} in the contact pressure)"
+            why = f"a factor of {factor:.2g} in the contact pressure at the measured temperature"
+            cause = f"{_CAUSES[first][factor > 1]} ({why})"
         ratio = float(np.asarray(self.measured["force_ratio"])[place])
         ratio_ci95 = float(np.asarray(self.measured_ci95["force_ratio"])[place])
         off = max(ratio - 1, 0.0) + ratio_ci95
@@ -94,7 +96,7 @@ class Validity(NamedTuple):
             binary = f"collisions are binary to {100 * off:.1g} %"
         else:
             binary = f"binary collisions explain {100 / ratio:.2g} % of the mean contact force"
-        return f"{start}: {cause}; {binary} (dt = {timestep}/γ̇)."
+        return f"{start}{cause}; {binary} (dt = {timestep}/γ̇)."
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
