@@ -52,11 +52,8 @@ def run_where_command(restitution: float, packing_fraction: float, json: bool = 
     for name in FACTORS:
         factors.rows.append([_ASSUMPTIONS[name], _with_ci95(found.factors[name], found.factors_ci95[name])])
     print_table(factors)
-    print(
-        plain(
-            f"Reference map: N = {table.head['grains']}, dt = {table.head['timestep']}/γ̇. Theory: {table.head['theory']}."
-        )
-    )
+    made_with = f"N = {table.head['grains']}, dt = {table.head['timestep']}/γ̇"
+    print(plain(f"Reference map: {made_with}. Theory: {table.head['theory']}."))
 
 
 def _with_ci95(value: Any, ci95: Any) -> str:
