@@ -73,6 +73,23 @@ BENCHMARKS = (
         ("paper_claims.json",),
     ),
     Benchmark(
+        "reference_runs",
+        "What are stresses and temperatures at random points that no table of `jg.validity` has seen?",
+        (10, 0.5),
+        ("reference_runs.json",),
+    ),
+    Benchmark(
+        "reference",
+        "Which table does `jg.validity` answer from, and do its intervals hold?",
+        (1, 1),
+        ("reference.json", "reference.png"),
+        (
+            Option("dataset", "that of a map, as NetCDF, in place of the paper's", Path),
+            Option("--other", "a map of the same points with another time step", Path),
+        ),
+        one_core=True,
+    ),
+    Benchmark(
         "dissipation",
         "How much less than Enskog's is the dissipation rate, and does a theory with a law of it predict other flows?",
         (2, 1),

@@ -30,6 +30,7 @@ from jaxgran.cli.terminal import (
     stop,
     stop_interrupted,
 )
+from jaxgran.cli.where import WHERE_EXAMPLES, where_command
 from jaxgran.maps.interruption import is_interruption
 from jaxgran.model.checks import InputError
 
@@ -63,6 +64,12 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
         "Run one flow, average it, film it.",
         "Run one flow to its steady state, sample it, and print its averages with their errors.",
         RUN_EXAMPLES,
+    ),
+    "where": (
+        where_command,
+        "Say where kinetic theory holds, at once.",
+        "Say what kinetic theory can predict at a restitution and a packing fraction, from a map measured once.",
+        WHERE_EXAMPLES,
     ),
     "fit": (
         fit_command,

@@ -1,0 +1,265 @@
+"""The table from which ``jg.validity`` answers, made from a map; and whether its intervals hold.
+
+A map with one number of grains, one time step and the factors of Enskog's pressure becomes ``averages.csv`` in
+``jaxgran/reference``: every average with its standard error and the bound on its other errors, and the shape of the
+Gaussian process that interpolates it, by maximum likelihood. The best of three theories, whose pressure is within 10 %
+at most points, becomes a Chebyshev series in ``theory.csv``. Then the intervals are judged: on points of the map that
+are left out, and on the fresh flows of ``python -m benchmarks reference_runs``. A second map adds the line of the force
+ratio at another time step to the figure.
+
+    jaxgran map --preset paper --timestep 1e-4 --no-snapshots --output other.nc
+    python -m benchmarks reference --other other.nc      # from benchmarks/results/paper.nc, in half a minute
+    python -m benchmarks reference map.nc                # from another map
+    python -m benchmarks reference --quick               # into files named _quick and a folder of the output
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+from scipy.optimize import minimize
+
+import jaxgran as jg
+from benchmarks.output import RESULTS, Output
+from benchmarks.reference_figure import draw
+from jaxgran.maps.schema import flattened
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.reference.surface import Shape, coordinates
+from jaxgran.reference.table import (
+    FACTORS,
+    FOLDER,
+    MEASURED,
+    RATIO,
+    THEORY,
+    Series,
+    Table,
+    read_table,
+    theory_of,
+    write_columns,
+)
+from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
+
+THEORIES: dict[str, Callable] = {one.__name__: one for one in (gaussian_moments, garzo_dufty, jenkins_richman)}
+TERMS = 16  # of the Chebyshev series along each coordinate
+MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range
+START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
+BOUNDED_BY = {"dissipation_rate": "shear_stress"}  # its power is what is dissipated
+
+
+def run(output: Output, dataset: Path | None = None, other: Path | None = None) -> None:
+    """Make the table, judge its intervals, draw the figure, and write ``reference`` as JSON and PNG."""
+    source = RESULTS / "paper.nc" if dataset is None else dataset
+    folder = output.folder / "reference_quick" if output.quick else FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    others = [] if other is None else [jg.open_map(other)]
+    make_table(jg.open_map(source), others, folder, {"map": source.name, "table commit": output.hardware["commit"]})
+    table = read_table(folder)
+    fresh = json.loads((RESULTS / "reference_runs.json").read_text())
+    rows = list(judged(table, fresh["rows"]))
+    head = {"table": table.head, "left_out": left_out(table), "plane": plane(table)}
+    head |= {"fresh": {key: fresh[key] for key in ("points", "grains", "timestep")}, "coverage": coverage(rows)}
+    for name, found in (head["left_out"] | {f"fresh {key}": one for key, one in head["coverage"].items()}).items():
+        print(name, found)
+    print(head["plane"])
+    output.write_rows("reference", head, "rows", rows)
+    output.write_picture(draw(table), "reference", dpi=300)
+
+
+# ------------------------------------------------------------------------------------------------ table
+
+
+def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_from: dict[str, Any]) -> None:
+    """Write both files of the table of a map into a folder."""
+    flat = flattened(data).stack(point=("packing_fraction", "restitution"))
+    flat = flat.isel(point=np.flatnonzero(np.isfinite(flat["pressure"].values)))
+    columns = {name: flat[name].values for name in ("restitution", "packing_fraction")}
+    paths = {name: name for name in (*MEASURED, RATIO)} | {"dissipation_rate": "stresses/dissipation_rate"}
+    paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS}
+    for name, path in paths.items():
+        columns |= {name: flat[path].values, f"{name}_stderr": flat[f"{path}_stderr"].values}
+        bounded = BOUNDED_BY.get(name, name)
+        if f"{bounded}_ci95" in flat:
+            parts = flat[f"{bounded}_ci95"].drop_sel(error_source=["total", "sampling"])
+            bound = np.sqrt((parts**2).sum("error_source").values)
+            columns[f"{name}_bound"] = bound * columns[name] / flat[bounded].values
+    for other in others:
+        name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
+        at_points = flattened(other).stack(point=("packing_fraction", "restitution")).sel(point=flat.point)
+        columns |= {name: at_points[RATIO].values, f"{name}_stderr": at_points[f"{RATIO}_stderr"].values}
+        paths[name] = RATIO
+    theory, within = best_theory(columns)
+    series = chebyshev_series(theory, columns)
+    terms = {"low": " ".join(f"{x:.12g}" for x in series.low), "high": " ".join(f"{x:.12g}" for x in series.high)}
+    first, second = (x.ravel() for x in np.indices((TERMS, TERMS)))
+    table_of_terms = {"first": first, "second": second, **{k: v.ravel() for k, v in series.coefficients.items()}}
+    about = {"contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and -ln(0.86 - nu), see table.py"}
+    write_columns(folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9)
+    attributes = {name: data.attrs[name] for name in ("grains", "timestep", "seeds", "polydispersity", "activation")}
+    head: dict[str, Any] = {
+        "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear rate, see table.py",
+        **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
+        "map commit": data.attrs["commit"],
+        **made_from,
+        **{f"points with the pressure of {name} within 10 %": count for name, count in within.items()},
+    }
+    bare = Table({}, columns, series)
+    for name in paths:
+        shape = fitted_shape(bare, name)
+        head[f"surface {name}"] = " ".join(
+            f"{x:.5g}" for x in (shape.amplitude, *shape.lengths, shape.noise, shape.leave_one_out)
+        )
+    write_columns(folder / "averages.csv", head, columns)
+
+
+def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, int]]:
+    """The theory whose pressure is within 10 % at most points, and how many points that are for each theory."""
+    flows = columns["restitution"], columns["packing_fraction"]
+    within = {}
+    for name, theory in THEORIES.items():
+        predicted = np.asarray(jax.vmap(lambda *flow, theory=theory: theory(*flow).pressure)(*flows))
+        within[name] = int(np.sum(np.abs(predicted / columns["pressure"] - 1) < 0.1))
+    return THEORIES[max(within, key=within.__getitem__)], within
+
+
+def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series:
+    """The series of the logarithms of a theory's predictions, over the range of the columns."""
+    ends = coordinates(*(np.array([x.min(), x.max()]) for x in (columns["restitution"], columns["packing_fraction"])))
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
+    nodes = np.cos(np.pi * (np.arange(TERMS) + 0.5) / TERMS)
+    first, second = (low[k] + (nodes + 1) / 2 * (high[k] - low[k]) for k in (0, 1))
+    u, v = (x.ravel() for x in np.meshgrid(first, second, indexing="ij"))
+    predicted = jax.vmap(theory)(1 - u**2, packing_fraction(v))
+    inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, TERMS - 1))
+    coefficients = {}
+    for name in THEORY:
+        values = np.log(np.asarray(getattr(predicted, name))).reshape(TERMS, TERMS)
+        coefficients[name] = inverse @ values @ inverse.T
+    return Series(low, high, coefficients)
+
+
+def packing_fraction(second: np.ndarray) -> np.ndarray:
+    """ν from the second of the ``coordinates``."""
+    at_zero = coordinates(0.0, 0.0)[1]  # −ln of the packing fraction at which it diverges
+    return np.exp(-at_zero) - np.exp(-second)
+
+
+def fitted_shape(table: Table, name: str) -> Shape:
+    """The shape of the surface of an average: the largest likelihood, with weak priors of its four logarithms."""
+    surface = table.surface(name, Shape(1.0, (1.0, 1.0)))
+    priors, widths = np.array([-1.0, 0.5, 0.5, 0.0]), np.array([3.0, 1.5, 1.5, 0.5])
+
+    def with_shape(logs: np.ndarray) -> Shape:
+        amplitude, first, second, noise = np.exp(np.clip(logs, -6, 6))
+        return Shape(float(amplitude), (float(first), float(second)), float(noise))
+
+    def cost(logs: np.ndarray) -> float:
+        likelihood = type(surface)(surface.points, surface.values, surface.stderrs, with_shape(logs)).log_likelihood()
+        return -likelihood + float(np.sum(((logs - priors) / widths) ** 2)) / 2
+
+    enough = {"xatol": 0.02, "fatol": 0.02}
+    best = min((minimize(cost, one, method="Nelder-Mead", options=enough) for one in START), key=lambda one: one.fun)
+    shape = with_shape(best.x)
+    errors, expected = type(surface)(surface.points, surface.values, surface.stderrs, shape).left_out()
+    scatter = float(np.sqrt(np.mean((errors / expected) ** 2)))
+    return Shape(shape.amplitude, shape.lengths, shape.noise, max(1.0, scatter))
+
+
+# -------------------------------------------------------------------------------------------- intervals
+
+
+def left_out(table: Table) -> dict[str, dict[str, float]]:
+    """Leave-one-out errors of every surface, and the share within 95 % intervals."""
+    found = {}
+    for name, surface in table.surfaces.items():
+        errors, expected = surface.left_out()
+        found[name] = {
+            "rms": round(float(np.sqrt(np.mean(errors**2))), 4),
+            "noise": round(float(np.sqrt(np.mean(surface.stderrs**2))), 4),
+            "covered": round(float(np.mean(np.abs(errors) < HALF_INTERVAL * expected)), 3),
+        }
+    return found
+
+
+def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
+    """For every fresh flow, ln(measured/table) of every average and the half-widths of its two intervals.
+
+    The whole interval is that of ``jg.validity``. The other one leaves out the bounds: sampling and interpolation only,
+    for flows of the map's number of grains. The errors of the fresh flow are added to both.
+    """
+    for row in rows:
+        where = coordinates(row["restitution"], row["packing_fraction"])
+        one = {"restitution": row["restitution"], "packing_fraction": row["packing_fraction"]}
+        for name in MEASURED:
+            log, stderr = table.surfaces[name](where)
+            expected = log + table.series(where)[theory_of(name)]
+            bounded = BOUNDED_BY.get(name, name)
+            known = [row[f"{bounded}_{part}"] / row[bounded] for part in ("timestep", "tolerance")]
+            own = np.hypot(HALF_INTERVAL * row[f"{name}_stderr"] / row[name], np.hypot(*known))
+            narrow = np.hypot(HALF_INTERVAL * stderr, own)
+            whole = np.hypot(narrow, np.exp(table.bounds[name](where)[0]))
+            values = np.log(row[name]) - expected, narrow, whole
+            one |= {
+                f"{name}{end}": round(float(x), 5) for end, x in zip(("", "_narrow", "_whole"), values, strict=True)
+            }
+        yield one
+
+
+def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Share of the fresh flows within both intervals, mean and rms difference."""
+    found = {}
+    for name in MEASURED:
+        apart, narrow, whole = (np.array([row[f"{name}{end}"] for row in rows]) for end in ("", "_narrow", "_whole"))
+        found[name] = {
+            "covered": round(float(np.mean(np.abs(apart) < whole)), 3),
+            "covered_narrow": round(float(np.mean(np.abs(apart) < narrow)), 3),
+            "mean": round(float(np.mean(apart)), 4),
+            "rms": round(float(np.sqrt(np.mean(apart**2))), 4),
+            "median_half_width": round(float(np.median(whole)), 4),
+        }
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ plane
+
+
+def plane(table: Table) -> dict[str, Any]:
+    """Shares of the plane of ln(1 − α) and ν where the theory's pressure is within limits, and counts of points."""
+    alphas, nus = table.columns["restitution"], table.columns["packing_fraction"]
+    x, y = (
+        np.linspace(*np.log(1 - np.array(table.range("restitution"))), 200),
+        np.linspace(*table.range("packing_fraction"), 200),
+    )
+    where = coordinates(*np.meshgrid(1 - np.exp(x), y))
+    over, stderr = table.surfaces["pressure"](where)
+    half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds["pressure"](where)[0]))
+    points = coordinates(alphas, nus)
+    error = np.exp(table.series(points)["pressure"]) / table.columns["pressure"] - 1
+    binary = table.columns["force_ratio"] < 1.05
+    worst = int(np.argmin(np.where(binary, error, np.inf)))
+    found: dict[str, Any] = {}
+    for limit in (0.05, 0.10):
+        low, high = (np.abs(np.expm1(-(over + shift))) for shift in (-half, half))
+        outside = np.abs(np.expm1(-over)) > limit
+        share = {
+            "share": 1 - np.mean(outside),
+            "share_at_least": np.mean((low < limit) & (high < limit)),
+            "share_at_most": np.mean((low < limit) | (high < limit) | ~outside | ((over - half) * (over + half) < 0)),
+        }
+        found[f"{limit:g}"] = {name: round(float(x), 3) for name, x in share.items()}
+        found[f"{limit:g}"] |= {"points_binary_within": int(np.sum(binary & (np.abs(error) < limit)))}
+    return found | {
+        "points": len(alphas),
+        "points_binary": int(binary.sum()),
+        "worst_binary": {
+            "restitution": float(alphas[worst]),
+            "packing_fraction": float(nus[worst]),
+            "error": round(float(error[worst]), 3),
+            "force_ratio": float(table.columns["force_ratio"][worst]),
+        },
+    }

@@ -1,0 +1,81 @@
+"""Smooth surfaces through measured points of the plane of α and ν, with their standard errors: Gaussian processes.
+
+The coordinates are √(1 − α) and −ln(0.86 − ν), in which logarithms of averages over those of a theory are smooth. A
+surface is the mean of a Gaussian process that is given the points with their standard errors. Its prior is a plane plus
+a Matérn 5/2 function. Amplitude, lengths and a factor of the standard errors maximise the likelihood; where the points
+left out scatter more than they should, all standard errors are larger by the ratio. C. E. Rasmussen and C. K. I.
+Williams, *Gaussian Processes for Machine Learning* (2006).
+
+All functions take the module of arrays, ``numpy`` or ``jax.numpy``, as ``xp``.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+_JAMMING = 0.86  # beyond the densest flow; the onset of rigidity lies near 0.85
+_SLOPE = 5.0  # prior standard deviation of the plane's three coefficients: wide
+_TINY = 1e-30  # under a root, whose derivative at zero would be infinite
+
+
+def coordinates(restitution: Any, packing_fraction: Any, xp: Any = np) -> Any:
+    """√(1 − α) and −ln(0.86 − ν), on a last axis."""
+    return xp.stack([xp.sqrt(1 - restitution), -xp.log(_JAMMING - packing_fraction)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What is fitted of a surface: amplitude, a length along each coordinate, factors of standard errors."""
+
+    amplitude: float
+    lengths: tuple[float, float]
+    noise: float = 1.0  # of the points
+    leave_one_out: float = 1.0  # of the surface
+
+    def covariance(self, one: Any, other: Any, xp: Any = np) -> Any:
+        """Prior covariance of (..., 2) and (points, 2) coordinates, (..., points)."""
+        apart = (one[..., None, :] - other) / np.array(self.lengths)
+        r = xp.sqrt(5 * xp.sum(apart**2, axis=-1) + _TINY)
+        return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + _SLOPE**2 * (1 + one @ other.T)
+
+    def variance(self, one: Any, xp: Any = np) -> Any:
+        """Prior variance at (..., 2) coordinates."""
+        return self.amplitude**2 + _SLOPE**2 * (1 + xp.sum(one**2, axis=-1))
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface through values (points,) with standard errors at coordinates (points, 2)."""
+
+    points: np.ndarray
+    values: np.ndarray
+    stderrs: np.ndarray
+    shape: Shape
+
+    @cached_property
+    def _whitening(self) -> np.ndarray:
+        """The inverse of the lower Cholesky factor of the covariance: the inverse itself would lose small variances."""
+        noise = np.diag((self.shape.noise * self.stderrs) ** 2)
+        return np.linalg.inv(np.linalg.cholesky(self.shape.covariance(self.points, self.points) + noise))
+
+    @cached_property
+    def _weights(self) -> np.ndarray:
+        return self._whitening.T @ (self._whitening @ self.values)
+
+    def __call__(self, where: Any, xp: Any = np) -> tuple[Any, Any]:
+        """Value and standard error at coordinates (..., 2)."""
+        with_points = self.shape.covariance(where, self.points, xp)
+        known = xp.sum((with_points @ self._whitening.T) ** 2, axis=-1)
+        spread = xp.sqrt(xp.maximum(self.shape.variance(where, xp) - known, _TINY))
+        return with_points @ self._weights, self.shape.leave_one_out * spread
+
+    def left_out(self) -> tuple[np.ndarray, np.ndarray]:
+        """Errors at the points where each is left out in turn, and their expected standard deviations."""
+        own = np.sum(self._whitening**2, axis=0)
+        return self._weights / own, self.shape.leave_one_out / np.sqrt(own)
+
+    def log_likelihood(self) -> float:
+        """Logarithm of the probability density of the values, up to a constant."""
+        return float(np.sum(np.log(np.diag(self._whitening))) - self.values @ self._weights / 2)

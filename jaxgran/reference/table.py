@@ -1,0 +1,163 @@
+"""The tables of this folder: measured averages of the reference map, and the theory as a Chebyshev series.
+
+Both are text with a head of lines ``# name: value``; ``python -m benchmarks reference`` makes them from a map.
+``averages.csv`` has a row for each point. Each average has the columns NAME, NAME_stderr and, where there is a bound on
+the errors other than sampling, NAME_bound; the head has the shape of its surface. ``theory.csv`` has a row for each
+term of the series of the logarithm of a prediction, in the coordinates of ``surface`` scaled to −1 ... 1.
+"""
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxgran.reference.surface import Shape, Surface, coordinates
+
+MEASURED = {
+    "pressure": "m / t^2",
+    "shear_stress": "m / t^2",
+    "granular_temperature": "m (sigma / t)^2",
+    "local_granular_temperature": "m (sigma / t)^2",
+    "dissipation_rate": "m / t^3",
+}
+"""Averages of which the table has a surface over a theory, and their units."""
+
+RATIO = "force_ratio"
+"""The force ratio at the time step of the map; ``force_ratio_at_DT`` is that of another map, at its time step."""
+
+THEORY = ("pressure", "shear_stress", "granular_temperature")
+"""What the series predict. The dissipation rate of a theory is its shear stress times the shear rate."""
+
+FACTORS = ("local_temperature", "anisotropy", "chaos", "pairs", "binary")
+"""Factors of the contact pressure over Enskog's, in the order of ``sampling.enskog_factors``."""
+
+FOLDER = Path(__file__).parent
+_EXCESS = 0.01  # the force ratio's surface is that of asinh((ratio − 1)/0.01): linear below, logarithmic above
+_BOUND_SHAPE = Shape(1.0, (1.0, 1.0))  # of the logarithm of a bound, which varies slowly
+_BOUND_STDERR = 0.02
+_LEAST_STDERR = 1e-3  # of a value of a surface; without clusters, that of the force ratio is 0
+
+
+def theory_of(name: str) -> str:
+    """The prediction that a measured average is compared with."""
+    return "shear_stress" if name == "dissipation_rate" else name.removeprefix("local_")
+
+
+def to_surface(name: str, value: Any, stderr: Any, theory: Any = 1.0) -> tuple[Any, Any]:
+    """An average and its standard error as they are in its surface; measured averages are taken over the theory's."""
+    if name.startswith(RATIO):
+        return np.arcsinh((value - 1) / _EXCESS), stderr / np.hypot(value - 1, _EXCESS)
+    return np.log(value / theory), stderr / value
+
+
+def excess_from_surface(value: Any, xp: Any = np) -> Any:
+    """Force ratio − 1 from the value of its surface."""
+    return _EXCESS * xp.sinh(value)
+
+
+@dataclass(frozen=True)
+class Series:
+    """Chebyshev series in two coordinates of the logarithms of the predictions of a theory."""
+
+    low: np.ndarray  # (2,) coordinates at −1
+    high: np.ndarray  # at 1
+    coefficients: dict[str, np.ndarray]  # (terms, terms) each
+
+    def __call__(self, where: Any, xp: Any = np) -> dict[str, Any]:
+        """Logarithm of every prediction at coordinates (..., 2)."""
+        scaled = (2 * where - self.low - self.high) / (self.high - self.low)
+        count = len(next(iter(self.coefficients.values())))
+        terms = [xp.ones_like(scaled), scaled]
+        for _ in range(2, count):
+            terms.append(2 * scaled * terms[-1] - terms[-2])
+        stacked = xp.stack(terms, axis=-1)
+        first, second = stacked[..., 0, :], stacked[..., 1, :]
+        return {name: xp.sum((first @ table) * second, axis=-1) for name, table in self.coefficients.items()}
+
+
+@dataclass(frozen=True)
+class Table:
+    """The averages of a map as surfaces, and what it was made with."""
+
+    head: dict[str, str]
+    columns: dict[str, np.ndarray]
+    series: Series
+
+    def range(self, name: str) -> tuple[float, float]:
+        """Smallest and largest restitution or packing fraction."""
+        return float(self.columns[name].min()), float(self.columns[name].max())
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        return coordinates(self.columns["restitution"], self.columns["packing_fraction"])
+
+    @cached_property
+    def ratios(self) -> dict[float, Surface]:
+        """The surfaces of the force ratio by time step."""
+        others = {
+            float(name.split("_at_")[1]): x for name, x in self.surfaces.items() if name.startswith(f"{RATIO}_at_")
+        }
+        return {float(self.head["timestep"]): self.surfaces[RATIO], **others}
+
+    @cached_property
+    def surfaces(self) -> dict[str, Surface]:
+        """The surface of every average."""
+        return {name: self.surface(name, shape) for name, shape in self.shapes.items()}
+
+    @cached_property
+    def bounds(self) -> dict[str, Surface]:
+        """The surfaces of the logarithm of every bound, over its average; that of the force ratio is not."""
+        found = {}
+        for name in [name for name in self.shapes if f"{name}_bound" in self.columns]:
+            over = 1.0 if name == RATIO else self.columns[name]
+            values = np.log(self.columns[f"{name}_bound"] / over)
+            found[name] = Surface(self.points, values, np.full(values.shape, _BOUND_STDERR), _BOUND_SHAPE)
+        return found
+
+    @cached_property
+    def shapes(self) -> dict[str, Shape]:
+        found = {}
+        for key, text in self.head.items():
+            if key.startswith("surface "):
+                amplitude, first, second, noise, left_out = map(float, text.split())
+                found[key.removeprefix("surface ")] = Shape(amplitude, (first, second), noise, left_out)
+        return found
+
+    def surface(self, name: str, shape: Shape) -> Surface:
+        """The surface of an average, of a given shape."""
+        theory = np.exp(self.series(self.points)[theory_of(name)]) if name in MEASURED else 1.0
+        values, stderrs = to_surface(name, self.columns[name], self.columns[f"{name}_stderr"], theory)
+        return Surface(self.points, values, np.maximum(stderrs, _LEAST_STDERR), shape)
+
+
+@cache
+def shipped_table() -> Table:
+    """The table of this package."""
+    return read_table(FOLDER)
+
+
+def read_table(folder: Path) -> Table:
+    """The table in a folder."""
+    head, columns = read_columns(folder / "averages.csv")
+    theory_head, terms = read_columns(folder / "theory.csv")
+    low, high = (np.array([float(x) for x in theory_head[name].split()]) for name in ("low", "high"))
+    count = round(np.sqrt(len(terms["first"])))
+    coefficients = {name: terms[name].reshape(count, count) for name in THEORY}
+    return Table(theory_head | head, columns, Series(low, high, coefficients))
+
+
+def read_columns(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Head and columns of a file."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    head = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
+    names, *rows = [line.split(",") for line in lines if not line.startswith("#")]
+    return head, dict(zip(names, np.array(rows, float).T, strict=True))
+
+
+def write_columns(path: Path, head: dict[str, Any], columns: dict[str, Any], digits: int = 6) -> None:
+    """Write a file that ``read_columns`` reads."""
+    lines = [f"# {name}: {value}" for name, value in head.items()]
+    rows = [",".join(f"{value:.{digits}g}" for value in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([*lines, ",".join(columns), *rows]) + "\n", encoding="utf-8")

@@ -1,0 +1,193 @@
+"""Where kinetic theory can predict the stress of a granular flow: the answer for any restitution and packing fraction.
+
+Nothing is simulated. Averages are read from the surfaces of a reference map that is shipped with the package (module
+``table``), the prediction of the theory from a series. Both are smooth, so that derivatives exist.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxgran.model.checks import InputError, refused
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.model.display import with_error
+from jaxgran.reference.surface import coordinates
+from jaxgran.reference.table import FACTORS, MEASURED, Table, excess_from_surface, shipped_table, theory_of
+
+_NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
+_CAUSES = {  # what is said where a factor is below one, and where it is above
+    "local_temperature": ("long waves of velocity raise the granular temperature",) * 2,
+    "anisotropy": ("velocities are anisotropic",) * 2,
+    "chaos": ("velocities of colliding grains are correlated",) * 2,
+    "pairs": ("fewer pairs are at contact than in equilibrium", "more pairs are at contact than in equilibrium"),
+    "binary": ("grains collide in clusters",) * 2,
+}
+
+
+class Validity(NamedTuple):
+    """What was measured at a restitution and a packing fraction, and what kinetic theory says.
+
+    All arrays have the shape to which restitution and packing fraction broadcast; () for two numbers. ``NAME_ci95`` is
+    the half-width of a 95 % interval.
+
+    =============  ==================================================================================================
+    field          content
+    =============  ==================================================================================================
+    measured       average by name: pressure and shear_stress in m/t², granular_temperature and
+                   local_granular_temperature in m(σ/t)², dissipation_rate in m/t³, force_ratio
+    measured_ci95  of each: sampling, interpolation, time step, tolerance, and the difference from a large system
+    theory         pressure, shear_stress, granular_temperature and dissipation_rate of kinetic theory, same units
+    error          theory over measured, less one, of all but the granular temperature and the force ratio; the theory's
+                   temperature is compared with the local one
+    error_ci95     of each
+    factors        the assumptions of Enskog's contact pressure at the measured granular temperature, by name: factors
+                   whose product is the measured contact pressure over Enskog's (``sampling.enskog_factors``)
+    factors_ci95   of each, from sampling and interpolation at the number of grains of the map
+    =============  ==================================================================================================
+    """
+
+    restitution: Any
+    packing_fraction: Any
+    measured: dict[str, Any]
+    measured_ci95: dict[str, Any]
+    theory: dict[str, Any]
+    error: dict[str, Any]
+    error_ci95: dict[str, Any]
+    factors: dict[str, Any]
+    factors_ci95: dict[str, Any]
+
+    def fails_first(self) -> Any:
+        """The name of the factor that is furthest from one, in logarithm; "none" where all are within 2 % of one.
+
+        For values that are known, not traced by JAX: a string, or an array of strings.
+        """
+        logs = np.abs(np.log([self.factors[name] for name in FACTORS]))
+        names = np.array(FACTORS, object)[np.argmax(logs, axis=0)]
+        found = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
+        return found if found.ndim else str(found)
+
+    def verdict(self) -> Any:
+        """One sentence for every flow: a string, or an array of strings. For values that are known, not traced."""
+        first = np.asarray(self.fails_first(), object)
+        sentences = np.empty(first.shape, object)
+        for place in np.ndindex(first.shape):
+            sentences[place] = self._sentence(place, str(first[place]))
+        return sentences if sentences.ndim else sentences.item()
+
+    def _sentence(self, place: tuple[int, ...], first: str) -> str:
+        error, ci95 = (100 * float(np.asarray(x["pressure"])[place]) for x in (self.error, self.error_ci95))
+        if abs(error) > ci95:
+            side = "over" if error > 0 else "under"
+            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %: "
+        else:
+            start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %), although "
+        if first == "none":
+            start = start.replace(", although ", "; ")
+            cause = "no assumption changes the contact pressure by more than 2 %"
+        else:
+            factor = float(np.asarray(self.factors[first])[place])
+            why = f"a factor of {factor:.2g} in the contact pressure at the measured temperature"
+            cause = f"{_CAUSES[first][factor > 1]} ({why})"
+        ratio = float(np.asarray(self.measured["force_ratio"])[place])
+        ratio_ci95 = float(np.asarray(self.measured_ci95["force_ratio"])[place])
+        off = max(ratio - 1, 0.0) + ratio_ci95
+        timestep = shipped_table().head["timestep"]
+        if off < 0.05:
+            binary = f"collisions are binary to {100 * off:.1g} %"
+        else:
+            binary = f"binary collisions explain {100 / ratio:.2g} % of the mean contact force"
+        return f"{start}{cause}; {binary} (dt = {timestep}/γ̇)."
+
+
+def validity(restitution: Any, packing_fraction: Any) -> Validity:
+    """Measured stresses, temperatures and dissipation of a flow, what kinetic theory says of them, and which fails.
+
+    Args:
+      restitution: α, a number or an array.
+      packing_fraction: ν, a number or an array; the two broadcast.
+
+    Returns:
+      A ``Validity``. Its ``verdict()`` says it in a sentence. Numbers and arrays that are known give arrays of NumPy in
+      double precision. ``jax.jit``, ``jax.vmap`` and derivatives apply, in double precision only; where a traced value
+      is outside the measured range, the result is NaN.
+
+    Raises:
+      InputError: (a ValueError) a value is outside the measured range, which the message names; or JAX traces it
+        without ``jax_enable_x64``.
+
+    Examples:
+      >>> found = validity(0.98, 0.5)
+      >>> bool(abs(found.error["pressure"]) < 0.05)
+      True
+    """
+    table, xp = shipped_table(), _module(restitution, packing_fraction)
+    if xp is np:
+        restitution = _checked("restitution", restitution, table)
+        packing_fraction = _checked("packing_fraction", packing_fraction, table)
+    alpha, nu = xp.broadcast_arrays(*(xp.asarray(x, float) for x in (restitution, packing_fraction)))
+    inside = _inside(table, alpha, nu)
+    middle = [sum(table.range(name)) / 2 for name in ("restitution", "packing_fraction")]
+    where = coordinates(xp.where(inside, alpha, middle[0]), xp.where(inside, nu, middle[1]), xp)
+    found = _evaluated(table, where, xp)
+    masked = [{name: xp.where(inside, x, np.nan) for name, x in part.items()} for part in found]
+    return Validity(alpha, nu, *masked)
+
+
+def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
+    """The dictionaries of a ``Validity`` at coordinates in the measured range."""
+    logs = table.series(where, xp)
+    theory = {name: xp.exp(logs[theory_of(name)]) for name in MEASURED if not name.startswith("local_")}
+    measured, ci95, error, error_ci95 = ({} for _ in range(4))
+    for name in MEASURED:
+        over, stderr = table.surfaces[name](where, xp)
+        half = xp.hypot(HALF_INTERVAL * stderr, xp.exp(table.bounds[name](where, xp)[0]))
+        measured[name] = xp.exp(over + logs[theory_of(name)])
+        ci95[name] = measured[name] * xp.sinh(half)
+        if name != "granular_temperature":
+            error[name] = xp.expm1(-over)
+            error_ci95[name] = xp.exp(-over) * xp.sinh(half)
+    value, stderr = table.surfaces["force_ratio"](where, xp)
+    measured["force_ratio"] = 1 + excess_from_surface(value, xp)
+    sampling = excess_from_surface(HALF_INTERVAL * stderr, xp) * xp.cosh(value)
+    ci95["force_ratio"] = xp.hypot(sampling, xp.exp(table.bounds["force_ratio"](where, xp)[0]))
+    factors, factors_ci95 = {}, {}
+    for name in FACTORS:
+        log, stderr = table.surfaces[f"pressure_{name}"](where, xp)
+        factors[name], factors_ci95[name] = xp.exp(log), xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr)
+    return measured, ci95, theory, error, error_ci95, factors, factors_ci95
+
+
+def _module(*values: Any) -> Any:
+    """The module of arrays: that of JAX if it traces a value, else NumPy."""
+    if not any(type(value).__module__.startswith("jax") for value in values):
+        return np  # without loading JAX
+    import jax
+    import jax.numpy as jnp
+    from jax.core import Tracer
+
+    if not any(isinstance(value, Tracer) for value in values):
+        return np
+    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+        raise InputError(
+            "validity needs double precision under jax.jit, jax.vmap and jax.grad: "
+            'call jax.config.update("jax_enable_x64", True) first.'
+        )
+    return jnp
+
+
+def _checked(name: str, value: Any, table: Table) -> np.ndarray:
+    """A value that is known, as an array of floats in the measured range."""
+    low, high = table.range(name)
+    try:
+        numbers = np.asarray(value, float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if numbers.size == 0 or not np.all((low <= numbers) & (numbers <= high)):
+        raise refused(name, value, f"must be between {low:g} and {high:g}, the range of the reference map")
+    return numbers
+
+
+def _inside(table: Table, alpha: Any, nu: Any) -> Any:
+    """Whether points are in the measured range."""
+    (first, last), (loosest, densest) = table.range("restitution"), table.range("packing_fraction")
+    return (first <= alpha) & (alpha <= last) & (loosest <= nu) & (nu <= densest)
