@@ -18,12 +18,14 @@ from jax import lax
 from scipy.integrate import quad
 
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
-from jaxgran.analysis.fields import Fields, fields_at, flight_fields_at, grid
+from jaxgran.analysis.fields import Fields, fields_at, grid
+from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 from jaxgran.sampling.averages import averages
 
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
@@ -106,9 +108,17 @@ def outflow(fields_of, points: jax.Array) -> tuple[jax.Array, jax.Array]:
     return slopes[0, :, :, 0] + slopes[1, :, :, 1], loss
 
 
+def flight_fields_at(state: State, points: jax.Array, graining: CoarseGraining) -> Fields:
+    """Fields of grains in free flight: of a snapshot whose only slot for a contact is empty."""
+    index, zero = jnp.zeros(1, int), jnp.zeros(1)
+    contacts = Contacts(index, index, jnp.zeros((1, 2)), zero, zero, zero, zero, index > 0)
+    one = jnp.asarray(1.0)
+    return fields_at(Snapshot(state, contacts, zero, one, one, one, jnp.asarray(0)), points, graining)
+
+
 @jax.jit
 def densities_of(state, points, graining):
-    return densities(flight_fields_at(state, 1.0, points, graining))
+    return densities(flight_fields_at(state, points, graining))
 
 
 @jax.jit
@@ -120,7 +130,7 @@ def rate_in_flight(state, points, graining):
 
 @jax.jit
 def outflow_in_flight(state, points, graining):
-    return outflow(lambda r: flight_fields_at(state, 1.0, r, graining), points)[0]
+    return outflow(lambda r: flight_fields_at(state, r, graining), points)[0]
 
 
 @jax.jit
@@ -354,7 +364,7 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
 
 def test_a_void_moves_with_the_mean_flow(scene) -> None:
     state = scene([[8.5, 8.0]], [[2.0, 2.0]])
-    fields = flight_fields_at(state, 1.0, jnp.asarray([[15.0, 14.0], [8.6, 8.0]]), heaviside(1.0))
+    fields = flight_fields_at(state, jnp.asarray([[15.0, 14.0], [8.6, 8.0]]), heaviside(1.0))
     np.testing.assert_allclose(fields.velocity, [[14.0, 0.0], [2.0 + 0.0, 2.0]], rtol=1e-14)
     np.testing.assert_allclose(fields.density, [0, 1 / np.pi])
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(fields))
@@ -434,7 +444,6 @@ def test_momentum_through_planes_over_time_is_the_stress_of_the_tally(planes_in_
 def test_a_width_that_does_not_fit_the_cell_is_refused(seen, points, width: float) -> None:
     for fields in (
         partial(fields_at, seen),
-        partial(flight_fields_at, seen.state, 1.0),
         lambda r, graining: jax.eval_shape(lambda r: fields_at(seen, r, graining), r),
     ):
         with pytest.raises(InputError, match="width of the coarse-graining must be positive and at most"):

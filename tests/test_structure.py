@@ -13,10 +13,8 @@ from jaxgran.analysis.force_chains import (
     cluster_sizes,
     clusters,
     fabric,
-    force_correlation,
     force_distribution,
     loaded_contacts,
-    persistence,
 )
 from jaxgran.analysis.order import coordination, hexatic_order, pair_correlation, profiles
 from jaxgran.analysis.series import series
@@ -71,29 +69,6 @@ def test_times_are_apart_and_errors_come_from_their_blocks() -> None:
     assert share.force.value == 0.75 and np.isnan(share.force.error)
 
 
-def test_persistence_of_bonds_that_break_at_random_is_geometric() -> None:
-    rng, grains, alive, keep = np.random.default_rng(0), 400, 20, 0.8
-    bonds, contacts = np.array([rng.choice(grains, 2, replace=False) for _ in range(alive)]), []
-    for _ in range(300):
-        for k in np.nonzero(rng.random(alive) > keep)[0]:
-            bonds[k] = rng.choice(grains, 2, replace=False)
-        contacts.append([(*np.sort(bond)[:: rng.choice([-1, 1])], 1.0) for bond in bonds])
-    lags = np.arange(1, 9)
-    positions = np.broadcast_to(rng.uniform(0, 40, (grains, 2)), (300, grains, 2))
-    found = persistence(snapshot_of(positions, contacts), 0.01, lags)
-    np.testing.assert_allclose(found.contact.at[1:], 0.01 * lags)
-    assert_within_errors(found.contact, keep ** np.append(0, lags), least=0.01)
-    assert_within_errors(found.contact_lifetime, 0.01 / -np.log(keep))
-
-
-def test_persistence_of_a_cluster_that_loses_a_grain() -> None:
-    chain, pair = [(0, 1, 1.0), (1, 2, 1.0)], [(0, 1, 1.0)]
-    found = persistence(snapshot_of(np.stack([ROW] * 4), [chain, chain, pair, pair]), 1.0, [1, 2, 3])
-    np.testing.assert_allclose(found.cluster.value, [1, (3 + 1 + 1) / 7, (1 + 1) / 6, 1 / 3])
-    np.testing.assert_allclose(found.contact.value, [1, (2 + 1 + 1) / 5, (1 + 1) / 4, 1 / 2])
-    assert 1 < found.cluster_lifetime.value < 2 and np.isnan(found.contact_lifetime.value)
-
-
 def dimers(force, times=200, pairs=20):
     """Pairs far apart, in contact at random directions, with forces of ``force(rng, pairs)``."""
     rng = np.random.default_rng(1)
@@ -105,25 +80,13 @@ def dimers(force, times=200, pairs=20):
     return snapshot_of(positions.reshape(times, -1, 2), contacts, tilt=0.3)
 
 
-def test_exponential_forces_have_an_exponential_distribution_and_no_correlation() -> None:
+def test_exponential_forces_have_an_exponential_distribution() -> None:
     seen = dimers(lambda rng, angle: rng.exponential(3.0, angle.size))
     edges = np.linspace(0, 12, 25)
     found = force_distribution(seen, edges)
     exact = -np.diff(np.exp(-edges)) / np.diff(edges)
     assert_within_errors(found, exact, least=2e-3)
     np.testing.assert_allclose(np.sum(found.value * np.diff(edges)), 1)
-    assert_within_errors(force_correlation(seen, np.linspace(1, 19, 10)), 0.0)
-
-
-def test_correlation_of_forces_that_neighbours_share() -> None:
-    rng = np.random.default_rng(2)
-    rows = np.array([[5 + 10 * a + 1.0 * b, 5 + 10 * c] for a in range(3) for c in range(3) for b in range(3)])
-    forces = [np.repeat(rng.exponential(1.0, 9), 2) for _ in range(400)]
-    contacts = [[(3 * (k // 2) + k % 2, 3 * (k // 2) + k % 2 + 1, f) for k, f in enumerate(here)] for here in forces]
-    found = force_correlation(snapshot_of(np.stack([rows] * 400), contacts), [0.5, 1.5, 5.0, 18.0])
-    assert np.isnan(found.value[1])
-    keep = [0, 2]
-    assert_within_errors((found.value[keep], found.error[keep]), [1.0, 0.0])
 
 
 def test_fabric_of_a_known_density_of_directions_and_forces() -> None:
@@ -199,7 +162,6 @@ def test_results_are_those_of_the_periodic_flow(seen, change: str) -> None:
     bins = np.linspace(0.2, 2.6, 7)
     for measure in (
         lambda s: pair_correlation(s, bins),
-        lambda s: force_correlation(s, bins),
         hexatic_order,
         coordination,
         near_contact,

@@ -149,14 +149,6 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: Co
     return _fields_at(snapshot, points, graining)
 
 
-def flight_fields_at(
-    state: State, shear_rate: float | Array, points: Float[Array, "points 2"], graining: CoarseGraining
-) -> Fields:
-    """``fields_at`` for grains in free flight, without contact impulses."""
-    _check(graining, state)
-    return _flight_fields_at(state, shear_rate, points, graining)
-
-
 def grid(side: float | Array, count: int) -> Float[Array, "points 2"]:
     """A regular grid of points (count², 2) in the cell, row by row: ``reshape(count, count)`` gives axes (y, x).
 
@@ -196,11 +188,6 @@ def _fields_at(snapshot: Snapshot, points: Array, graining: CoarseGraining) -> F
     return _coarse_grained(after, losses, _in_blocks(transfers), snapshot.shear_rate, points, graining)
 
 
-@jax.jit
-def _flight_fields_at(state: State, shear_rate: Array, points: Array, graining: CoarseGraining) -> Fields:
-    return _coarse_grained(state, jnp.zeros_like(state.grains.masses), None, shear_rate, points, graining)
-
-
 def _in_blocks(branches: _Branches) -> _Branches:
     """The branches in blocks (blocks, size), loaded ones first."""
     order = jnp.argsort(~branches.loaded)
@@ -212,7 +199,7 @@ def _in_blocks(branches: _Branches) -> _Branches:
 
 
 def _coarse_grained(
-    state: State, losses: Array, blocks: _Branches | None, shear_rate: Array, points: Array, graining: CoarseGraining
+    state: State, losses: Array, blocks: _Branches, shear_rate: Array, points: Array, graining: CoarseGraining
 ) -> Fields:
     """The fields, written for one point; ``lax.map`` evaluates batches of points as matrix products.
 
@@ -232,7 +219,7 @@ def _coarse_grained(
             return lax.cond(jnp.any(block.loaded), added, lambda: sums), None
 
         zeros = jnp.zeros((2, 6), masses.dtype)
-        return zeros if blocks is None else lax.scan(add_block, zeros, blocks)[0]
+        return lax.scan(add_block, zeros, blocks)[0]
 
     def fields(point: Array) -> Fields:
         d = displacement(point[None], state.positions, state.side, state.tilt)

@@ -1,4 +1,4 @@
-"""Force chains: clusters of grains in loaded contact, their lifetimes, forces and fabric.
+"""Force chains: clusters of grains in loaded contact, their forces and fabric.
 
 A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
 """
@@ -6,13 +6,12 @@ A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains c
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # loads its submodules on first use
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxgran.analysis.series import Curve, Measured, Sums, by_time, centres, histograms, ratio, series, with_errors
+from jaxgran.contact.clusters import cluster_labels
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.model.cell import minimum_image
 
 _DIRECTIONS = 12  # bins of 15° on the half circle, for the mean force at an angle
 
@@ -61,28 +60,6 @@ class ClusterShare(NamedTuple):
     shear_stress: Measured
 
 
-class Persistence(NamedTuple):
-    """Probability C(τ) that grains joined at t are joined at t + τ, and the lifetime at which it falls to 1/e.
-
-    ================  =========  ======  ===========================================
-    field             shape      unit    meaning
-    ================  =========  ======  ===========================================
-    contact           (lags+1,)  strain  C of pairs with a loaded contact
-    cluster           (lags+1,)  strain  C of pairs in the same cluster
-    contact_lifetime  ()         strain  of the contacts
-    cluster_lifetime  ()         strain  of the clusters
-    ================  =========  ======  ===========================================
-
-    A lifetime below the first lag is interpolated from C(0) = 1, so only its order of magnitude is meaningful. One
-    beyond the last lag is NaN.
-    """
-
-    contact: Curve
-    cluster: Curve
-    contact_lifetime: Measured
-    cluster_lifetime: Measured
-
-
 class Fabric(NamedTuple):
     """Anisotropies of the loaded contacts. Angles are those of the normals, in radians in (−π/2, π/2].
 
@@ -119,10 +96,8 @@ def clusters(snapshots: Snapshot) -> Clusters:
     """Clusters of grains connected by loaded contacts, at each time."""
     times, grains = series(snapshots).state.positions.shape[:2]
     load = loaded_contacts(snapshots)
-    edges = load.time * grains + load.i, load.time * grains + load.j
-    graph = scipy.sparse.coo_array((np.ones(load.time.size), edges), shape=(times * grains, times * grains))
-    labels = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    sizes = np.bincount(labels)[labels]
+    first = load.time * grains
+    labels, sizes = cluster_labels(first + load.i, first + load.j, times * grains)
     return Clusters(labels.reshape(times, grains), sizes.reshape(times, grains))
 
 
@@ -166,44 +141,6 @@ def cluster_share(snapshots: Snapshot) -> ClusterShare:
     return ClusterShare(*(Measured(*share) for share in zip(*estimates, strict=True)))
 
 
-def persistence(snapshots: Snapshot, interval: float, lags: ArrayLike) -> Persistence:
-    """How long contacts and clusters last, by the intermittent correlation function: a pair may separate in between.
-
-    Args:
-      snapshots: a series at equal intervals of strain, ideally of every time step.
-      interval: strain between successive snapshots.
-      lags: increasing integers, numbers of snapshots from 1 to below the length of the series.
-
-    Source: D. C. Rapaport, Mol. Phys. 50, 1151 (1983), for bonds.
-    """
-    labels, load = clusters(snapshots).labels, loaded_contacts(snapshots)
-    times, grains = labels.shape
-    bond = np.minimum(load.i, load.j).astype(np.int64) * grains + np.maximum(load.i, load.j)
-    bonds = scipy.sparse.coo_array((np.ones(bond.size), (load.time, bond)), shape=(times, grains * grains)).tocsr()
-
-    def joined(lag: int) -> tuple[np.ndarray, np.ndarray]:
-        """Number of pairs joined both at t and at t + lag, for each t: by a contact, and by a cluster."""
-        now, later = labels[: times - lag].astype(np.int64), labels[lag:].astype(np.int64)
-        _, first, common = np.unique(now * (labels.max() + 1) + later, return_index=True, return_counts=True)
-        pairs = np.bincount(first // grains, common * (common - 1) / 2, minlength=times)
-        return np.pad(np.asarray(bonds[: times - lag].multiply(bonds[lag:]).sum(axis=1)).ravel(), (0, lag)), pairs
-
-    all_lags = np.append(0, lags)
-    counts = np.stack([np.stack(joined(lag), axis=-1) for lag in all_lags.tolist()], axis=1)  # (times, lags, 2)
-    in_series = (np.arange(times)[:, None] < times - all_lags)[:, :, None]  # times t for which t + lag is in the series
-    sums = {"joined": counts, "start": counts[:, :1] * in_series}
-
-    def estimate(s: Sums) -> Sums:
-        curves = ratio(s["joined"], s["start"])
-        lifetimes = {name: _decay(all_lags, curves[..., k]) for k, name in enumerate(("contact", "cluster"))}
-        return {"curves": curves, **lifetimes}
-
-    estimates = with_errors(estimate, sums)
-    contact, cluster = (Curve(all_lags * interval, *(x[:, k] for x in estimates["curves"])) for k in (0, 1))
-    lifetimes = (Measured(*(np.asarray(x * interval) for x in estimates[name])) for name in ("contact", "cluster"))
-    return Persistence(contact, cluster, *lifetimes)
-
-
 def force_distribution(snapshots: Snapshot, edges: ArrayLike) -> Curve:
     """Probability density of F/⟨F⟩ over the loaded contacts, in bins with the given edges."""
     load, edges = loaded_contacts(snapshots), np.asarray(edges)
@@ -212,33 +149,6 @@ def force_distribution(snapshots: Snapshot, edges: ArrayLike) -> Curve:
     sums = {"n": counts, "all": np.bincount(load.time, minlength=times)}
     estimates = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
     return Curve(centres(edges), *estimates)
-
-
-def force_correlation(snapshots: Snapshot, edges: ArrayLike) -> Curve:
-    """Correlation g_F(r) = ⟨F F'⟩(r)/⟨F⟩² − 1 of simultaneous loaded contacts whose contact points are r apart.
-
-    ⟨F⟩ is the mean over the series, so fluctuations common to all forces of a snapshot leave a constant at large r.
-    ``edges`` (σ) must lie below half the side.
-    """
-    frames, load, edges = series(snapshots), loaded_contacts(snapshots), np.asarray(edges)
-    radii, times = frames.state.grains.radii, len(frames.impulses)
-    contact_distances = radii[load.time, load.i] + radii[load.time, load.j]
-    from_j = radii[load.time, load.j] / contact_distances * load.distances
-    points = frames.state.positions[load.time, load.j] + from_j[:, None] * load.normals
-    products, pairs = np.zeros((2, times, len(edges) - 1))
-    for t in range(times):
-        here, force = points[load.time == t], load.force[load.time == t]
-        a, b = np.triu_indices(len(here), 1)
-        r = np.linalg.norm(minimum_image(here[a] - here[b], frames.state.side[t], frames.state.tilt[t]), axis=-1)
-        pairs[t], products[t] = np.histogram(r, edges)[0], np.histogram(r, edges, weights=force[a] * force[b])[0]
-    single = np.stack([np.ones_like(load.force), load.force], axis=-1)
-    sums = {"products": products, "pairs": pairs, "single": by_time(times, load.time, single)}
-
-    def estimate(s: Sums) -> Sums:
-        mean = ratio(s["single"][..., 1:], s["single"][..., :1])
-        return {"g": ratio(ratio(s["products"], s["pairs"]), mean**2) - 1}
-
-    return Curve(centres(edges), *with_errors(estimate, sums)["g"])
 
 
 def fabric(snapshots: Snapshot) -> Fabric:
@@ -284,12 +194,3 @@ def fabric(snapshots: Snapshot) -> Fabric:
 def _mode(x: Any, y: Any) -> tuple[Any, Any]:
     """Amplitude and angle of a second Fourier mode."""
     return np.hypot(x, y), np.arctan2(y, x) / 2
-
-
-def _decay(at: np.ndarray, curve: np.ndarray) -> np.ndarray:
-    """Interpolated point at which a curve (..., points) starting at one first falls to 1/e; NaN if it does not."""
-    below = curve < 1 / np.e
-    k = np.maximum(np.argmax(below, axis=-1), 1)
-    low, high = (np.take_along_axis(curve, n[..., None], axis=-1)[..., 0] for n in (k, k - 1))
-    share = ratio(high - 1 / np.e, high - low)
-    return np.where(below.any(axis=-1), at[k - 1] + share * (at[k] - at[k - 1]), np.nan)

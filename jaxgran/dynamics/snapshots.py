@@ -22,7 +22,7 @@ from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.collision import contacts_now
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.replicas import checked_batch, over_replicas
-from jaxgran.model.batches import equal_values, length_of, replica_of
+from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain
@@ -33,7 +33,7 @@ _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Snapshot:
+class Snapshot(Indexable):
     """A flow at the beginning of a time step, with the contacts of that step; a series has a leading (times,) axis.
 
     ===========  ===========  ====  ===============================================================
@@ -58,17 +58,11 @@ class Snapshot:
     status: Int[Array, "*times"]
 
     __eq__ = equal_values
+    _whole = "a series"
 
-    def __getitem__(self, time: Any) -> "Snapshot":
-        """The snapshot of one time of a series, or of several by a slice or a list; that of a replica in a batch."""
-        return replica_of(self, time, np.shape(self.state.side), "a series")
-
-    def __len__(self) -> int:
-        """Number of times of a series; of replicas in a batch."""
-        return length_of(self, np.shape(self.state.side), "a series")
-
-    def __bool__(self) -> bool:
-        return True  # one has no length
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        return np.shape(self.state.side)
 
 
 def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:

@@ -41,6 +41,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxgran.contact.clusters import cluster_labels
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.snapshots import Snapshot, snapshot
 from jaxgran.files import atomic_write
@@ -227,15 +228,11 @@ def _gsd_frame(snapshot: Snapshot, step: int):
 
 def _by_grain(pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int) -> Chunks:
     """Contact force and cluster of each grain."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    joined = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(grains, grains))
-    _, cluster = connected_components(joined, directed=False)
+    labels, sizes = cluster_labels(pairs[:, 0], pairs[:, 1], grains)
     return {
         "contact_force": np.bincount(pairs.ravel(), np.repeat(forces, 2), minlength=grains),
-        "cluster": cluster.astype(np.uint32),
-        "cluster_size": np.bincount(cluster)[cluster].astype(np.uint32),
+        "cluster": labels.astype(np.uint32),
+        "cluster_size": sizes.astype(np.uint32),
     }
 
 

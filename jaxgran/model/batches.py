@@ -1,6 +1,6 @@
 """Values, which are pytrees of arrays: their equality, and batches, whose arrays have leading axes of replicas."""
 
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import jax
 import numpy as np
@@ -10,29 +10,38 @@ from jaxgran.model.checks import InputError, is_traced
 T = TypeVar("T")
 
 
-def replica_of(batch: T, place: Any, replicas: tuple[int, ...], whole: str = "a batch") -> T:
-    """One replica of a batch, or several by a slice or a list; or the same of a series of times.
+class Indexable:
+    """Base of values that may be batches, or series: they are indexed, sliced and counted along their first axis."""
 
-    Raises:
-      InputError: there is no axis of replicas.
-      IndexError: there is no such replica.
-    """
-    if not replicas:
-        raise InputError(f"an index takes one of {whole}, and this is one {type(batch).__name__}, not {whole}.")
-    if not is_traced(place):
-        np.broadcast_to(0, replicas)[place]  # JAX would take the last replica in place of one that is not there
-    return jax.tree.map(lambda leaf: leaf[place], batch)
+    _whole = "a batch"
 
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        """The leading axes; none for a single value."""
+        raise NotImplementedError
 
-def length_of(batch: Any, replicas: tuple[int, ...], whole: str = "a batch") -> int:
-    """The number of replicas of a batch.
+    def __getitem__(self, place: Any) -> Self:
+        """One of a batch or series, or several by a slice or a list.
 
-    Raises:
-      TypeError: there is no axis of replicas.
-    """
-    if not replicas:
-        raise TypeError(f"this is one {type(batch).__name__}, not {whole}, and has no length.")
-    return replicas[0]
+        Raises:
+          InputError: this is a single value.
+          IndexError: there is none at this place.
+        """
+        if not self._axes:
+            name = type(self).__name__
+            raise InputError(f"an index takes one of {self._whole}, and this is one {name}, not {self._whole}.")
+        if not is_traced(place):
+            np.broadcast_to(0, self._axes)[place]  # JAX would take the last in place of one that is not there
+        return jax.tree.map(lambda leaf: leaf[place], self)
+
+    def __len__(self) -> int:
+        """How many a batch or series holds; TypeError for a single value."""
+        if not self._axes:
+            raise TypeError(f"this is one {type(self).__name__}, not {self._whole}, and has no length.")
+        return self._axes[0]
+
+    def __bool__(self) -> bool:
+        return True  # a single value has no length
 
 
 def equal_values(one: Any, other: object) -> bool:

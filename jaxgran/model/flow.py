@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxgran.model.batches import equal_values, hash_of_values, length_of, replica_of
+from jaxgran.model.batches import Indexable, equal_values, hash_of_values
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -32,7 +32,7 @@ def _rows(flow: "ShearFlow") -> list[Row]:
 
 
 @dataclass(frozen=True)
-class ShearFlow:
+class ShearFlow(Indexable):
     """Parameters of a simple shear flow of rigid, frictionless, polydisperse discs.
 
     The unit of length is the mean grain diameter σ. The unit of mass is the mass m of a grain of diameter σ.
@@ -94,16 +94,9 @@ class ShearFlow:
         if shapes:
             _broadcast(self, shapes[0])
 
-    def __getitem__(self, replica: Any) -> "ShearFlow":
-        """The flow of one replica of a batch, or of several by a slice or a list."""
-        return replica_of(self, replica, np.shape(self.restitution))
-
-    def __len__(self) -> int:
-        """Number of flows of a batch."""
-        return length_of(self, np.shape(self.restitution))
-
-    def __bool__(self) -> bool:
-        return True  # one has no length
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        return np.shape(self.restitution)
 
     @property
     def activation_fraction(self) -> float | jax.Array:

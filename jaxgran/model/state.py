@@ -1,7 +1,6 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.model.batches import equal_values, length_of, replica_of
+from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import InputError, is_traced
 from jaxgran.model.display import Row, arrays, display_methods, rounded
 from jaxgran.model.flow import ShearFlow, require_flow
@@ -39,7 +38,7 @@ def _rows(state: "State") -> list[Row]:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class State:
+class State(Indexable):
     """A sheared packing at one instant.
 
     ==========  ===========  ====  =====================================================
@@ -62,16 +61,9 @@ class State:
     __eq__ = equal_values
     __repr__, _repr_html_ = display_methods("State", _rows)
 
-    def __getitem__(self, replica: Any) -> "State":
-        """The state of one replica of a batch, or of several by a slice or a list."""
-        return replica_of(self, replica, np.shape(self.side))
-
-    def __len__(self) -> int:
-        """Number of states of a batch."""
-        return length_of(self, np.shape(self.side))
-
-    def __bool__(self) -> bool:
-        return True  # one has no length
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        return np.shape(self.side)
 
 
 def require_state(flow: ShearFlow, state: State) -> None:

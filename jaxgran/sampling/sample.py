@@ -16,7 +16,7 @@ from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, over_replicas
 from jaxgran.dynamics.tally import TABLE, Tally
-from jaxgran.model.batches import equal_values, in_numpy, length_of, replica_of
+from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import (
     InputError,
     as_array,
@@ -67,7 +67,7 @@ def _rows(sample: "Sample") -> list[Row]:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Sample(Averages):
+class Sample(Averages, Indexable):
     """A measured strain of one replica; a batch has a leading (replicas,) axis everywhere.
 
     ==========  =========  ====  =================================================
@@ -93,16 +93,9 @@ class Sample(Averages):
     __eq__ = equal_values
     __repr__, _repr_html_ = display_methods("Sample", _rows)
 
-    def __getitem__(self, replica: Any) -> "Sample":
-        """The sample of one replica of a batch, or of several by a slice or a list."""
-        return replica_of(self, replica, np.shape(self.area))
-
-    def __len__(self) -> int:
-        """Number of samples of a batch."""
-        return length_of(self, np.shape(self.area))
-
-    def __bool__(self) -> bool:
-        return True  # one has no length
+    @property
+    def _axes(self) -> tuple[int, ...]:
+        return np.shape(self.area)
 
     @property
     def averages(self) -> Mapping[str, Array | np.ndarray]:
