@@ -72,11 +72,11 @@ def run_plot_command(
     file: Path, output: Path | None = None, format: FileFormat = "png", dpi: int = 200, caption: bool = True
 ) -> None:
     from jaxgran.maps.output import remove_pictures
-    from jaxgran.maps.results import read_dataset
+    from jaxgran.maps.results import open_map
     from jaxgran.plotting.map_figures import require_file, save_figures
 
     require_file(format, dpi)
-    data = read_dataset(file)
+    data = open_map(file)
     folder = file.parent if output is None else output
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
