@@ -22,7 +22,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.inference.closure import LAWS
 from jaxgran.inference.cross_validation import leave_one_out
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 
 SMALLER = {"grains": 64, "seeds": 1, "strain": 20.0}
 NAMES = ("pressure", "shear_stress", "force_ratio")
@@ -32,7 +32,7 @@ STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v")) 
 
 def run(output: Output, dataset: Path | None = None) -> None:
     """Fit, leave out, print, and write JSON and PNG; of a dataset of a map, or of one that is made."""
-    data = make_map(output.quick) if dataset is None else read_dataset(dataset)
+    data = make_map(output.quick) if dataset is None else open_map(dataset)
     errors, closure = leave_one_out(data), jg.fit_closure(data)
     summary = {name: error_summary(errors, name) for name in NAMES} | {"restitution": restitution_summary(errors)}
     print("relative errors of points left out, in percent")

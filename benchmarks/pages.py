@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.output import RESULTS
 from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 from jaxgran.model.display import with_error
 
 
@@ -102,7 +102,7 @@ def duration(seconds: float, digits: int = 2) -> str:
 
 @cache
 def _map(file: str) -> Any:
-    return read_dataset(RESULTS / file)
+    return open_map(RESULTS / file)
 
 
 def point(file: str, name: str, restitution: float, packing_fraction: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import pytest
 import xarray as xr
 from command_line import Outcome, jaxgran
 
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 
 NEEDS_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 DRIVER = Path(__file__).with_name("fault_driver.py")
@@ -32,7 +32,7 @@ class Lab:
         self.folder = folder
         done = self.run_here("whole.nc")
         assert done.status == 0, done.err
-        self.whole = read_dataset(folder / "whole.nc")
+        self.whole = open_map(folder / "whole.nc")
 
     def run_here(self, output: str, *words: str) -> Outcome:
         """Run a map in this process, where nothing happens to it."""
@@ -79,7 +79,7 @@ class Lab:
 
     def assert_whole(self, output: str) -> None:
         """The map has the bits of the one that nothing happened to, and nothing else is left."""
-        xr.testing.assert_equal(read_dataset(self.folder / output), self.whole)
+        xr.testing.assert_equal(open_map(self.folder / output), self.whole)
         assert not (self.folder / f"{output}.unfinished").exists()
         assert not list((self.folder / output).parent.glob(".*"))  # no temporary files
 

@@ -10,7 +10,7 @@ import pytest
 from synthetic import one_sentence
 
 from jaxgran.maps.cluster import run_on_cluster
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 from jaxgran.model.checks import InputError
 
 MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
@@ -27,7 +27,7 @@ def test_a_map_on_a_cluster_is_that_of_one_process(tmp_path: Path) -> None:
     here = run(tmp_path, "-m", "jaxgran", "map", *MAP.split(), "--workers", "1", "--output", "here.nc")
     there = run(tmp_path, str(SCRIPT), "--workers", "2", "--", *MAP.split(), "--output", "there.nc")
     assert here.returncode == there.returncode, there.stderr
-    assert read_dataset(tmp_path / "there.nc").equals(read_dataset(tmp_path / "here.nc"))
+    assert open_map(tmp_path / "there.nc").equals(open_map(tmp_path / "here.nc"))
     assert "2/2 points" in there.stderr and "Traceback" not in there.stderr
     assert not list(tmp_path.glob("*.unfinished"))
 

@@ -14,7 +14,7 @@ from synthetic import random_instant, random_replica
 
 from jaxgran.maps.conventions import CONVENTIONS
 from jaxgran.maps.dataset import map_dataset, run_attributes
-from jaxgran.maps.results import read_dataset, write_dataset
+from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import path_of
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
@@ -118,7 +118,7 @@ def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(severa
     one = made(grains=64, timestep=5e-4)
     assert one.grains.item() == 64 and one.grains.dims == () and not {"grains", "timestep"} & set(one.data_vars)
     write_dataset(one, tmp_path / "map.nc")
-    again = read_dataset(tmp_path / "map.nc")
+    again = open_map(tmp_path / "map.nc")
     assert set(again.coords) == set(one.coords)
     assert {"grains", "timestep"} <= set(again.force_ratio.encoding["coordinates"].split())
     assert again["stresses"].contact_stress.axis_b.values.tolist() == ["x", "y"]

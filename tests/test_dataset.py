@@ -13,7 +13,7 @@ from synthetic import one_sentence, random_replica
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.output import check_output
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.maps.results import choices_of, is_finished, read_dataset, write_dataset
+from jaxgran.maps.results import choices_of, is_finished, open_map, write_dataset
 from jaxgran.maps.schema import flattened, has_one_timestep, path_of, timestep_text
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
@@ -85,7 +85,7 @@ def test_a_map_is_selected_and_written_as_any_data_of_xarray(data, tmp_path: Pat
     assert there.force_ratio == data.force_ratio[1, 0] and there["seeds"].strain.dims == ("seed",)
     data.to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     assert xr.load_datatree(tmp_path / "map.nc", engine="netcdf4").equals(data)
-    assert read_dataset(tmp_path / "map.nc").equals(data)
+    assert open_map(tmp_path / "map.nc").equals(data)
     assert xr.load_dataset(tmp_path / "map.nc", engine="netcdf4").equals(data.to_dataset())
     write_dataset(data, tmp_path / "map.nc")
     alone = xr.load_dataset(tmp_path / "map.nc", group="theory", engine="netcdf4")
@@ -100,7 +100,7 @@ def test_a_file_of_another_format_is_refused_in_a_sentence(few, version: int | N
         other.attrs["format_version"] = version
     write_dataset(other, tmp_path / "map.nc")
     with pytest.raises(ValueError, match="and this version of jaxgran reads format_version 2") as caught:
-        read_dataset(tmp_path / "map.nc")
+        open_map(tmp_path / "map.nc")
     assert one_sentence(str(caught.value))
 
 
@@ -251,7 +251,7 @@ def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: 
     assert data.timestep.attrs["reduced_unit"] == "1 / shear rate"
     few = with_variables(data, *FEW)
     write_dataset(few, tmp_path / "map.nc")
-    assert read_dataset(tmp_path / "map.nc").equals(few)
+    assert open_map(tmp_path / "map.nc").equals(few)
 
 
 def test_a_list_of_one_time_step_keeps_its_dimension() -> None:
@@ -282,7 +282,7 @@ def test_attributes_tell_every_parameter_of_the_run(settings, data) -> None:
 
 def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     write_dataset(data, tmp_path / "map.nc")
-    again = read_dataset(tmp_path / "map.nc")
+    again = open_map(tmp_path / "map.nc")
     assert again.equals(data)
     stored, made = flattened(again), flattened(data)
     for name in made.variables:
@@ -317,20 +317,20 @@ def test_failed_write_keeps_the_old_file_and_leaves_no_other(
 def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_found(few, tmp_path: Path) -> None:
     path, rng = tmp_path / "map.nc", np.random.default_rng(0)
     few.to_netcdf(path, engine="netcdf4")
-    assert read_dataset(path).equals(few)
+    assert open_map(path).equals(few)
     write_dataset(few, path)
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 40, size=50):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
         with pytest.raises(ValueError, match="damaged"):
-            read_dataset(path)
+            open_map(path)
 
 
 def test_a_file_that_was_edited_by_others_is_read(few, tmp_path: Path) -> None:
     write_dataset(few, tmp_path / "map.nc")
     with h5py.File(tmp_path / "map.nc", "r+") as file:
         file["force_ratio"][0, 0] = 7.0
-    assert read_dataset(tmp_path / "map.nc").force_ratio[0, 0] == 7.0
+    assert open_map(tmp_path / "map.nc").force_ratio[0, 0] == 7.0
 
 
 def test_checking_the_output_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
@@ -376,7 +376,7 @@ def test_time_steps_chosen_by_point_are_in_the_file_and_in_the_error(tmp_path: P
     np.testing.assert_allclose(share, stress_error(crossing, found.packing_fraction.values[:, None]))
     assert timestep_text(found) == "0.0001 to 0.001"
     write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
-    again = read_dataset(tmp_path / "map.nc")
+    again = open_map(tmp_path / "map.nc")
     assert MapSettings(**choices_of(again)) == chosen and not has_one_timestep(again)
 
 
@@ -395,7 +395,7 @@ def test_grains_chosen_by_point_are_in_the_file_and_change_the_error(tmp_path: P
         expected = size / (1 - size)
         assert float(point.pressure_ci95.sel(error_source="size") / abs(point.pressure)) == pytest.approx(expected)
     write_dataset(with_variables(found, *FEW), tmp_path / "map.nc")
-    assert MapSettings(**choices_of(read_dataset(tmp_path / "map.nc"))) == chosen
+    assert MapSettings(**choices_of(open_map(tmp_path / "map.nc"))) == chosen
 
 
 def test_table_of_a_map_has_a_row_for_each_point(data: xr.DataTree) -> None:

@@ -16,7 +16,7 @@ import xarray as xr
 from command_line import assert_one_sentence
 from fault_lab import NEEDS_PROC, PATIENCE, Lab
 
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 
 pytestmark = NEEDS_PROC
 
@@ -45,7 +45,7 @@ def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: L
         kills += process.returncode != 0
         folder = lab.folder / f"{output}.unfinished"
         if (lab.folder / output).exists() and not folder.exists():  # it was faster: the next map
-            xr.testing.assert_equal(read_dataset(lab.folder / output), lab.whole)
+            xr.testing.assert_equal(open_map(lab.folder / output), lab.whole)
             maps, known = maps + 1, 0
     lab.assert_whole_when_continued(output)
 

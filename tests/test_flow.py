@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxgran.model.checks import InputError
 from jaxgran.model.choices import MAX_PACKING_FRACTION, MIN_GRAINS
-from jaxgran.model.flow import ShearFlow, require_sheared
+from jaxgran.model.flow import ShearFlow, require_sheared, steps_of_strain
 
 FLOW = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
 NUMBERS = (
@@ -125,3 +125,29 @@ def test_traced_numbers_are_not_judged():
 def test_midpoint_looks_half_a_step_ahead():
     assert FLOW.activation_fraction == 0.5
     assert replace(FLOW, activation="touching").activation_fraction == 0
+
+
+@given(
+    st.floats(1e-6, 0.1),
+    st.floats(0.1, 10),
+    st.floats(0, 1e3),
+    st.sampled_from([np.float32, np.float64]),
+)
+@settings(max_examples=50)
+def test_time_steps_of_a_strain_are_the_same_bits_traced_or_not(dt: float, rate: float, strain: float, kind) -> None:
+    numbers = [kind(x) for x in (strain, rate, dt / rate)]
+
+    def steps(strain, rate, dt):
+        return steps_of_strain(replace(FLOW, shear_rate=rate, timestep=dt), strain)
+
+    known, traced = steps(*numbers), jax.jit(steps)(*numbers)
+    assert isinstance(known, np.generic | np.ndarray) and known.dtype == traced.dtype == kind
+    assert known == traced == round(known.item())
+    exact = strain / (rate * (dt / rate))
+    assert abs(known - exact) <= 0.5 + 4 * np.finfo(kind).eps * exact
+
+
+def test_time_steps_of_a_strain_are_those_of_each_flow_of_a_batch() -> None:
+    flows = replace(FLOW, timestep=[1e-3, 2e-3])
+    assert steps_of_strain(flows, 0.0204).tolist() == [20, 10]
+    assert steps_of_strain(flows, np.array([0.0204, 0.0408])).tolist() == [20, 20]

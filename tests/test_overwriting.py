@@ -11,7 +11,7 @@ from drawn import write_without_drawing
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.results import is_finished, read_dataset
+from jaxgran.maps.results import is_finished, open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
@@ -61,7 +61,7 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     assert "'jaxgran_map.nc' already exists and has a map with grains 256 and not 64" in outcome.err
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
-    assert read_dataset(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
+    assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
 
 
 def test_the_same_map_may_be_repeated(finished: bytes, tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp
 def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> None:
     assert jaxgran(tmp_path, *MAP, "--preset", "paper").status == 0
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    data = read_dataset(tmp_path / "jaxgran_map_paper.nc")
+    data = open_map(tmp_path / "jaxgran_map_paper.nc")
     assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
 
 
@@ -174,4 +174,4 @@ def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch: pytest.Monk
     first.close(finished=True)
     assert jaxgran(tmp_path, *RUN).status == 0
     assert files(tmp_path) == {"flow.nc"}
-    np.testing.assert_array_equal(read_dataset(tmp_path / "flow.nc").status, [[Status.ok]])
+    np.testing.assert_array_equal(open_map(tmp_path / "flow.nc").status, [[Status.ok]])

@@ -12,10 +12,11 @@ from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba, Pallas
 from jaxgran.maps import journal
 from jaxgran.maps.dataset import map_dataset
+from jaxgran.maps.merge import merge_maps
 from jaxgran.maps.own_names import RESERVED
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.results import choices_of, read_dataset
+from jaxgran.maps.results import choices_of, open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 
@@ -110,13 +111,53 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     sample_and_before = 2 * 4 * (3.2 + 0.5) / 1e-3
     assert sum(steps) < 0.4 * sample_and_before
     assert_same_variables(data, observed)
-    assert_same_variables(read_dataset(output), observed)
+    assert_same_variables(open_map(output), observed)
     assert_same_variables(ratio_map(**MAP, observe=observe, output=output, resume=True), observed)
     with pytest.raises(InputError, match=r"has a map with observe 'contacts_per_grain, own_stress: .*' and not None"):
         ratio_map(**MAP, output=output, resume=True)
     with pytest.raises(InputError, match="must be a function that is passed to `ratio_map`") as caught:
         MapSettings(**choices_of(data))
     assert one_sentence(str(caught.value))
+
+
+UNITS = {"own_stress": "m / t^2", "contacts_per_grain": "1"}
+
+
+def assert_units(data: xr.DataTree) -> None:
+    """Values, errors and those of the seeds have the units, as CF asks (see ``conventions``)."""
+    for end in ("", "_stderr", "_ci95"):
+        assert (data[f"own_stress{end}"].units, data[f"own_stress{end}"].reduced_unit) == ("1", "m / t^2")
+        assert data[f"contacts_per_grain{end}"].units == "1"
+    assert data["seeds/own_stress"].reduced_unit == "m / t^2" and data["seeds/contacts_per_grain"].units == "1"
+
+
+def test_units_are_labels_in_the_file_and_no_part_of_what_is_resumed(observed, tmp_path) -> None:
+    output = tmp_path / "map.nc"
+    data = ratio_map(**MAP, observe=observe, observe_units=UNITS, output=output)
+    assert_units(data)
+    assert_units(open_map(output))
+    assert_same_variables(data, observed)
+    again = ratio_map(**MAP, observe=observe, observe_units={"own_stress": "N"}, output=output, resume=True)
+    assert again.own_stress.reduced_unit == "N"
+    assert_same_variables(again, observed)
+    one = {**MAP, "seeds": 1, "observe": observe, "observe_units": UNITS}
+    assert_units(merge_maps([ratio_map(**one), ratio_map(**one, first_seed=1)], observe))
+
+
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        ({"torque": "1"}, "names that observe returns, which are contacts_per_grain, own_stress, not 'torque'"),
+        ({"own_stress": 3}, "must be a dictionary of units by name"),
+        (["m"], "must be a dictionary of units by name"),
+    ],
+)
+def test_units_of_what_is_not_observed_are_refused_before_the_map_runs(units: Any, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        ratio_map(**MAP, observe=observe, observe_units=units)
+    assert one_sentence(str(caught.value))
+    with pytest.raises(InputError, match="and there are none, not 'a'"):
+        ratio_map(**MAP, observe_units={"a": "1"})
 
 
 def test_what_a_function_computes_counts_and_not_its_place() -> None:

@@ -21,7 +21,7 @@ from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import RunParameters
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.replica import Advance, Key, Replica
-from jaxgran.maps.results import choices_of, read_dataset
+from jaxgran.maps.results import choices_of, open_map
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import BadPoints
@@ -250,7 +250,7 @@ def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch:
         ratio_map(**SETTINGS, output=tmp_path / "map.nc", attributes={"project": "mine"})
     assert np.isfinite(caught.value.data.force_ratio[0, 1]) and np.isnan(caught.value.data.force_ratio[0, 0])
     assert caught.value.data.attrs["project"] == "mine"
-    np.testing.assert_array_equal(read_dataset(tmp_path / "map.nc").status, caught.value.data.status)
+    np.testing.assert_array_equal(open_map(tmp_path / "map.nc").status, caught.value.data.status)
 
 
 def test_replicas_of_a_point_differ(results) -> None:

@@ -154,6 +154,17 @@ def test_any_list_of_numbers_is_a_tuple_in_the_settings(kind: Any) -> None:
     assert settings.restitution == (0.5, 0.9) and settings.grains == (64, 128)
 
 
+@pytest.mark.parametrize("kind", [float, np.float64, np.array])
+def test_a_single_number_is_a_plane_of_one_as_on_the_command_line(kind: Any) -> None:
+    point = {"restitution": 0.5, "packing_fraction": 0.7}
+    settings, _ = chosen(**{**GOOD, **{name: kind(x) for name, x in point.items()}})
+    assert (settings.restitution, settings.packing_fraction) == ((0.5,), (0.7,))
+    assert chosen(**{**GOOD, "restitution": 0})[0].restitution == (0.0,)
+    for wrong in (True, "0.5", None):
+        with pytest.raises(InputError, match=r"^restitution must be a list"):
+            chosen(**{**GOOD, "restitution": wrong})
+
+
 def test_numbers_of_grains_may_be_given_by_point() -> None:
     settings, _ = chosen(**{**GOOD, "grains_by_point": [64, 128]})
     assert [flow.grains for flow in settings.flows()] == [64, 128] and settings.grains == 128
@@ -173,7 +184,15 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
 def test_the_command_and_the_function_start_alike() -> None:
     """What is left to Python has no text form, and what is left to the command is about figures and the terminal."""
     python = {one.name for one in fields(RunParameters)}
-    python_only = {"observe", "grains_by_point", "timestep_by_point", "progress", "record", "attributes"}
+    python_only = {
+        "observe",
+        "observe_units",
+        "grains_by_point",
+        "timestep_by_point",
+        "progress",
+        "record",
+        "attributes",
+    }
     assert set(MAP_OPTIONS) - {"format", "quiet"} == python - python_only
     assert with_start({}) == PRESETS["quick"]
     assert with_start({"error": 0.1}).items() >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import stdtrit
 
 from jaxgran import statistics
-from jaxgran.sampling.sample import steps_of_blocks
+from jaxgran.model.flow import steps_of_blocks
 from jaxgran.statistics import correlation_length, drift, error_correlation, jackknife, standard_errors
 
 TRIALS = 400

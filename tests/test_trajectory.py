@@ -209,6 +209,53 @@ def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: P
         assert len(read_trajectory(path).step) == recorder.frames == 1 + steps // 10
 
 
+def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive) -> None:
+    steps: list[int] = []
+    recorder = Recorder(0.01037, lambda _, step: steps.append(step))
+    driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (25, 15, 60))
+    assert steps == [round(10.37 * k) for k in range(10)]
+    steps.clear()
+    driven_in_blocks(Recorder(1e-5, lambda _, step: steps.append(step)).recording(drive), flow, flowing(0.78), (3, 2))
+    assert steps == [0, 1, 2, 3, 4, 5]
+
+
+def mean_forces(flow, run, state, steps: int) -> dict[tuple[int, int], float]:
+    """Mean force of each pair over the time steps that follow a state, pair by pair."""
+    one_snapshot, forces = jax.jit(partial(snapshot, solver=EXACT)), {}
+    for _ in range(steps):
+        seen = jax.tree.map(np.asarray, one_snapshot(flow, state))
+        for slot in np.flatnonzero(seen.impulses):
+            pair = tuple(sorted((int(seen.contacts.i[slot]), int(seen.contacts.j[slot]))))
+            forces[pair] = forces.get(pair, 0.0) + float(seen.impulses[slot]) / 1e-3 / steps
+        state, _ = run(flow, state, 1)
+    return forces
+
+
+def test_forces_over_a_strain_are_the_means_over_its_time_steps_and_change_no_bit(
+    flow, flowing, drive, run, tmp_path: Path
+) -> None:
+    path, again, start = tmp_path / "flow.gsd", tmp_path / "again.gsd", flowing(0.78)
+    recorder = Recorder(0.02, partial(write_frame, path), force_strain=0.012)
+    recorded = driven_in_blocks(recorder.recording(drive), flow, start, (20, 20))
+    assert_same_bits(recorded, driven_in_blocks(drive, flow, start, (20, 20)))
+    read = read_trajectory(path)
+    assert_same_bits(frame_of(read, 0), start)
+    states = jax.tree.map(jnp.asarray, read.state)
+    write_trajectory(again, flow, states, read.strain, force_strain=0.012, solver=EXACT)
+    expected = [mean_forces(flow, run, jax.tree.map(lambda x, k=k: x[k], states), 12) for k in range(3)]
+    assert sum(map(len, expected)) > 5  # pairs in contact
+    for file in (path, again):
+        with gsd.hoomd.open(file) as frames:
+            for frame, forces in zip(frames, expected, strict=True):
+                assert [tuple(pair) for pair in frame.bonds.group.tolist()] == sorted(forces)
+                np.testing.assert_allclose(frame.log["bonds/force"], [forces[p] for p in sorted(forces)], rtol=1e-6)
+                assert frame.log["jaxgran/force_strain"][0] == pytest.approx(0.012)
+                total = frame.log["particles/contact_force"].sum()
+                np.testing.assert_allclose(total, 2 * sum(forces.values()), rtol=1e-6)
+    with pytest.raises(InputError, match=r"^force_strain must be above 0 and at most the strain between frames, 0\.02"):
+        write_trajectory(again, flow, states, read.strain, force_strain=0.03, overwrite=True)
+
+
 # What other programs see
 
 

@@ -1,6 +1,7 @@
 """States, flows, samples and snapshots are values: compared, indexed and counted, and their averages are attributes."""
 
 from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,9 +109,35 @@ def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> N
     assert data.status.flag_meanings.split()[int(np.max(data.status))] == Status(int(np.max(one.status))).name
 
 
+def with_observed(observed: Any) -> Sample:
+    return replace(SAMPLES, tally=replace(SAMPLES.tally, observed=observed))
+
+
+def test_dataset_of_a_sample_has_what_was_observed_with_its_units() -> None:
+    rng = np.random.default_rng(3)
+    sums = {"torque": rng.uniform(1, 2, (2, BLOCKS)), "fabric": rng.uniform(1, 2, (2, BLOCKS, 3))}
+    samples = with_observed(sums)
+    data = samples.to_dataset(observe_units={"torque": "m sigma^2 / t^2"})
+    assert data.fabric.dims == ("replica", "fabric_dim_0") and samples[0].to_dataset().fabric.dims == ("fabric_dim_0",)
+    for name, x in sums.items():
+        steps = SAMPLES.tally.steps.sum(axis=1).reshape(2, *[1] * (x.ndim - 2))
+        np.testing.assert_allclose(data[name], x.sum(axis=1) / steps, rtol=1e-12)
+        np.testing.assert_array_equal(data[f"{name}_stderr"][1], samples[1].observed()[1][name])
+    for end in ("", "_stderr"):
+        assert data[f"torque{end}"].attrs["reduced_unit"] == "m sigma^2 / t^2"
+        assert "units" not in data[f"fabric{end}"].attrs
+    for observed, units, words in (
+        (sums, {"spin": "1"}, "names that observe returns, which are torque, fabric, not 'spin'"),
+        (None, {"spin": "1"}, "and there are none, not 'spin'"),
+        ({"pressure": sums["torque"]}, {}, "names that a sample does not have, not 'pressure'"),
+    ):
+        with pytest.raises(InputError, match=words):
+            with_observed(observed).to_dataset(units)
+
+
 def test_observed_tells_what_is_missing() -> None:
     with pytest.raises(InputError, match="made without") as without:
         SAMPLES[0].observed()
     with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
-        replace(SAMPLES, tally=replace(SAMPLES.tally, observed={"x": np.ones((2, BLOCKS))})).observed()
+        with_observed({"x": np.ones((2, BLOCKS))}).observed()
     assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 from jaxgran.model.display import with_error
 
 pytestmark = [
@@ -99,7 +99,7 @@ def test_a_user_without_rights_home_and_cache_gets_a_table(place: Path, anyone, 
     assert "Traceback" not in err
     assert err.count("the cache folder") == err.count("so every run compiles anew") == 1
     assert max(map(len, out.splitlines())) <= 80
-    data = read_dataset(folder / "jaxgran_map.nc")
+    data = open_map(folder / "jaxgran_map.nc")
     rows = [line for line in out.splitlines() if line.startswith("| 0.7 ")]
     assert rows and all("+-" in row for row in rows)
     there = data.sel(packing_fraction=0.7)

@@ -23,7 +23,7 @@ from mkdocs.structure.pages import Page
 from jaxgran.cli.arguments import placeholder
 from jaxgran.cli.mistakes import option_name, with_options
 from jaxgran.maps.parameters import options as parameters
-from jaxgran.maps.results import read_dataset
+from jaxgran.maps.results import open_map
 from jaxgran.page.explore import explore
 from jaxgran.sampling.observables import OBSERVABLES
 
@@ -40,7 +40,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for chart in sorted(CHARTS.glob("*.png")):
         files.append(File.generated(config, f"charts/{chart.name}", abs_src_path=str(chart)))
     files.append(File.generated(config, "charts/architecture.svg", content=architecture.picture()))
-    files.append(File.generated(config, "charts/paper.html", content=explore(read_dataset(CHARTS / "paper.nc")).text))
+    files.append(File.generated(config, "charts/paper.html", content=explore(open_map(CHARTS / "paper.nc")).text))
     for name in notebooks.NAMES:
         markdown, beside = notebooks.shown(name)
         files.append(File.generated(config, f"notebooks/{name}.md", content=markdown))

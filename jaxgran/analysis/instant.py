@@ -28,7 +28,9 @@ class Instant(NamedTuple):
 
 
 def instant_of(frame: Snapshot) -> Instant:
-    """The instant of one snapshot, with the forces of its time step."""
+    """The instant of one snapshot, with the forces of its time step; of a series of successive ones as ``averaged``."""
+    if np.ndim(frame.state.side):
+        return averaged([instant_of(frame[k]) for k in range(len(frame))])
     arrays = jax.tree.map(np.asarray, frame)
     state, rate, pairs = arrays.state, arrays.shear_rate.item(), pair_forces(arrays)
     side, tilt = state.side.item(), state.tilt.item()

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.model.checks import require_whole
-from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
 
 _EXACT = BarzilaiBorwein(tolerance=1e-8)
@@ -81,8 +81,7 @@ def growth(
 def _growth(
     flow: ShearFlow, solver: ProjectedMethod, state: State, strain: Array, count: int, moving_contacts: bool
 ) -> Growth:
-    steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
-    edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
+    steps = steps_of_blocks(steps_of_strain(flow, strain), count)
 
     def interval(carry, steps: Array):
         (now, change), status = carry
@@ -101,8 +100,8 @@ def _growth(
         return ((State(now.grains, x, c, now.side, tilt), (dx, dc, dtilt)), status), (size, status)
 
     zero = (jnp.zeros_like(state.positions), jnp.zeros_like(state.velocities), jnp.zeros_like(state.tilt))
-    _, (sizes, status) = lax.scan(interval, ((state, zero), jnp.int32(0)), jnp.diff(edges).astype(jnp.int32))
-    return Growth(edges[1:] * flow.shear_rate * flow.timestep, sizes, status)
+    _, (sizes, status) = lax.scan(interval, ((state, zero), jnp.int32(0)), steps)
+    return Growth(jnp.cumsum(steps).astype(state.side.dtype) * flow.shear_rate * flow.timestep, sizes, status)
 
 
 def lyapunov_exponent(strain: np.ndarray, derivative: np.ndarray) -> tuple[float, float]:

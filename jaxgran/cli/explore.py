@@ -23,14 +23,14 @@ EXPLORE_OPTIONS = {
 
 def run_explore_command(file: Path, output: Path | None = None, overwrite: bool = False) -> None:
     from jaxgran.io.atomic import require_place
-    from jaxgran.maps.results import read_dataset
+    from jaxgran.maps.results import open_map
     from jaxgran.page.document import require_plotly
     from jaxgran.page.explore import explore, shows_same_map
 
     path = file.with_suffix(".html") if output is None else output
     require_place(path, "output", ".html")
     require_plotly()
-    page = explore(read_dataset(file, needed=()))
+    page = explore(open_map(file))
     if path.exists() and not overwrite and not shows_same_map(path, page):
         raise InputError(
             f"output {short_repr(str(path))} already exists and belongs to another map; "

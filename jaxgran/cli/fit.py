@@ -162,9 +162,9 @@ def _fit_map(file: Path, stresses: list[float] | None, relative_error: float, js
     from jaxgran.inference.closure_fit import fit_closure
     from jaxgran.inference.cross_validation import leave_one_out
     from jaxgran.inference.stress_inversion import restitution_from_stresses
-    from jaxgran.maps.results import read_dataset
+    from jaxgran.maps.results import open_map
 
-    data = read_dataset(file)
+    data = open_map(file)
     closure, errors = fit_closure(data), leave_one_out(data)
     columns = ("observable", "rms error", "largest error", "noise of a point")
     table = Table("Closure of the map, each point predicted from the others", columns, numbers=False)

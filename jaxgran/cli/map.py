@@ -75,11 +75,11 @@ def shown(data, output: Path, format: FileFormat, draw: bool = True) -> list[Pat
 def run_plot_command(
     file: Path, output: Path | None = None, format: FileFormat = "png", dpi: int = 200, caption: bool = True
 ) -> None:
-    from jaxgran.maps.results import read_dataset
+    from jaxgran.maps.results import open_map
     from jaxgran.plotting.map_figures import remove_pictures, require_file, save_figures
 
     require_file(format, dpi)
-    data = read_dataset(file)
+    data = open_map(file)
     folder = file.parent if output is None else output
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)

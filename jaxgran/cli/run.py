@@ -46,7 +46,14 @@ RUN_OPTIONS = {
         "GIF or MP4 of the flow: grains by their speed, and the forces between them.", Path, example="FILE.gif"
     ),
     "page": Option("HTML file that plays the flow in a browser, with its running averages.", Path, example="FILE.html"),
-    "frame_strain": Option("Strain between frames.", default="a hundredth of --strain, or 0.05 with --error"),
+    "frame_strain": Option(
+        "Strain between frames, each at the nearest time step.",
+        default="a hundredth of --strain, or 0.05 with --error",
+    ),
+    "force_strain": Option(
+        "Strain from each frame on over which its forces are averaged, at most --frame-strain.",
+        default="one time step",
+    ),
     "all": Option("Print every average, those of the solver's quality last.", bool),
     "json": JSON,
     "quiet": QUIET,
@@ -62,6 +69,7 @@ def run_run_command(
     movie: Path | None = None,
     page: Path | None = None,
     frame_strain: float | None = None,
+    force_strain: float | None = None,
     all: bool = False,
     json: bool = False,
     quiet: bool = False,
@@ -80,7 +88,7 @@ def run_run_command(
             raise InputError(
                 f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace it.", field=name
             )
-    recorder, frames, film = _recorder(trajectory, movie, page, frame_strain, strain)
+    recorder, frames, film = _recorder(trajectory, movie, page, frame_strain, force_strain, strain)
     record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
     output = chosen.get("output")
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
@@ -107,12 +115,18 @@ run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "pa
 
 
 def _recorder(
-    trajectory: Path | None, movie: Path | None, page: Path | None, frame_strain: float | None, strain: float
+    trajectory: Path | None,
+    movie: Path | None,
+    page: Path | None,
+    frame_strain: float | None,
+    force_strain: float | None,
+    strain: float,
 ):
     """The recorder of the flow, the frames of its movie, and the film of its page; None if there is no file for it."""
     if trajectory is None and movie is None and page is None:
-        if frame_strain is not None:
-            raise InputError("`frame_strain` requires `trajectory`, `movie` or `page`.", field="frame_strain")
+        for name, value in (("frame_strain", frame_strain), ("force_strain", force_strain)):
+            if value is not None:
+                raise InputError(f"`{name}` requires `trajectory`, `movie` or `page`.", field=name)
         return None, None, None
     configured_jax()
     from jaxgran.io.atomic import require_place
@@ -125,6 +139,10 @@ def _recorder(
         least, most = strain / most_frames, strain
         accepted = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
         require_number("frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted)
+    every = strain / 100 if frame_strain is None else frame_strain
+    if force_strain is not None:
+        accepted = f"above 0 and at most the strain between frames, {every:g}"
+        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= every), accepted)
     keep, frames, film = [], Frames(), None
     if trajectory is not None:
         check_trajectory(trajectory)
@@ -140,7 +158,7 @@ def _recorder(
         require_plotly()
         film = Film()
         keep.append(film.frames.keep)
-    return Recorder(strain / 100 if frame_strain is None else frame_strain, *keep), frames, film
+    return Recorder(every, *keep, force_strain=force_strain or 0.0), frames, film
 
 
 def _write_movie(movie: Path, frames, quiet: bool) -> None:

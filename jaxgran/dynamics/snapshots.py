@@ -4,6 +4,7 @@ A time step begins with the state of a snapshot. Its contacts change the velocit
 then fly freely for dt (``flown``). A contact force is the impulse over dt.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,7 +26,7 @@ from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
-from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_state
 
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
@@ -136,15 +137,47 @@ def _snapshot_series_of_replicas(
 def _snapshot_series(
     flow: ShearFlow, numerics: Numerics, state: State, strain: Array, count: int
 ) -> tuple[State, Snapshot]:
-    steps = jnp.round(strain / (flow.shear_rate * flow.timestep))
-    edges = jnp.round(steps * jnp.arange(count + 1, dtype=steps.dtype) / count)
+    return lax.scan(partial(_later, flow, numerics), state, steps_of_blocks(steps_of_strain(flow, strain), count))
 
-    def next_snapshot(state: State, steps: Array) -> tuple[State, Snapshot]:
-        state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
-        new = snapshot(flow, state, numerics.solver)
-        return state, replace(new, status=jnp.maximum(new.status, tally.status))
 
-    return lax.scan(next_snapshot, state, jnp.diff(edges).astype(jnp.int32))
+def _later(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Snapshot]:
+    """The state after some time steps, and its snapshot with the worst status since."""
+    state, tally = advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+    new = snapshot(flow, state, numerics.solver)
+    return state, replace(new, status=jnp.maximum(new.status, tally.status))
+
+
+_snapshot, _after_steps = jax.jit(snapshot), jax.jit(_later)
+
+
+def snapshots_from(flow: ShearFlow, numerics: Numerics, state: State, strain: float | Array) -> Snapshot:
+    """The snapshots of all time steps of a strain that begins at a state, on the host, with the loaded contacts only.
+
+    For a strain of one time step or less it is a single snapshot instead of a series, with all contacts.
+    """
+    snapshots = [jax.tree.map(np.asarray, _snapshot(flow, state, numerics.solver))]
+    steps = int(steps_of_strain(flow, strain))
+    if steps <= 1:
+        return snapshots[0]
+    for _ in range(steps - 1):
+        state, now = _after_steps(flow, numerics, state, np.int32(1))
+        snapshots.append(jax.tree.map(np.asarray, now))
+    return _series_of_loaded(snapshots)
+
+
+def _series_of_loaded(snapshots: Sequence[Snapshot]) -> Snapshot:
+    """One series of single snapshots, with as many slots as the most loaded contacts of a time."""
+    slots = [np.flatnonzero(one.impulses > 0) for one in snapshots]
+    most = max(map(len, slots))
+
+    def loaded(values: Array, slots: np.ndarray) -> np.ndarray:
+        return np.pad(np.asarray(values)[slots], [(0, most - len(slots)), *[(0, 0)] * (np.ndim(values) - 1)])
+
+    def with_loaded(one: Snapshot, slots: np.ndarray) -> Snapshot:
+        contacts, impulses = jax.tree.map(partial(loaded, slots=slots), (one.contacts, one.impulses))
+        return replace(one, contacts=contacts, impulses=impulses)
+
+    return jax.tree.map(lambda *x: np.stack(x), *map(with_loaded, snapshots, slots))
 
 
 def collided(snapshot: Snapshot) -> State:

@@ -33,7 +33,7 @@ from jaxgran.inference.selection import FEWEST, largest_misfit, of_two_discs, st
 from jaxgran.io.tracks import Tracks, tracks_of_states
 from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, require_key, require_number, require_untraced, require_whole, short_repr
-from jaxgran.model.flow import ShearFlow, require_flow, require_sheared
+from jaxgran.model.flow import ShearFlow, require_flow, require_sheared, steps_of_strain
 from jaxgran.model.state import State
 from jaxgran.model.status import MEANINGS, Status
 from jaxgran.sampling.prediction import predicted
@@ -207,7 +207,7 @@ def _expected(
     timestep = min(float(flow.timestep), _FINE * crossing)
     exact = replace(flow, timestep=timestep)
     tight = Numerics(replace(solver, tolerance=min(float(solver.tolerance), _TOLERANCE)), engine)
-    steps = max(1, round(frame_strain / (shear_rate * timestep)))
+    steps = max(1, int(steps_of_strain(exact, frame_strain)))
     simulated_frames, parts, used = min(frames, _FRAMES), [], 0
     while len(parts) < _FEWEST_TRAJECTORIES or (used < _ENOUGH and len(parts) < _MOST_TRAJECTORIES):
         state, tracks, collisions = _tracks(exact, tight, state, steps, simulated_frames)

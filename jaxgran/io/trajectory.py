@@ -12,9 +12,10 @@ particles/position             (grains, 3)     σ       centres, in the box arou
 particles/velocity             (grains, 3)     σγ̇      peculiar velocities c, before the contacts act; in the
                                                        laboratory c + γ̇ y x̂, up to the velocity of the origin
 particles/diameter, /mass      (grains,)       σ, m    diameters and masses
-bonds/group                    (bonds, 2)      –       pairs of grains in loaded contact in the next step
-log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt
-log/particles/contact_force    (grains,)       mσγ̇²    sum of the contact forces on a grain, by magnitude
+bonds/group                    (bonds, 2)      –       pairs i < j of grains in loaded contact in the steps that follow,
+                                                       one step or those of a strain
+log/bonds/force                (bonds,)        mσγ̇²    their contact forces, impulse p over dt, mean over these steps
+log/particles/contact_force    (grains,)       mσγ̇²    sum of the forces of its bonds, by magnitude
 log/particles/cluster          (grains,)       –       number of its cluster; grains of one cluster are joined by bonds
 log/particles/cluster_size     (grains,)       –       grains of its cluster; 1 without bonds
 log/particles/exact_position   (grains, 2)     σ       positions of the state, in [0, L)
@@ -23,6 +24,7 @@ log/particles/exact_radius     (grains,)       σ       radii; in the first fram
 log/particles/exact_mass       (grains,)       m       masses; in the first frame only
 log/jaxgran/side, /tilt        (1,)            σ, –    side and tilt of the state
 log/jaxgran/strain             (1,)            –       strain since the first frame
+log/jaxgran/force_strain       (1,)            –       strain over which forces are averaged; dt for one step
 log/jaxgran/timestep           (1,)            1/γ̇     dt
 log/jaxgran/shear_rate         (1,)            1/t     γ̇
 log/jaxgran/restitution        (1,)            –       α
@@ -42,14 +44,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxgran.contact.clusters import cluster_labels
-from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
-from jaxgran.dynamics.snapshots import Snapshot, snapshot
+from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.engine import checked_numerics
+from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
 from jaxgran.files import atomic_write
 from jaxgran.io.atomic import require_place
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt, wrap
-from jaxgran.model.checks import InputError, short_repr
-from jaxgran.model.flow import ShearFlow
+from jaxgran.model.checks import InputError, require_number, short_repr
+from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
 
@@ -110,7 +113,7 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
 
     Args:
       path: GSD file, complete after every frame.
-      frame: one snapshot of the flow.
+      frame: one snapshot of the flow; or a series of every time step from the frame on, whose forces are averaged.
       step: time steps since the first frame.
     """
     if step:
@@ -127,21 +130,24 @@ def write_trajectory(
     strain: Sequence[float] | np.ndarray,
     *,
     overwrite: bool = False,
+    force_strain: float | None = None,
     solver: ProjectedMethod = DEFAULT_SOLVER,
 ) -> None:
     """Write states of a flow and their contact forces as a GSD file.
 
     Args:
       path: GSD file, with the ending ``.gsd``.
-      flow: parameters of the flow; contact forces are those of the time step after each state.
+      flow: parameters of the flow.
       states: states with a leading (frames,) axis, such as ``state`` of the series of ``snapshot_series``.
       strain: strain at each frame, shape (frames,), increasing; stored as a number of time steps since the first.
       overwrite: whether to replace an existing file.
-      solver: solves the contacts of the time step after each state.
+      force_strain: strain from each state on over which the contact forces are averaged; None for one time step.
+      solver: solves the contacts of the time steps after each state.
 
     Raises:
       InputError: (a ValueError) the file exists or cannot be written, the states have no leading axis or do not fit
-        the flow, or the strain does not increase by at least one time step from frame to frame.
+        the flow, the strain does not increase by at least one time step from frame to frame, or a frame averages
+        forces beyond the next one.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
@@ -154,17 +160,21 @@ def write_trajectory(
     strains = np.asarray(strain, np.float64)
     if strains.shape != np.shape(states.side):
         raise InputError(f"strain must have one number for each of the {np.size(states.side)} states.")
-    steps = np.round((strains - strains[0]) / float(flow.shear_rate * flow.timestep))
+    steps = steps_of_strain(flow, strains - strains[0])
     if not np.all(np.diff(steps) >= 1):
         raise InputError("strain must increase by at least one time step from frame to frame.")
     frames = [jax.tree.map(lambda x, k=k: x[k], states) for k in range(len(steps))]
     for state in frames:
         require_state(flow, state)
-    require_solver(solver)
-    snapshot_of = jax.jit(snapshot)
+    numerics = checked_numerics(solver, None)
+    least = float(np.min(np.diff(strains), initial=np.inf))
+    if force_strain is not None:
+        accepted = f"above 0 and at most the strain between frames, {least:g}"
+        require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= least), accepted)
     with atomic_write(path) as temporary:
         for k, (state, step) in enumerate(zip(frames, steps.astype(int).tolist(), strict=True)):
-            _write(temporary, "r+" if k else "x", snapshot_of(flow, state, solver), step)
+            frame = snapshots_from(flow, numerics, state, force_strain or 0.0)
+            _write(temporary, "r+" if k else "x", frame, step)
 
 
 def _library() -> tuple[Any, Any]:
@@ -180,14 +190,15 @@ def _write(path: Path, mode: str, frame: Snapshot, step: int) -> None:
         hoomd.HOOMDTrajectory(file).append(_gsd_frame(frame, step))
 
 
-def _gsd_frame(snapshot: Snapshot, step: int):
-    """A snapshot as a frame of the GSD library."""
+def _gsd_frame(seen: Snapshot, step: int):
+    """A snapshot, or the first of a series with the mean forces of all, as a frame of the GSD library."""
     _, hoomd = _library()
-    state = jax.tree.map(np.asarray, snapshot.state)
-    side, tilt = state.side.item(), state.tilt.item()
-    impulses = np.asarray(snapshot.impulses)
-    loaded = np.flatnonzero(impulses > 0)
-    timestep, shear_rate = np.asarray(snapshot.timestep).item(), np.asarray(snapshot.shear_rate).item()
+    arrays = jax.tree.map(np.asarray, seen)
+    steps = arrays if arrays.state.side.ndim else jax.tree.map(lambda x: x[None], arrays)
+    first = steps[0]
+    state, side, tilt = first.state, first.state.side.item(), first.state.tilt.item()
+    timestep, shear_rate = first.timestep.item(), first.shear_rate.item()
+    pairs, forces = _mean_forces(steps)
     frame = hoomd.Frame()
     frame.configuration.step = step
     frame.configuration.dimensions = 2
@@ -197,11 +208,9 @@ def _gsd_frame(snapshot: Snapshot, step: int):
     frame.particles.velocity = _in_space(state.velocities)
     frame.particles.diameter = 2 * state.grains.radii
     frame.particles.mass = state.grains.masses
-    frame.bonds.N = len(loaded)
+    frame.bonds.N = len(pairs)
     frame.bonds.types = ["contact"]
-    frame.bonds.typeid = np.zeros(len(loaded), np.uint32)
-    pairs = np.stack([np.asarray(snapshot.contacts.i)[loaded], np.asarray(snapshot.contacts.j)[loaded]], axis=-1)
-    forces = np.asarray(impulses[loaded] / timestep, np.float64)
+    frame.bonds.typeid = np.zeros(len(pairs), np.uint32)
     frame.bonds.group = pairs
     constants = {"exact_radius": state.grains.radii, "exact_mass": state.grains.masses} if step == 0 else {}
     grain_log = {
@@ -216,7 +225,8 @@ def _gsd_frame(snapshot: Snapshot, step: int):
         "strain": step * timestep * shear_rate,
         "timestep": timestep,
         "shear_rate": shear_rate,
-        "restitution": np.asarray(snapshot.restitution, np.float64),
+        "force_strain": len(steps) * timestep * shear_rate,
+        "restitution": np.asarray(first.restitution, np.float64),
     }
     frame.log = {
         "bonds/force": forces,
@@ -224,6 +234,15 @@ def _gsd_frame(snapshot: Snapshot, step: int):
         **{f"jaxgran/{name}": np.array([x]) for name, x in flow_log.items()},
     }
     return frame
+
+
+def _mean_forces(steps: Snapshot) -> tuple[Int[np.ndarray, "bonds 2"], Float[np.ndarray, " bonds"]]:
+    """Pairs i < j in loaded contact at any of the time steps, and the means of their forces over all of them."""
+    time, slot = np.nonzero(steps.impulses > 0)
+    pairs = np.sort(np.stack([steps.contacts.i[time, slot], steps.contacts.j[time, slot]], axis=-1), axis=-1)
+    bonds, bond = np.unique(pairs, axis=0, return_inverse=True)
+    forces = np.asarray(steps.impulses[time, slot] / steps.timestep[time], np.float64)
+    return bonds, np.bincount(bond.ravel(), forces, minlength=len(bonds)) / len(steps.timestep)
 
 
 def _by_grain(pairs: Int[np.ndarray, "bonds 2"], forces: Float[np.ndarray, " bonds"], grains: int) -> Chunks:

@@ -19,7 +19,7 @@ from jaxgran.analysis.instant import Instant, averaged, instant_of
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
-from jaxgran.model.flow import ShearFlow
+from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP
 from jaxgran.sampling.batch import advance_batch
@@ -73,7 +73,7 @@ def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, Instant
 
 def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
     """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
-    steps = _steps((np.asarray(flow.timestep) * np.asarray(flow.shear_rate)).item())
+    steps = _steps(flow)
     found: list[Instant] = []
     advance = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
     advance(
@@ -82,9 +82,9 @@ def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
     return averaged(found) if len(found) == steps else None
 
 
-def _steps(timestep: float) -> int:
+def _steps(flow: ShearFlow) -> int:
     """The number of time steps of the window."""
-    return min(max(1, round(WINDOW / timestep)), _MOST_STEPS)
+    return min(max(1, int(steps_of_strain(flow, WINDOW).item())), _MOST_STEPS)
 
 
 def as_arrays(instants: Sequence[Instant | None]) -> dict[str, np.ndarray]:

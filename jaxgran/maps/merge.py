@@ -41,7 +41,7 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
       2
     """
     from jaxgran.maps.dataset import map_dataset
-    from jaxgran.maps.own_observables import identity_of
+    from jaxgran.maps.own_observables import identity_of, label_units, sums_by_name, units_of
     from jaxgran.maps.results import choices_of, open_map
     from jaxgran.maps.settings import MapSettings
     from jaxgran.maps.sums import replicas_of
@@ -74,7 +74,9 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
                 where = f"seed {key[1] + numbers[0]} of point {point}"
                 raise InputError(f"maps must have no replica in common, and {origin[key]} and {name} have {where}.")
             replicas[key], origin[key] = replica, name
-    return map_dataset(settings, replicas, _attributes(opened))
+    merged_map = map_dataset(settings, replicas, _attributes(opened))
+    label_units(merged_map, units_of(opened[0], sums_by_name(settings) or ()))
+    return merged_map
 
 
 def _require_same(first: str, here: Any, name: str, there: Any, keys: Sequence[str], but: Sequence[str] = ()) -> None:

@@ -8,7 +8,7 @@ import jax
 
 from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES
-from jaxgran.sampling.observe import observed_shapes
+from jaxgran.sampling.observe import dimensions_of, observed_shapes
 
 if TYPE_CHECKING:
     from jaxgran.model.flow import ShearFlow
@@ -50,8 +50,3 @@ def require_observe(observe: Any, flow: ShearFlow) -> None:
 
 def _names(name: str) -> tuple[str, str, str]:
     return name, f"{name}_stderr", f"{name}_ci95"
-
-
-def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """The dimensions of an array at one point."""
-    return tuple(f"{name}_dim_{k}" for k in range(len(shape)))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
-from jaxgran.maps.own_names import dimensions_of
 from jaxgran.maps.schema import ERROR_SOURCES
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.status import GIVEN_UP
-from jaxgran.sampling.observe import digest_of, observed_shapes
+from jaxgran.sampling.observables import unit_attributes
+from jaxgran.sampling.observe import digest_of, dimensions_of, observed_shapes
 from jaxgran.sampling.sample import observed_estimates
 
 if TYPE_CHECKING:
@@ -65,6 +65,21 @@ def own_variables(
         about = {"long_name": f"half-width of the 95 % interval of the mean of {name}, known for sampling only"}
         variables[f"{name}_ci95"] = grid.variable(interval, about, *dims, "error_source")
     return variables
+
+
+def label_units(data: xr.DataTree, units: Mapping[str, str]) -> None:
+    """Give the variables of the user's observables the attributes of their units, as built-in ones have them."""
+    for name, unit in units.items():
+        for group in (data, data["seeds"]):
+            for variable in (name, f"{name}_stderr", f"{name}_ci95"):
+                if variable in group.data_vars:
+                    group[variable].attrs.update(unit_attributes(unit))
+
+
+def units_of(data: xr.DataTree, names: Iterable[str]) -> dict[str, str]:
+    """The units that ``label_units`` gave a map, by name."""
+    attributes = {name: data[name].attrs for name in names}
+    return {name: about.get("reduced_unit", "1") for name, about in attributes.items() if "units" in about}
 
 
 def own_seed_variables(

@@ -14,7 +14,7 @@ This module loads neither JAX nor xarray, so that the command line can print its
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
@@ -78,10 +78,10 @@ _TOLERANCE = (lambda x: (x >= 1e-12) & (x <= 0.1), "between 1e-12 and 0.1")
 class MapParameters:
     """What the numbers of a map depend on."""
 
-    restitution: Sequence[float] = field(  # type: ignore[assignment]
+    restitution: float | Sequence[float] = field(  # type: ignore[assignment]
         default=None, metadata=row("Restitution, 0 to 1.", several=True, default="of the preset")
     )
-    packing_fraction: Sequence[float] = field(  # type: ignore[assignment]
+    packing_fraction: float | Sequence[float] = field(  # type: ignore[assignment]
         default=None, metadata=row("Packing fraction, up to 0.83.", several=True, default="of the preset")
     )
     _: KW_ONLY
@@ -257,6 +257,14 @@ class RunParameters(MapParameters):
     record: Any = field(
         default=None,
         metadata=row("Wraps the function that advances a sampled batch, such as that of a recorder.", commands=()),
+    )
+    observe_units: Mapping[str, str] | None = field(
+        default=None,
+        metadata=row(
+            'Units of what `observe` returns, by name, such as {"torque": "m sigma^2 / t^2"}; "1" for pure numbers. '
+            "They are labels, and do not decide whether a map is resumed.",
+            commands=(),
+        ),
     )
     attributes: dict[str, Any] | None = field(
         default=None, metadata=row("More attributes of the dataset.", commands=())

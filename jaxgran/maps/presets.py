@@ -75,9 +75,9 @@ def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _parameters_of(file: Path) -> dict[str, Any]:
     """The parameters of the map in a file; a warning names other differences that could change its numbers."""
-    from jaxgran.maps.results import choices_of, differences, read_dataset
+    from jaxgran.maps.results import choices_of, differences, open_map
 
-    data = read_dataset(file)
+    data = open_map(file)
     chosen, different = choices_of(data), differences(data)
     if different:
         warnings.warn(f"differs from {file}: {'; '.join(different)}.", stacklevel=4)

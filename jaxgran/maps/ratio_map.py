@@ -20,12 +20,14 @@ from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.output import check_output
+from jaxgran.maps.own_observables import label_units, sums_by_name
 from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole, short_repr
+from jaxgran.sampling.observe import require_units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -68,6 +70,9 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     run = RunParameters(**with_start(given))
     output = _checked(run)
     settings, automatic_choice = chosen_settings(run)
+    units = {} if run.observe_units is None else run.observe_units
+    if run.observe_units is not None:
+        require_units(units, sums_by_name(settings) or ())
     workers = _workers(run)
     if automatic_choice:
         _tell(run, f"chosen: {automatic_choice}")
@@ -85,6 +90,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
             if earlier is not None and finished and not difference and not started:
                 complete = True
                 _tell(run, f"{output} is finished and is read from its file.")
+                label_units(earlier, units)
                 return earlier
             _tell_resumed(run, settings, checkpoint)
         results, attributes, interruption = _run(run, settings, workers, None if run.record else checkpoint)
@@ -93,6 +99,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
         attributes |= {"automatic_choice": automatic_choice, **(run.attributes or {})}
         data = map_dataset(settings, results, attributes)
+        label_units(data, units)
         if output is not None and any(results.values()) and not (interruption and finished):
             write_dataset(data, output)
         if interruption is not None:

@@ -36,36 +36,6 @@ def write_dataset(data: xr.DataTree, path: Path) -> None:
         temporary.write_bytes(content + _MARK + hashlib.sha256(content).digest())
 
 
-def read_dataset(path: Path, needed: tuple[str, ...] = (*RATIO, "status")) -> xr.DataTree:
-    """Read a map, loaded into memory.
-
-    Args:
-      path: the file.
-      needed: variables that it must have.
-
-    Raises:
-      InputError: (a ValueError) the file does not exist, cannot be read, is not a map with these variables, or has
-        another version of the format.
-    """
-    if not os.path.isfile(path):
-        raise InputError(f"there is no file {short_repr(str(path))}.")
-    try:
-        data = xr.load_datatree(_whole(path), engine="netcdf4")
-    except Exception as error:  # an incomplete file may fail in any way
-        why = " ".join(str(error).split()).rstrip(".")
-        raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
-    problem = what_lacks(data, *needed)
-    if problem:
-        raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
-    version = data.attrs.get("format_version")
-    if version != FORMAT_VERSION:
-        found = "no format_version" if version is None else f"format_version {version}"
-        raise InputError(
-            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
-        )
-    return data
-
-
 def open_map(path: str | Path) -> xr.DataTree:
     """The map of a file, loaded into memory: that of ``ratio_map(output=…)``, of ``jaxgran map`` or of ``to_netcdf``.
 
@@ -78,7 +48,23 @@ def open_map(path: str | Path) -> xr.DataTree:
     """
     if not isinstance(path, (str, os.PathLike)):
         raise refused("path", path, "must be a file name")
-    return read_dataset(Path(path))
+    if not os.path.isfile(path):
+        raise InputError(f"there is no file {short_repr(str(path))}.")
+    try:
+        data = xr.load_datatree(_whole(Path(path)), engine="netcdf4")
+    except Exception as error:  # an incomplete file may fail in any way
+        why = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
+    problem = what_lacks(data, *RATIO, "status")
+    if problem:
+        raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
+    version = data.attrs.get("format_version")
+    if version != FORMAT_VERSION:
+        found = "no format_version" if version is None else f"format_version {version}"
+        raise InputError(
+            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
+        )
+    return data
 
 
 def _whole(path: Path) -> bytes:
@@ -144,7 +130,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
     from jaxgran.maps.own_observables import identity_of
 
     try:
-        data = read_dataset(path)
+        data = open_map(path)
         chosen = choices_of(data)
     except InputError:
         return None, "something other than a map of this version"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +40,10 @@ class MapSettings(MapParameters):
     ``solver`` and ``engine`` are values, see ``ProjectedMethod`` and ``dynamics.engine``; None stands for the default
     solver and for the automatic choice of an engine. A given ``tolerance`` becomes that of the solver.
     """
+
+    if TYPE_CHECKING:
+        restitution: tuple[float, ...] = ()
+        packing_fraction: tuple[float, ...] = ()
 
     def __post_init__(self):
         object.__setattr__(self, "solver", _with_tolerance(self.solver, self.tolerance))
@@ -216,6 +220,9 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     """
     rows = fields(MapParameters)
     chosen: dict[str, Any] = {one.name: _plain(getattr(asked, one.name), one.metadata["option"].kind) for one in rows}
+    for name in ("restitution", "packing_fraction"):
+        if _are_numbers((chosen[name],)):
+            chosen[name] = (float(chosen[name]),)
     by_point = chosen["grains_by_point"]
     if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
         chosen["grains"] = max(by_point)

@@ -164,6 +164,33 @@ def require_strain(flow: ShearFlow, strain: Any, parts: int) -> None:
         require("strain", strain, lambda x: x <= most, f"at most {MAX_STEPS} time steps, {most:g}")
 
 
+def steps_of_strain(flow: ShearFlow, strain: Any) -> Any:
+    """Whole numbers of time steps nearest to a strain, as floats, for one flow or each of a batch.
+
+    It is computed with JAX where values are traced and with NumPy otherwise, in the same precision to the same bits.
+
+    Examples:
+      >>> flow = ShearFlow(grains=64, restitution=0.5, packing_fraction=0.6, timestep=1e-3)
+      >>> float(steps_of_strain(flow, 0.0104))
+      10.0
+    """
+    numbers = strain, flow.shear_rate, flow.timestep
+    xp, precision = jnp if is_traced(*numbers) else np, jnp.result_type(*numbers)
+    strain, shear_rate, timestep = (xp.asarray(x, precision) for x in numbers)
+    return xp.round(strain / (shear_rate * timestep))
+
+
+def steps_of_blocks(steps: Any, blocks: int) -> Any:
+    """Time steps of each of ``blocks`` parts of ``steps`` time steps, (..., blocks), which differ by one at most.
+
+    Examples:
+      >>> steps_of_blocks(np.array(10.0), 4).tolist()
+      [2, 3, 3, 2]
+    """
+    edges = (steps[..., None] * np.arange(blocks + 1, dtype=steps.dtype) / blocks).round()
+    return (edges[..., 1:] - edges[..., :-1]).astype(np.int32)
+
+
 def require_sheared(flow: ShearFlow) -> None:
     """Raise an InputError if the shear rate is zero, for functions that measure time in strain."""
     words = "above 0 where strain is counted (for a flow without shear there is cooling)"

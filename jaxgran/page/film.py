@@ -75,10 +75,12 @@ class Film:
             np.asarray(x).item() for x in (self.flow.restitution, self.flow.packing_fraction, self.flow.timestep)
         )
         rule = "midpoint" if np.asarray(self.flow.activation_fraction).item() > 0 else "touching"
+        window, one_step = seen[0].instant.window, dt * np.asarray(self.flow.shear_rate).item()
+        forces = f"mean forces over a strain of {window:.3g}" if window > 1.5 * one_step else "forces of one time step"
         data = {
             "title": f"Sheared flow at α = {alpha:g}, ν = {nu:g}",
             "about": f"N = {self.flow.grains}, dt = {dt:g}/γ̇, {rule} activation. "
-            "A frame shows the forces of one time step. Averages are those from the first frame to the one shown.",
+            f"A frame shows the {forces}. Averages are those from the first frame to the one shown.",
             "strain": strains,
             "frames": [grain_data(**one.instant._asdict(), scale=scale) for one in seen],
             "averages": [

@@ -58,7 +58,7 @@ class Frames:
             self.scenes, self.strains, self._stride = self.scenes[::2], self.strains[::2], 2 * self._stride
         if self._recorded % self._stride == 0:
             self.scenes.append(self._view(seen))
-            self.strains.append(step * (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).item())
+            self.strains.append(step * (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).flat[0].item())
         self._recorded += 1
 
 

@@ -28,7 +28,7 @@ from jaxgran.model.checks import (
     two_digits,
 )
 from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses, unit_text
-from jaxgran.model.flow import ShearFlow, require_strain
+from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observables import OBSERVABLES, Averages
@@ -136,19 +136,24 @@ class Sample(Averages, Indexable):
         each = [here[place].errors() for place in range(len(here.area))]
         return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
 
-    def to_dataset(self) -> "xr.Dataset":
+    def to_dataset(self, observe_units: Mapping[str, str] | None = None) -> "xr.Dataset":
         """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the strain and the status.
 
         A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``. ``long_name`` says what a
-        variable is. ``reduced_unit`` is its unit in m, σ and t.
+        variable is. ``reduced_unit`` is its unit in m, σ and t. If ``observe`` returned a dictionary of numbers or
+        arrays, their means are there too; an array has the dimensions NAME_dim_0, NAME_dim_1, …
+
+        Args:
+          observe_units: units of what ``observe`` returned, by name; "1" for pure numbers.
 
         Raises:
-          InputError: JAX transforms this function.
+          InputError: JAX transforms this function, or ``observe`` returned a name that an average has, or
+            ``observe_units`` has a name that ``observe`` does not return.
         """
         require_untraced("to_dataset()", "take it of the finished sample", self)
         from jaxgran.sampling.sample_dataset import dataset_of
 
-        return dataset_of(self)
+        return dataset_of(self, {} if observe_units is None else observe_units)
 
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
         """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.
@@ -358,18 +363,7 @@ def _sample_replicas(
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
-    return steps_of_blocks(jnp.round(strain / (flow.shear_rate * flow.timestep)), blocks)
-
-
-def steps_of_blocks(steps: Any, blocks: int) -> Any:
-    """Time steps of each of ``blocks`` parts of ``steps`` time steps, (..., blocks), which differ by one at most.
-
-    Examples:
-      >>> steps_of_blocks(np.array(10.0), 4).tolist()
-      [2, 3, 3, 2]
-    """
-    edges = (steps[..., None] * np.arange(blocks + 1, dtype=steps.dtype) / blocks).round()
-    return (edges[..., 1:] - edges[..., :-1]).astype(np.int32)
+    return steps_of_blocks(steps_of_strain(flow, strain), blocks)
 
 
 def _sample_blocks(

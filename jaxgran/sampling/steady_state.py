@@ -31,7 +31,7 @@ from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import DEFAULT_NUMERICS, Engine, Numerics, checked_numerics, in_lockstep
 from jaxgran.dynamics.tally import Tally
 from jaxgran.model.checks import InputError, is_traced, key_shape, require, require_key, require_number
-from jaxgran.model.flow import ShearFlow, one_of, require_sheared
+from jaxgran.model.flow import ShearFlow, one_of, require_sheared, steps_of_blocks, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
@@ -54,7 +54,7 @@ from jaxgran.sampling.correlation_strain import (
 )
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error, steps_of_blocks
+from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.sampling.timestep import (
     COARSE_TIMESTEP,
     bounded_coarse_timestep,
@@ -301,12 +301,7 @@ _heated = batch_program(_heated_replica)
 
 def _chunk(batch: Batch, strain: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain."""
-    return _advanced(batch, _steps(batch, strain), advance)
-
-
-def _steps(batch: Batch, strain: np.ndarray) -> Float[np.ndarray, " replicas"]:
-    """Whole numbers of time steps of the strain of each replica."""
-    return np.round(strain / (np.asarray(batch.flow.shear_rate) * np.asarray(batch.flow.timestep)))
+    return _advanced(batch, steps_of_strain(batch.flow, strain), advance)
 
 
 def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[Batch, Tally]:
@@ -322,7 +317,7 @@ def _advanced(batch: Batch, steps: np.ndarray, advance: AdvanceBatch) -> tuple[B
 def _blocks(batch: Batch, strain: np.ndarray, count: int, advance: AdvanceBatch) -> tuple[Batch, Tally]:
     """Advance every replica by its own strain in ``count`` blocks, and keep all tallies, (replicas, count)."""
     tallies = []
-    for steps in steps_of_blocks(_steps(batch, strain), count).T:
+    for steps in steps_of_blocks(steps_of_strain(batch.flow, strain), count).T:
         batch, tally = _advanced(batch, steps, advance)
         tallies.append(tally)
     return batch, jax.tree.map(lambda *x: np.stack(x, axis=1), *tallies)
@@ -351,7 +346,7 @@ def _sheared(batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: b
     With ``measure`` the last chunk gives the correlation strain.
     """
     chunks = max(1, int(np.ceil(np.max(strain))))
-    for steps in steps_of_blocks(_steps(batch, strain), chunks).T:
+    for steps in steps_of_blocks(steps_of_strain(batch.flow, strain), chunks).T:
         batch, tally = _advanced(batch, steps, advance)
         if measure:
             batch = batch._replace(memory=_memory(batch, _averages(batch, tally)))
