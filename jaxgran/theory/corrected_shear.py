@@ -134,8 +134,9 @@ def corrected_shear(
     Γ = R Γ_E/L and p_c = R p_E at the same temperature tensor, where p_c is the collisional pressure. The balance of
     the moments is then solved as without them, so that τγ̇ = Γ. No coefficient is adjusted to T, p or τ.
 
-    Source: the correlation length in Γ, J. T. Jenkins, Granul. Matter 10, 47 (2007); both laws were fitted by this
-    project.
+    Source: a correlation length that divides the dissipation rate is that of extended kinetic theory, for instance of
+    D. Vescovi, D. Berzi, P. Richard and N. Brodu, Phys. Fluids 26, 053305 (2014). Both laws are fits of this project
+    (``python -m benchmarks dissipation``).
 
     Examples:
       Grains lose less energy than in Enskog's theory, so the flow is hotter.
