@@ -11,7 +11,7 @@ from oracles import gaps_of, kinetic_energy
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.tally import TABLE
-from jaxgran.model.cell import displacement, relative_velocity
+from jaxgran.model.cell import displacement, relative_velocity, wrap
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.averages import averages
@@ -218,6 +218,23 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     for name in TABLE:
         expected = powers.get(name, 1) * getattr(slow_tally, name)
         np.testing.assert_array_equal(getattr(fast_tally, name), expected, err_msg=name)
+
+
+def test_a_flow_that_is_moved_repeats_its_trajectory_there(engine, engine_run, flowing):
+    """No place of the sheared cell is special. A place that is higher by b flows faster by γ̇ b."""
+    state, flow, shift = flowing(0.6), flow_of(0.6), np.array([[1.3, -2.7]])
+    steps = 60 if engine == "pallas" else 300
+    moved = replace(state, positions=wrap(state.positions + shift, state.side, state.tilt))
+    here, tally = engine_run(flow, state, steps)
+    there, moved_tally = engine_run(flow, moved, steps)
+    assert tally.solves > 10
+    assert moved_tally.solves == tally.solves
+    np.testing.assert_allclose(there.velocities, here.velocities, atol=1e-8)
+    strain = steps * float(flow.timestep)
+    expected = here.positions + shift + strain * shift[:, 1:] * np.array([[1.0, 0.0]])
+    gone = displacement(there.positions, expected, here.side, here.tilt)
+    np.testing.assert_allclose(gone, 0, atol=1e-8)
+    np.testing.assert_allclose(moved_tally.contact_moment, tally.contact_moment, rtol=1e-6)
 
 
 def test_compiled_velocities_equal_the_interpreted_ones(flowing):
