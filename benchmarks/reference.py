@@ -45,7 +45,7 @@ from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 
 THEORIES: dict[str, Callable] = {one.__name__: one for one in (gaussian_moments, garzo_dufty, jenkins_richman)}
-TERMS = 16  # of the Chebyshev series along each coordinate
+TERMS = 20  # of the Chebyshev series along each coordinate
 MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range
 START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
 BOUNDED_BY = {"dissipation_rate": "shear_stress"}  # its power is what is dissipated
@@ -97,7 +97,7 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
     terms = {"low": " ".join(f"{x:.12g}" for x in series.low), "high": " ".join(f"{x:.12g}" for x in series.high)}
     first, second = (x.ravel() for x in np.indices((TERMS, TERMS)))
     table_of_terms = {"first": first, "second": second, **{k: v.ravel() for k, v in series.coefficients.items()}}
-    about = {"contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and -ln(0.86 - nu), see table.py"}
+    about = {"contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py"}
     write_columns(folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9)
     attributes = {name: data.attrs[name] for name in ("grains", "timestep", "seeds", "polydispersity", "activation")}
     head: dict[str, Any] = {
@@ -128,25 +128,20 @@ def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, int
 
 def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series:
     """The series of the logarithms of a theory's predictions, over the range of the columns."""
-    ends = coordinates(*(np.array([x.min(), x.max()]) for x in (columns["restitution"], columns["packing_fraction"])))
-    low, high = ends.min(axis=0), ends.max(axis=0)
+    alphas, nus = columns["restitution"], columns["packing_fraction"]
+    low = np.array([np.sqrt(1 - alphas.max()), nus.min()])
+    high = np.array([np.sqrt(1 - alphas.min()), nus.max()])
     low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
     nodes = np.cos(np.pi * (np.arange(TERMS) + 0.5) / TERMS)
     first, second = (low[k] + (nodes + 1) / 2 * (high[k] - low[k]) for k in (0, 1))
     u, v = (x.ravel() for x in np.meshgrid(first, second, indexing="ij"))
-    predicted = jax.vmap(theory)(1 - u**2, packing_fraction(v))
+    predicted = jax.vmap(theory)(1 - u**2, v)
     inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, TERMS - 1))
     coefficients = {}
     for name in THEORY:
         values = np.log(np.asarray(getattr(predicted, name))).reshape(TERMS, TERMS)
         coefficients[name] = inverse @ values @ inverse.T
     return Series(low, high, coefficients)
-
-
-def packing_fraction(second: np.ndarray) -> np.ndarray:
-    """ν from the second of the ``coordinates``."""
-    at_zero = coordinates(0.0, 0.0)[1]  # −ln of the packing fraction at which it diverges
-    return np.exp(-at_zero) - np.exp(-second)
 
 
 def fitted_shape(table: Table, name: str) -> Shape:

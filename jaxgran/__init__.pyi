@@ -46,6 +46,7 @@ from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
+from .reference.validity import Validity, validity
 from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
 from .sampling.sample import Sample, sample
@@ -84,6 +85,7 @@ __all__ = [
     "TrackNoise",
     "Tracks",
     "Trajectory",
+    "Validity",
     "advance",
     "averages_against_grains",
     "cluster_shares",
@@ -126,5 +128,6 @@ __all__ = [
     "solve_contacts",
     "theory_errors",
     "tracks_of_states",
+    "validity",
     "write_trajectory",
 ]

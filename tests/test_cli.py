@@ -147,6 +147,9 @@ MISTAKES = {  # one for each kind of option, check and file
     "plot": "FILE must be given: see jaxgran plot --help",
     "plot none.nc": "there is no file",
     "plot text.nc --dpi many": "--dpi must be a whole number, not 'many'",
+    "where --restitution 0.7": "--packing-fraction must be given",
+    "where --restitution 0.05 --packing-fraction 0.6": "--restitution must be between 0.1 and 0.98",
+    "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.82",
     "fit text.gsd": "'text.gsd' cannot be read",
     "fit text.gsd --pressure 3": "--pressure requires a map, and 'text.gsd' is none",
     "fit text.nc --frame-time 1": "--frame-time requires tracks of discs, and 'text.nc' is a map",
@@ -634,7 +637,7 @@ def test_completion_is_offered_and_its_script_calls_the_command(words: list[str]
 @pytest.mark.parametrize(
     ("line", "expected"),
     {
-        "jaxgran ": {"map", "merge", "plot", "explore", "run", "fit", "info"},
+        "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "fit", "info"},
         "jaxgran p": {"plot"},
         "jaxgran run --m": {"--movie"},
         "jaxgran map --preset ": {"quick", "paper", "dense"},

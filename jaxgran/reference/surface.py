@@ -25,6 +25,11 @@ def coordinates(restitution: Any, packing_fraction: Any, xp: Any = np) -> Any:
     return xp.stack([xp.sqrt(1 - restitution), -xp.log(_JAMMING - packing_fraction)], axis=-1)
 
 
+def packing_fraction(where: Any, xp: Any = np) -> Any:
+    """ν at coordinates (..., 2)."""
+    return _JAMMING - xp.exp(-where[..., 1])
+
+
 @dataclass(frozen=True)
 class Shape:
     """What is fitted of a surface: amplitude, a length along each coordinate, factors of standard errors."""
@@ -36,7 +41,7 @@ class Shape:
 
     def covariance(self, one: Any, other: Any, xp: Any = np) -> Any:
         """Prior covariance of (..., 2) and (points, 2) coordinates, (..., points)."""
-        apart = (one[..., None, :] - other) / np.array(self.lengths)
+        apart = (one[..., None, :] - other) / np.array([self.lengths])
         r = xp.sqrt(5 * xp.sum(apart**2, axis=-1) + _TINY)
         return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + _SLOPE**2 * (1 + one @ other.T)
 

@@ -3,7 +3,7 @@
 Both are text with a head of lines ``# name: value``; ``python -m benchmarks reference`` makes them from a map.
 ``averages.csv`` has a row for each point. Each average has the columns NAME, NAME_stderr and, where there is a bound on
 the errors other than sampling, NAME_bound; the head has the shape of its surface. ``theory.csv`` has a row for each
-term of the series of the logarithm of a prediction, in the coordinates of ``surface`` scaled to −1 ... 1.
+term of the series of the logarithm of a prediction, in √(1 − α) and ν scaled to −1 ... 1.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.reference.surface import Shape, Surface, coordinates
+from jaxgran.reference.surface import Shape, Surface, coordinates, packing_fraction
 
 MEASURED = {
     "pressure": "m / t^2",
@@ -59,14 +59,15 @@ def excess_from_surface(value: Any, xp: Any = np) -> Any:
 
 @dataclass(frozen=True)
 class Series:
-    """Chebyshev series in two coordinates of the logarithms of the predictions of a theory."""
+    """Chebyshev series in √(1 − α) and ν of the logarithms of the predictions of a theory."""
 
-    low: np.ndarray  # (2,) coordinates at −1
+    low: np.ndarray  # (2,) √(1 − α) and ν at −1
     high: np.ndarray  # at 1
     coefficients: dict[str, np.ndarray]  # (terms, terms) each
 
     def __call__(self, where: Any, xp: Any = np) -> dict[str, Any]:
-        """Logarithm of every prediction at coordinates (..., 2)."""
+        """Logarithm of every prediction at coordinates (..., 2) of ``surface``."""
+        where = xp.stack([where[..., 0], packing_fraction(where, xp)], axis=-1)
         scaled = (2 * where - self.low - self.high) / (self.high - self.low)
         count = len(next(iter(self.coefficients.values())))
         terms = [xp.ones_like(scaled), scaled]

@@ -128,12 +128,21 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
     inside = _inside(table, alpha, nu)
     middle = [sum(table.range(name)) / 2 for name in ("restitution", "packing_fraction")]
     where = coordinates(xp.where(inside, alpha, middle[0]), xp.where(inside, nu, middle[1]), xp)
-    found = _evaluated(table, where, xp)
+    found = _evaluated(table, where) if xp is np else _mapped(table, where, alpha.shape)
     masked = [{name: xp.where(inside, x, np.nan) for name, x in part.items()} for part in found]
     return Validity(alpha, nu, *masked)
 
 
-def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
+def _mapped(table: Table, where: Any, shape: tuple[int, ...]) -> Any:
+    """``_evaluated`` of traced points one by one, so that ranks are promoted nowhere."""
+    import jax
+    import jax.numpy as jnp
+
+    found = jax.vmap(lambda one: _evaluated(table, one, jnp))(where.reshape(-1, 2))
+    return jax.tree.map(lambda x: x.reshape(shape), found)
+
+
+def _evaluated(table: Table, where: Any, xp: Any = np) -> tuple[dict[str, Any], ...]:
     """The dictionaries of a ``Validity`` at coordinates in the measured range."""
     logs = table.series(where, xp)
     theory = {name: xp.exp(logs[theory_of(name)]) for name in MEASURED if not name.startswith("local_")}

@@ -1,0 +1,207 @@
+"""What the reference table says of a flow: surfaces against algebra, series against the theory, verdicts, intervals."""
+
+import json
+import subprocess
+import sys
+from math import comb
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from command_line import jaxgran
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxgran as jg
+from benchmarks import reference
+from jaxgran.reference.surface import Shape, Surface
+from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
+from jaxgran.theory import gaussian_moments, navier_stokes
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+ALPHAS, NUS = st.floats(0.1, 0.98), st.floats(0.1, 0.82)
+FLOWS = [(0.7, 0.6), (0.98, 0.5), (0.1, 0.82), (0.5, 0.75), (0.3, 0.2)]
+
+
+@pytest.fixture(scope="module")
+def result() -> dict:
+    return json.loads((RESULTS / "reference.json").read_text(encoding="utf-8"))
+
+
+def a_surface(points: int = 12) -> Surface:
+    rng = np.random.default_rng(0)
+    where = rng.uniform(-1, 1, (points, 2))
+    return Surface(where, np.sin(2 * where[:, 0]) + where[:, 1], np.full(points, 0.05), Shape(0.7, (1.2, 0.9)))
+
+
+def test_a_surface_is_the_conditional_mean_of_a_gaussian_distribution() -> None:
+    surface = a_surface()
+    every = np.vstack([surface.points, [[0.3, -0.2], [0.9, 0.4]]])
+    joint = surface.shape.covariance(every, every)
+    known = joint[:12, :12] + 0.05**2 * np.eye(12)
+    gain = np.linalg.solve(known, joint[:12, 12:]).T
+    value, stderr = surface(every[12:])
+    assert value == pytest.approx(gain @ surface.values, rel=1e-8)
+    assert stderr**2 == pytest.approx(np.diag(joint[12:, 12:] - gain @ joint[:12, 12:]), rel=1e-6)
+
+
+def test_errors_of_points_left_out_are_those_of_surfaces_without_them() -> None:
+    surface = a_surface()
+    errors, expected = surface.left_out()
+    for k in range(12):
+        others = np.arange(12) != k
+        without = Surface(surface.points[others], surface.values[others], surface.stderrs[others], surface.shape)
+        value, stderr = without(surface.points[k])
+        assert errors[k] == pytest.approx(surface.values[k] - value, rel=1e-6)
+        assert expected[k] == pytest.approx(np.hypot(stderr, 0.05), rel=1e-6)
+
+
+def test_a_surface_far_from_its_points_is_as_uncertain_as_its_prior() -> None:
+    surface = a_surface()
+    _, near = surface(surface.points[0])
+    _, far = surface(np.array([30.0, 30.0]))
+    assert near < 0.06
+    assert far > surface.shape.amplitude
+
+
+@settings(max_examples=20, deadline=None)
+@given(ALPHAS, NUS)
+def test_the_series_is_the_theory(alpha: float, nu: float) -> None:
+    name = shipped_table().head["theory"]
+    theory = getattr(gaussian_moments if name == "gaussian_moments" else navier_stokes, name)(alpha, nu)
+    said = jg.validity(alpha, nu).theory
+    for key in ("pressure", "shear_stress", "granular_temperature"):
+        assert said[key] == pytest.approx(float(getattr(theory, key)), rel=1e-5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(ALPHAS, NUS)
+def test_error_is_theory_over_measured_and_intervals_are_positive(alpha: float, nu: float) -> None:
+    found = jg.validity(alpha, nu)
+    for name, error in found.error.items():
+        theory = found.theory[name.removeprefix("local_")]
+        assert 1 + error == pytest.approx(theory / found.measured[name])
+    assert found.theory["dissipation_rate"] == found.theory["shear_stress"]
+    assert all(np.all(x > 0) for x in jax.tree.leaves((found.measured_ci95, found.error_ci95, found.factors_ci95)))
+
+
+def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
+    table = shipped_table()
+    flows = table.columns["restitution"], table.columns["packing_fraction"]
+    found = jg.validity(*flows)
+    for name in (*MEASURED, "force_ratio"):
+        apart = np.abs(found.measured[name] - table.columns[name])
+        own = np.hypot(found.measured_ci95[name], 1.96 * table.columns[f"{name}_stderr"])
+        assert np.mean(apart < own) > 0.95
+
+
+def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
+    alphas, nus = np.array([0.2, 0.5, 0.9]), np.array([[0.3], [0.7]])
+    found = jg.validity(alphas, nus)
+    assert found.measured["pressure"].shape == found.verdict().shape == (2, 3)
+    compiled = jax.jit(jg.validity)(alphas, nus)
+    mapped = jax.vmap(lambda nu: jax.vmap(lambda alpha: jg.validity(alpha, nu))(jnp.asarray(alphas)))(
+        jnp.asarray(nus[:, 0])
+    )
+    for one in (compiled, mapped):
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(one), strict=True):
+            np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"])
+def test_gradients_are_those_of_finite_differences(name: str) -> None:
+    def of(x):
+        return jg.validity(x[0], x[1]).measured[name]
+
+    at, step = jnp.array([0.45, 0.71]), 1e-5
+    exact = jax.grad(of)(at)
+    by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(2)]
+    np.testing.assert_allclose(exact, by_steps, rtol=1e-6)
+
+
+def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
+    with pytest.raises(jg.InputError, match=r"packing_fraction must be between 0.1 and 0.82, the range"):
+        jg.validity(0.5, [0.5, 0.83])
+    for wrong in ("a", None, np.nan, []):
+        with pytest.raises(jg.InputError, match="restitution must be between"):
+            jg.validity(wrong, 0.5)
+    values = jax.jit(jg.validity)(jnp.array([0.05, 0.5]), 0.5).measured["pressure"]
+    assert list(np.isnan(values)) == [True, False]
+    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(jnp.array([0.05, 0.5]))
+    assert np.all(np.isfinite(slopes))
+
+
+def test_single_precision_is_refused_where_jax_traces() -> None:
+    with jax.enable_x64(False), pytest.raises(jg.InputError, match="double precision"):
+        jax.jit(jg.validity)(0.5, 0.5)
+
+
+def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> jg.Validity:
+    all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {name: np.array(x) for name, x in factors.items()}
+    measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
+    errors = {"pressure": np.array(error)}, {"pressure": np.array(ci95)}
+    return jg.Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, all_factors, {})
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (made(-0.05, 0.02, chaos=0.8), ("underestimates the pressure by 5.0 ± 2.0 %", "correlated", "binary to 0.1 %")),
+        (made(0.2, 0.02, pairs=0.7), ("overestimates the pressure by 20.0 ± 2.0 %", "fewer pairs")),
+        (
+            made(0.01, 0.02, anisotropy=1.1, pairs=1.05),
+            ("agrees with the measured pressure", "velocities are anisotropic"),
+        ),
+        (made(0.01, 0.02), ("agrees with the measured pressure", "no assumption")),
+        (made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0), ("in clusters", "explain 25 % of the mean contact force")),
+    ],
+)
+def test_a_verdict_says_error_cause_and_share_of_binary_collisions(found: jg.Validity, said: tuple[str, ...]) -> None:
+    assert all(words in found.verdict() for words in said)
+
+
+def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: Path) -> None:
+    command = "import sys; from jaxgran.cli.app import app; "
+    command += "app('where --restitution 0.7 --packing-fraction 0.6 --json'.split(), standalone_mode=False); "
+    command += "assert 'jax' not in sys.modules and 'scipy' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    printed, found = json.loads(done.stdout), jg.validity(0.7, 0.6)
+    assert printed["verdict"]["value"] == found.verdict()
+    for name in MEASURED:
+        assert printed[name]["value"] == pytest.approx(float(found.measured[name]))
+        assert printed[f"{name}_ci95"]["value"] == pytest.approx(float(found.measured_ci95[name]))
+
+
+@pytest.mark.parametrize(("alpha", "nu"), FLOWS)
+def test_the_command_says_the_verdict_and_every_average(alpha: float, nu: float, tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "where", "--restitution", str(alpha), "--packing-fraction", str(nu))
+    assert outcome.status == 0
+    assert jg.validity(alpha, nu).verdict() in outcome.out
+    assert all(name in outcome.out for name in (*MEASURED, "force_ratio"))
+
+
+def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> None:
+    """The committed coverage is that of the table in this package, and 95 % is within binomial error of it."""
+    fresh = json.loads((RESULTS / "reference_runs.json").read_text(encoding="utf-8"))["rows"]
+    found = reference.coverage(list(reference.judged(shipped_table(), fresh)))
+    for name, one in result["coverage"].items():
+        assert one == pytest.approx(found[name], abs=2e-3)
+        for kind in ("covered", "covered_narrow"):
+            within = round(found[name][kind] * len(fresh))
+            as_few = sum(comb(40, k) * 0.95**k * 0.05 ** (40 - k) for k in range(within + 1))
+            assert len(fresh) == 40
+            assert as_few > 0.025
+
+
+def test_what_pages_say_of_the_plane_follows_from_the_table(result: dict) -> None:
+    assert reference.plane(shipped_table()) == result["plane"]
+    page = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
+    plane = result["plane"]
+    worst, share = plane["worst_binary"], plane["0.1"]
+    assert f"{share['points_binary_within']} of the {plane['points_binary']} points" in page
+    assert f"{100 * share['share']:.0f} %" in page
+    assert f"{100 * plane['0.05']['share']:.0f} %" in page
+    assert f"{-100 * worst['error']:.0f} % too low" in page
