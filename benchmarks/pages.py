@@ -3,10 +3,18 @@
 A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a value with its standard error, and a loop
 over the rows of a result makes a table, so that neither can differ from the file. A name that a file does not have
 stops the build. Markdown needs braces for itself: comments of Jinja are ``{=# … #=}``.
+
+The README is filled in from ``docs/_build/README.md`` and committed, since it is read where no site is built:
+
+    python -m benchmarks.pages
 """
 
 import json
 import math
+import os
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -14,11 +22,13 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from benchmarks.output import RESULTS
+from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.results import open_map
 from jaxgran.model.display import with_error
+
+README = ROOT / "docs" / "_build" / "README.md"
 
 
 class Results:
@@ -180,6 +190,23 @@ def quotients(rows: Iterable[Mapping[str, float]], one: str, other: str) -> list
     return [row[one] / row[other] for row in rows]
 
 
+def peers_ratio(flow: Mapping[str, Any]) -> str:
+    """Time of soft discs in LAMMPS, with ten steps a contact, over that of jaxgran at the same error."""
+    return front.ratio(flow, "LAMMPS, 10 steps a contact", front.COST)
+
+
+def output_of_where(restitution: float, packing_fraction: float) -> str:
+    """The verdict and the averages that ``jaxgran where`` prints."""
+    command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
+    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxgran", *command.split()], capture_output=True, text=True, check=True, env=environment
+    )
+    verdict, rest = done.stdout.split("\n", 1)
+    lines = [line.rstrip() for line in rest.split("Enskog's contact pressure")[0].splitlines()]
+    return "\n".join([textwrap.fill(verdict, 110), "", *filter(None, lines)])
+
+
 ENVIRONMENT = jinja2.Environment(
     undefined=jinja2.StrictUndefined,
     trim_blocks=True,
@@ -196,10 +223,16 @@ ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVE
 ENVIRONMENT.globals |= {
     one.__name__: one for one in (abs, max, at, point, sig, percent, percent_pm, pm, duration, signed)
 }
-ENVIRONMENT.globals |= {one.__name__: one for one in (over, rms, found, flows_of, ranked, shares_of_clusters)}
+ENVIRONMENT.globals |= {
+    one.__name__: one for one in (peers_ratio, output_of_where, over, rms, found, flows_of, ranked, shares_of_clusters)
+}
 ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, quotients, farthest_from_one)}
 
 
 def filled(page: str) -> str:
     """A page with its numbers."""
     return ENVIRONMENT.from_string(page).render()
+
+
+if __name__ == "__main__":
+    (ROOT / "README.md").write_text(filled(README.read_text(encoding="utf-8")), encoding="utf-8")

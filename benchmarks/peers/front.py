@@ -69,7 +69,7 @@ def table(flows: list[dict]) -> str:
     for flow in flows:
         for curve in dict.fromkeys(row["curve"] for row in flow["rows"]):
             cells = [_time(*time_to_target(_rows(flow, curve), names)) for names in choices]
-            ratios = [_ratio(flow, curve, cost) for cost in (COST, "wall_seconds_per_strain")]
+            ratios = [ratio(flow, curve, cost) for cost in (COST, "wall_seconds_per_strain")]
             head = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
             lines.append(f"| {head} | {curve} | " + " | ".join(cells + ratios) + " |")
     return "\n".join(lines)
@@ -84,7 +84,7 @@ def _time(seconds: float, sign: str) -> str:
     return "not reached" if sign == ">" else f"{'< ' if sign == '<' else ''}{seconds:.2g}"
 
 
-def _ratio(flow: dict, curve: str, cost: str) -> str:
+def ratio(flow: dict, curve: str, cost: str) -> str:
     """Time of a curve over that of jaxgran, "~" where both have been run no cheaper.
 
     Where the dearest setting of a curve misses the target beyond its standard error, the target costs more than that.
