@@ -180,7 +180,7 @@ def _run(
             if callable(run.progress):
                 run.progress(float(np.sum(advance.steps)))
 
-        running = replicas(settings, "auto", workers, report, checkpoint, warnings.warn, run.scheduler, run.record)
+        running = replicas(settings, workers, report, checkpoint, run.scheduler, run.record)
         try:
             with closing(running):
                 for key, replica in running:
