@@ -5,9 +5,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
+from jaxgran.maps import batches
+from jaxgran.maps.replica import Key, Replica
+from jaxgran.maps.run_replicas import run_replicas
+from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import displacement
 from jaxgran.model.flow import ShearFlow
 
@@ -58,3 +63,10 @@ def assert_same_tally(one: Tally, two: Tally, rtol: float, but: tuple[str, ...] 
     for name in set(TABLE) - {*COUNTS, *OF_THE_SOLVER, *but}:
         first, second = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
         np.testing.assert_allclose(first, second, rtol=0, atol=rtol * np.max(np.abs(second)), err_msg=name)
+
+
+def in_batches(size: int, settings: MapSettings, **options: Any) -> dict[Key, Replica]:
+    """The replicas of a map that are run in batches of a given size."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batches, "batch_size", lambda *_: size)
+        return dict(run_replicas(settings, **options))

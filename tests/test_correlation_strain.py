@@ -1,4 +1,4 @@
-"""The memory of a flow: the longer of heating by the shear and of a sound wave across the cell."""
+"""The correlation strain of a flow: the longer of heating by the shear and of a sound wave across the cell."""
 
 import numpy as np
 import pytest
@@ -6,22 +6,24 @@ import pytest
 from jaxgran.sampling.correlation_strain import RELAXATION_STRAIN, flow_correlation_strain
 
 
-def memory(temperature=1.0, pressure=1.0, shear_stress=1.0, grains=400, side=20.0, shear_rate=1.0):
+def correlation_strain(temperature=1.0, pressure=1.0, shear_stress=1.0, grains=400, side=20.0, shear_rate=1.0):
     averages = {"granular_temperature": temperature, "pressure": pressure, "shear_stress": shear_stress}
     return flow_correlation_strain(averages, grains, grains, side**2, shear_rate)
 
 
-def test_memory_is_the_longer_of_heating_and_waves():
-    assert memory(temperature=30.0, shear_stress=2.0, pressure=100.0) == pytest.approx(15.0)
-    assert memory(temperature=1e-3, pressure=0.25) == pytest.approx(0.35 * 20 * 2)
+def test_correlation_strain_is_the_longer_of_heating_and_waves():
+    assert correlation_strain(temperature=30.0, shear_stress=2.0, pressure=100.0) == pytest.approx(15.0)
+    assert correlation_strain(temperature=1e-3, pressure=0.25) == pytest.approx(0.35 * 20 * 2)
 
 
-def test_memory_of_a_faster_shear_is_the_same():
+def test_correlation_strain_of_a_faster_shear_is_the_same():
     """Bagnold: stresses and temperature grow as the square of the shear rate."""
-    slow = memory(2.0, 0.5, 0.3)
-    assert memory(2.0 * 9, 0.5 * 9, 0.3 * 9, shear_rate=3.0) == pytest.approx(float(slow))
+    slow = correlation_strain(2.0, 0.5, 0.3)
+    assert correlation_strain(2.0 * 9, 0.5 * 9, 0.3 * 9, shear_rate=3.0) == pytest.approx(float(slow))
 
 
-def test_memory_is_never_below_that_of_the_contact_network():
-    assert memory(temperature=0.0, pressure=1e9) == RELAXATION_STRAIN
-    np.testing.assert_array_equal(memory(temperature=np.full(2, np.nan), pressure=np.nan), RELAXATION_STRAIN)
+def test_correlation_strain_is_never_below_that_of_the_contact_network():
+    assert correlation_strain(temperature=0.0, pressure=1e9) == RELAXATION_STRAIN
+    np.testing.assert_array_equal(
+        correlation_strain(temperature=np.full(2, np.nan), pressure=np.nan), RELAXATION_STRAIN
+    )

@@ -23,19 +23,19 @@ def sample_of(seed: int, growth: float) -> Sample:
 
 
 def test_a_drift_that_all_seeds_share_is_one() -> None:
-    assert is_drifting([sample_of(seed, 1.6) for seed in range(4)], memory=1.0)
-    assert is_drifting([sample_of(0, 1.6)], memory=1.0)
-    assert not is_drifting([sample_of(seed, 1.1) for seed in range(4)], memory=1.0)  # less than is accepted
+    assert is_drifting([sample_of(seed, 1.6) for seed in range(4)], correlation_strain=1.0)
+    assert is_drifting([sample_of(0, 1.6)], correlation_strain=1.0)
+    assert not is_drifting([sample_of(seed, 1.1) for seed in range(4)], correlation_strain=1.0)  # less than is accepted
 
 
 def test_seeds_that_drift_against_each_other_are_steady_together() -> None:
     opposite = [sample_of(seed, growth) for seed, growth in enumerate((1.6, 1 / 1.6, 1.6, 1 / 1.6))]
-    assert all(is_drifting([one], memory=1.0) for one in opposite)
-    assert not is_drifting(opposite, memory=1.0)
+    assert all(is_drifting([one], correlation_strain=1.0) for one in opposite)
+    assert not is_drifting(opposite, correlation_strain=1.0)
 
 
-def test_a_flow_that_remembers_long_may_wander() -> None:
-    assert not is_drifting([sample_of(0, 1.3)], memory=100.0)
+def test_a_flow_of_long_correlation_may_wander() -> None:
+    assert not is_drifting([sample_of(0, 1.3)], correlation_strain=100.0)
 
 
 def test_a_series_drifts_by_the_difference_of_its_halves() -> None:

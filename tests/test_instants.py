@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from flows import in_batches
 from synthetic import random_instant, random_replica, snapshot_of
 
 from jaxgran.analysis.instant import instant_of
@@ -19,7 +20,6 @@ from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, open_map, write_dataset
-from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.flow import ShearFlow
@@ -57,11 +57,11 @@ def window() -> Iterator[float]:
 
 @pytest.fixture(scope="module")
 def with_instants(window) -> dict[Key, Replica]:
-    return dict(run_replicas(replace(SETTINGS, snapshots=True), batch=2))
+    return in_batches(2, replace(SETTINGS, snapshots=True))
 
 
 def test_numbers_of_a_map_are_the_same_bits_with_and_without_instants(with_instants) -> None:
-    plain = dict(run_replicas(SETTINGS, batch=2))
+    plain = in_batches(2, SETTINGS)
     assert all(replica.instant is None for replica in plain.values())
     for key, replica in with_instants.items():
         jax.tree.map(np.testing.assert_array_equal, replica._replace(instant=None), plain[key])

@@ -119,7 +119,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(steady_state, "_chunk", chunk)
     monkeypatch.setattr(steady_state, "_averages", averages)
-    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
+    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
     start: Any = SimpleNamespace(side=np.full(5, 10.0))
     status = np.array([0, 0, 0, 0, Status.nonfinite])
     flow = stack([FLOWS[0]] * 5)
@@ -133,7 +133,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     np.testing.assert_allclose(end.strain, strain.sum(axis=0))
     assert 9 <= np.count_nonzero(strain[:, 0]) < 30
     assert np.all(strain[:, 1] > 0)
-    assert strain[0, 0] == 0.8  # a chunk is a quarter of the memory
+    assert strain[0, 0] == 0.8  # a chunk is a quarter of the correlation strain
 
 
 def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,7 +186,7 @@ def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch: pytest
     )
     flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
     state: Any = SimpleNamespace(side=np.array([6.0]))
-    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
+    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
     end = steady_state._until_steady(
         Batch(flow, Numerics(), state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None
     )
@@ -295,7 +295,7 @@ def test_a_replica_that_is_given_up_is_not_advanced_and_changes_no_other(batch) 
 def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch, monkeypatch) -> None:
     """Both replicas start with a strain of 0.64, in 32 blocks of two steps; the limit is four times that."""
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 2.56)
-    monkeypatch.setattr(steady_state, "LONGEST_MEMORIES", 0)
+    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
     _, short = sample_batch(batch, 0.64)
     errors = [relative_error(replica(short, k)) for k in (0, 1)]
     target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
@@ -311,7 +311,7 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch
 
 def test_sample_that_has_grown_is_the_sample_of_its_strain(batch, monkeypatch) -> None:
     monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
-    monkeypatch.setattr(steady_state, "LONGEST_MEMORIES", 0)
+    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
     _, grown = sample_batch(batch, 0.32, error=1e-9)
     _, whole = sample_batch(batch, 0.64)
     np.testing.assert_allclose(grown.tally.steps, whole.tally.steps)
@@ -327,16 +327,17 @@ def test_report_is_told_every_replica_step(batch) -> None:
 
 def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
-    monkeypatch.setattr(steady_state, "_memory", lambda batch, _: batch.memory)
-    ready = batch._replace(status=np.zeros(2, int), memory=np.array([0.2, 0.4]))
+    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))
     _, long = sample_batch(ready, None)
     np.testing.assert_allclose(np.sum(long.tally.duration, axis=1), [1.2, 2.4])
     end, _ = sample_batch(ready, 1.0)
     assert (end.status[0] == Status.short_sample, end.status[1] >= Status.short_sample) == (False, True)
 
 
-def test_a_preparation_shorter_than_the_memory_is_not_steady(batch) -> None:
-    assert np.all(batch.memory > 0.5) and np.all(batch.status == Status.not_steady)  # it took a strain of 0.5
+def test_a_preparation_shorter_than_the_correlation_strain_is_not_steady(batch) -> None:
+    assert np.all(batch.correlation_strain > 0.5)  # the strain that it took
+    assert np.all(batch.status == Status.not_steady)
 
 
 def test_hot_and_cold_starts_begin_at_their_share_of_the_expected_temperature(keys) -> None:

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from flows import in_batches
 from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_replica
@@ -22,7 +23,6 @@ from jaxgran.maps.parameters import RunParameters
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.results import choices_of, open_map
-from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.checks import InputError
@@ -57,7 +57,7 @@ def reported() -> list[Advance]:
 @pytest.fixture(scope="module")
 def results(settings, reported) -> dict[Key, Replica]:
     """The replicas of a map, run in pairs."""
-    return dict(run_replicas(settings, batch=2, report=reported.append))
+    return in_batches(2, settings, report=reported.append)
 
 
 def assert_same_bits(one: dict[Key, Replica], other: dict[Key, Replica]) -> None:
@@ -76,15 +76,14 @@ numbers = st.floats(0.0, 1.0)
         max_size=12,
     ),
     seeds=st.integers(1, 5),
-    batch=st.one_of(st.just("auto"), st.integers(1, 20)),
     workers=st.integers(1, 4),
 )
 def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_number_of_grains(
-    points, seeds: int, batch, workers: int
+    points, seeds: int, workers: int
 ) -> None:
     flows = [ShearFlow(*point) for point in points]
     settings: Any = SimpleNamespace(part=None, flows=lambda: flows, seeds=seeds, engine=None)
-    tasks = batches(settings, batch, workers)
+    tasks = batches(settings, workers)
     keys = [key for task in tasks for key in task]
     assert sorted(keys) == [(point, seed) for point in range(len(flows)) for seed in range(seeds)]
     assert all(len({flows[point].grains for point, _ in task}) == 1 for task in tasks)
@@ -94,10 +93,7 @@ def test_every_replica_runs_once_the_most_expensive_first_and_a_batch_has_one_nu
     ):
         costs = [predicted_cost(flows[point]) for point, _ in first]
         assert costs == sorted(costs, reverse=True)
-    if batch == "auto":
-        assert len(tasks) >= min(workers, len(keys))  # no worker is idle
-    else:
-        assert max(map(len, tasks)) <= batch
+    assert len(tasks) >= min(workers, len(keys))  # no worker is idle
 
 
 def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_number_of_steps() -> None:
@@ -110,7 +106,7 @@ def test_cost_of_strain_grows_with_density_and_dissipation_and_less_than_the_num
 
 
 def test_results_do_not_depend_on_the_size_of_the_batches(settings, results) -> None:
-    assert_same_bits(dict(run_replicas(settings, batch=1)), results)
+    assert_same_bits(in_batches(1, settings), results)
 
 
 def test_results_do_not_depend_on_the_company_and_the_order(settings, results) -> None:
@@ -132,7 +128,7 @@ def test_every_step_of_every_replica_is_reported(results, reported) -> None:
 
 def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> None:
     told: list[Advance] = []
-    assert_same_bits(dict(run_replicas(settings, batch=2, workers=2, report=told.append)), results)
+    assert_same_bits(in_batches(2, settings, workers=2, report=told.append), results)
     assert_every_step_is_reported(told)
 
 
@@ -199,7 +195,7 @@ def test_another_error_of_the_device_is_not_hidden(settings, monkeypatch: pytest
 
 
 def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(settings, results) -> None:
-    second = dict(run_replicas(replace(settings, seeds=1, first_seed=1), batch=2))
+    second = in_batches(2, replace(settings, seeds=1, first_seed=1))
     assert_same_bits(second, {(point, 0): results[point, 1] for point in range(2)})
 
 
@@ -271,7 +267,7 @@ def test_ratio_map_is_the_dataset_of_the_replicas(settings, results) -> None:
 
 def test_first_of_several_time_steps_has_the_numbers_of_a_map_at_it_alone(settings, results) -> None:
     some = replace(settings, timestep=(1e-3, 5e-4))
-    both = dict(run_replicas(some, batch=8))
+    both = in_batches(8, some)
     assert_same_bits({key: replica for key, replica in both.items() if key[0] < len(settings.flows())}, results)
     data, alone = map_dataset(some, both, {}), map_dataset(settings, results, {})
     xr.testing.assert_equal(data.isel(timestep=0), alone)

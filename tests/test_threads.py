@@ -110,7 +110,7 @@ def test_replicas_of_hours_end_within_a_second_of_ctrl_c(ctrl_c) -> None:
             threading.Timer(0.3, interrupt).start()  # in the middle of a block, of which a replica has 32
 
     with pytest.raises(KeyboardInterrupt):
-        list(run_replicas(ENDLESS, batch=1, workers=2, report=report))
+        list(run_replicas(ENDLESS, workers=2, report=report))
     assert time.monotonic() - sent[0] < SECOND
     computing = time.process_time()
     time.sleep(0.2)

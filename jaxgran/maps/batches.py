@@ -6,7 +6,6 @@ So no core waits long at the end. The numbers of a replica do not depend on its 
 import math
 from collections.abc import Container
 from heapq import heappop, heappush
-from typing import Literal
 
 import jax
 
@@ -66,20 +65,16 @@ def points_of_part(settings: MapSettings) -> list[int]:
     return sorted(shares[number - 1])
 
 
-def remaining_batches(
-    settings: MapSettings, size: int | Literal["auto"], workers: int, checkpoint: Checkpoint | None
-) -> list[list[Key]]:
+def remaining_batches(settings: MapSettings, workers: int, checkpoint: Checkpoint | None) -> list[list[Key]]:
     """The batches that a checkpoint does not have yet, the interrupted ones first."""
     if checkpoint is None:
-        return batches(settings, size, workers)
+        return batches(settings, workers)
     interrupted = checkpoint.journals()
     excluded = {*checkpoint.done, *(key for task in interrupted for key in task)}
-    return interrupted + batches(settings, size, workers, excluded)
+    return interrupted + batches(settings, workers, excluded)
 
 
-def batches(
-    settings: MapSettings, size: int | Literal["auto"], workers: int, without: Container[Key] = ()
-) -> list[list[Key]]:
+def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -> list[list[Key]]:
     """The replicas in batches of one number of grains and of similar cost, the most expensive first."""
     flows = settings.flows()
     costs = [predicted_cost(flow) for flow in flows]
@@ -89,7 +84,7 @@ def batches(
     for grains in {flow.grains: None for flow in flows}:
         points = [point for point in order if flows[point].grains == grains and point in chosen]
         keys = [(point, seed) for point in points for seed in range(settings.seeds) if (point, seed) not in without]
-        most = batch_size(grains, len(keys), workers) if size == "auto" and keys else size
+        most = batch_size(grains, len(keys), workers) if keys else 0
         alike: list[list[Key]] = []
         for key in keys:
             full = not alike or len(alike[-1]) == most

@@ -76,9 +76,8 @@ def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
     steps = _steps(flow)
     found: list[Instant] = []
     advance = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
-    advance(
-        flow, numerics, state, jnp.array([steps - 1], jnp.int32)
-    )  # a snapshot has the forces of the step that it begins
+    # one step less than snapshots: a snapshot has the forces of the step that it begins
+    advance(flow, numerics, state, jnp.array([steps - 1], jnp.int32))
     return averaged(found) if len(found) == steps else None
 
 

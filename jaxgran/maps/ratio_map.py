@@ -187,7 +187,7 @@ def _run(
             if callable(run.progress):
                 run.progress(float(np.sum(advance.steps)))
 
-        running = run_replicas(settings, "auto", workers, report, checkpoint, warnings.warn, run.scheduler, run.record)
+        running = run_replicas(settings, workers, report, checkpoint, run.scheduler, run.record)
         try:
             with closing(running):
                 for key, replica in running:

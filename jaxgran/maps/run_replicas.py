@@ -11,7 +11,6 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +38,9 @@ _REPEATED = Status.capacity, Status.nonfinite  # a jammed packing would be jamme
 
 def run_replicas(
     settings: MapSettings,
-    batch: int | Literal["auto"] = "auto",
     workers: int = 1,
     report: Callable[[Advance], None] | None = None,
     checkpoint: Checkpoint | None = None,
-    warn: Callable[[str], None] = warnings.warn,
     scheduler: str | None = None,
     record: AdvanceWrapper | None = None,
 ) -> Generator[tuple[Key, Replica | None]]:
@@ -51,17 +48,15 @@ def run_replicas(
 
     Args:
       settings: the map.
-      batch: number of replicas that run together, or "auto", see ``batch_size``.
       workers: number of threads; more than one only on a CPU. See ``in_threads`` for how they end.
       report: called after each advance.
       checkpoint: keeps the finished replicas. Replicas that it already has are neither run nor yielded.
-      warn: called with one sentence about each batch that is given up.
       scheduler: address of a Dask scheduler, whose workers run the batches instead of this process. They
         keep journals if they can access the folder of the checkpoint. ``report`` is then called after whole batches.
       record: wraps the function that advances a sampled batch, but not the one of its preparation. It has an effect
         only with one worker.
     """
-    tasks, flows = remaining_batches(settings, batch, workers, checkpoint), settings.flows()
+    tasks, flows = remaining_batches(settings, workers, checkpoint), settings.flows()
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
     report = report or (lambda _: None)
     if scheduler is not None:
@@ -73,7 +68,8 @@ def run_replicas(
     with closing(outcomes):
         for number, outcome in outcomes:
             if outcome is None:
-                warn(f"a batch has killed its workers too often: {_points(settings, tasks[number])} not measured.")
+                lost = _points(settings, tasks[number])
+                warnings.warn(f"a batch has killed its workers too often: {lost} not measured.", stacklevel=2)
                 yield from ((key, None) for key in tasks[number])
                 continue
             if checkpoint is not None:

@@ -1,8 +1,8 @@
-"""How long a flow remembers, in strain: what preparation, blocks, samples and error bars have to know.
+"""The correlation strain of a flow, which sets the strain of its preparation, blocks and sample, and its error bars.
 
-The memory is the strain of one independent sample. A series that decays exponentially over a strain s has a memory 2s.
-Two things last. The granular temperature follows the heating by the shear over a strain of nT/τ, thermal energy over
-shear stress. Waves of velocity and density as long as the cell decay over a strain that grows as its side L, about
+It is the strain of one independent sample: 2s for a correlation that decays exponentially over a strain s.
+Two processes are slow. The granular temperature follows the heating by the shear over a strain of nT/τ, thermal energy
+over shear stress. Waves of velocity and density as long as the cell decay over a strain that grows as its side L, about
 0.35 γ̇ L √(ρ/p): the time that a sound wave needs for a third of the cell. ``python -m benchmarks size_study`` compares
 this law with the correlation of measured series.
 """
@@ -14,15 +14,15 @@ from jax.typing import ArrayLike
 
 RELAXATION_STRAIN = 0.5  # strain in which the contact network adapts to a new time step
 FEWEST_CORRELATION_STRAINS = 4.0  # of a sample; a shorter one gets the status ``short_sample``
-SAMPLE_MEMORIES = 6.0  # of a sample whose strain is not given
+SAMPLE_CORRELATION_STRAINS = 6.0  # of a sample whose strain is not given
 LEAST_SAMPLE = 8.0  # its strain, at least
-_WAVE = 0.35  # memory of the longest waves, in L √(ρ/p)
+_WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
 
 
 def flow_correlation_strain(
     averages: Mapping[str, ArrayLike], grains: int, mass: ArrayLike, area: ArrayLike, shear_rate: ArrayLike
 ) -> np.ndarray:
-    """Strain over which a flow remembers: max(nT/τ, 0.35 γ̇ L √(ρ/p)), and at least that of the contact network.
+    """Correlation strain of a flow: max(nT/τ, 0.35 γ̇ L √(ρ/p)), and at least that of the contact network.
 
     Args:
       averages: granular_temperature, pressure and shear_stress.

@@ -15,21 +15,21 @@ _LARGEST_DRIFT = 0.2  # and this drift in ln T or ln P
 _CLUSTER_STRAIN = 1.0  # over which the clusters of a dissipative flow move; blocks within it are correlated
 
 
-def is_drifting(seeds: Sequence[Sample], memory: float) -> bool:
+def is_drifting(seeds: Sequence[Sample], correlation_strain: float) -> bool:
     """Whether ln P or ln T drifts from the first to the second half of the samples, averaged over the seeds.
 
     The means of the halves must differ by more than four standard errors and by more than 0.2. What one seed does for
-    itself is noise. Blocks are correlated at least as the memory of the flow says.
+    itself is noise. Blocks are correlated at least as the correlation strain of the flow says.
 
     Args:
       seeds: samples of one flow with NumPy arrays, of 16 blocks or a multiple.
-      memory: strain over which the flow remembers, see ``flow_correlation_strain``.
+      correlation_strain: that of the flow, see ``flow_correlation_strain``.
 
     Returns:
       Whether they drift; True if a value is not finite.
     """
     strain = np.mean([np.sum(one.tally.duration) * one.shear_rate for one in seeds])
-    correlation = float(np.exp(-strain / _BLOCKS / max(_CLUSTER_STRAIN, memory / 2)))
+    correlation = float(np.exp(-strain / _BLOCKS / max(_CLUSTER_STRAIN, correlation_strain / 2)))
     series = np.mean([_series(one) for one in seeds], axis=0)
     return any(drifts(one, correlation) for one in series)
 

@@ -49,7 +49,7 @@ from jaxgran.sampling.correlation_strain import (
     FEWEST_CORRELATION_STRAINS,
     LEAST_SAMPLE,
     RELAXATION_STRAIN,
-    SAMPLE_MEMORIES,
+    SAMPLE_CORRELATION_STRAINS,
     flow_correlation_strain,
 )
 from jaxgran.sampling.packing import pack, require_room
@@ -65,7 +65,7 @@ from jaxgran.sampling.timestep import (
 from jaxgran.statistics import drift
 
 LONGEST_STRAIN = 256.0  # of a sample that is extended until its errors are small
-LONGEST_MEMORIES = 32.0  # the same limit in correlation strains, where it is longer
+LONGEST_CORRELATION_STRAINS = 32.0  # the same limit in correlation strains, where it is longer
 _SHORTENING_STRAIN = 0.1  # strain at each time step between the coarse and the final one
 _SHORTEST_CHUNK = 0.75  # strain of a chunk
 _FEWEST_CHUNKS = 12  # before the first test for a steady state
@@ -90,7 +90,7 @@ class Batch(NamedTuple):
     state: State
     status: Int[np.ndarray, " replicas"]
     strain: Float[np.ndarray, " replicas"]  # before the sample
-    memory: Float[np.ndarray, " replicas"]  # correlation strain
+    correlation_strain: Float[np.ndarray, " replicas"]
 
 
 def prepare(
@@ -181,13 +181,13 @@ def prepare_batch(
     predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
     each = for_replicas(numerics, len(status))
     batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
-    batch = batch._replace(memory=_memory(batch, predictions))
+    batch = batch._replace(correlation_strain=_correlation_strain(batch, predictions))
     if equilibrate is None:
         batch = _until_steady(batch, advance)
     elif equilibrate > 0:
         batch = _sheared(batch, np.full(len(status), equilibrate), advance, measure=True)
     if equilibrate is not None:
-        too_short = equilibrate < batch.memory
+        too_short = equilibrate < batch.correlation_strain
         batch = batch._replace(status=np.maximum(batch.status, np.where(too_short, Status.not_steady, Status.ok)))
     return _shortened(batch, flow, advance)
 
@@ -205,11 +205,11 @@ def sample_batch(
         doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 correlation strains. None samples ``strain`` only.
     """
     strains = (
-        np.maximum(LEAST_SAMPLE, SAMPLE_MEMORIES * batch.memory)
+        np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * batch.correlation_strain)
         if strain is None
-        else np.full_like(batch.memory, strain)
+        else np.full_like(batch.correlation_strain, strain)
     )
-    longest = np.maximum(LONGEST_STRAIN, LONGEST_MEMORIES * batch.memory)
+    longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * batch.correlation_strain)
     batch, tally = _blocks(batch, strains, BLOCKS, advance)
     while error is not None:
         worst = np.array([relative_error(one) for one in _as_sample(batch, tally)])
@@ -220,8 +220,8 @@ def sample_batch(
         strains = np.where(extended, 2 * strains, strains)
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
-    batch = batch._replace(memory=_memory(batch, _averages(batch, sample._total)))
-    short = strains < FEWEST_CORRELATION_STRAINS * batch.memory
+    batch = batch._replace(correlation_strain=_correlation_strain(batch, _averages(batch, sample._total)))
+    short = strains < FEWEST_CORRELATION_STRAINS * batch.correlation_strain
     of_length = np.where(short, Status.short_sample, Status.ok)
     return batch._replace(status=np.maximum.reduce([batch.status, of_length, sample.status])), sample
 
@@ -349,11 +349,11 @@ def _sheared(batch: Batch, strain: np.ndarray, advance: AdvanceBatch, measure: b
     for steps in steps_of_blocks(steps_of_strain(batch.flow, strain), chunks).T:
         batch, tally = _advanced(batch, steps, advance)
         if measure:
-            batch = batch._replace(memory=_memory(batch, _averages(batch, tally)))
+            batch = batch._replace(correlation_strain=_correlation_strain(batch, _averages(batch, tally)))
     return batch._replace(strain=batch.strain + strain)
 
 
-def _memory(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
+def _correlation_strain(batch: Batch, averages: Mapping[str, np.ndarray]) -> np.ndarray:
     """Correlation strain of each flow of a batch, see ``flow_correlation_strain``."""
     masses = np.ascontiguousarray(batch.state.grains.masses)  # or the order of the sum would depend on their place
     mass, area = np.sum(masses, axis=-1), np.asarray(batch.state.side) ** 2
@@ -368,13 +368,13 @@ def _until_steady(batch: Batch, advance: AdvanceBatch) -> Batch:
         waiting = steady | (batch.status >= GIVEN_UP)
         if waiting.all():
             break
-        chunk = np.maximum(_SHORTEST_CHUNK, batch.memory / 4)
-        correlation = np.exp(-2 * chunk / batch.memory)
+        chunk = np.maximum(_SHORTEST_CHUNK, batch.correlation_strain / 4)
+        correlation = np.exp(-2 * chunk / batch.correlation_strain)
         batch, tally = _chunk(batch, np.where(waiting, 0, chunk), advance)
         batch = batch._replace(strain=batch.strain + np.where(waiting, 0, chunk))
         means = _averages(batch, tally)
         if chunks <= _MEASURING_CHUNKS:
-            batch = batch._replace(memory=_memory(batch, means))
+            batch = batch._replace(correlation_strain=_correlation_strain(batch, means))
         record.append(np.log(np.stack([means["granular_temperature"], means["pressure"]])))
         if chunks >= _FEWEST_CHUNKS:
             late = np.stack(record[chunks // 3 :])
