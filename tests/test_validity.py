@@ -1,6 +1,7 @@
 """What the reference table says of a flow: surfaces against algebra, series against the theory, verdicts, intervals."""
 
 import json
+import re
 import subprocess
 import sys
 from math import comb
@@ -22,6 +23,7 @@ from jaxgran.theory import gaussian_moments, navier_stokes
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 ALPHAS, NUS = st.floats(0.1, 0.98), st.floats(0.1, 0.82)
+SHARES = ("covered_narrow", "covered")
 FLOWS = [(0.7, 0.6), (0.98, 0.5), (0.1, 0.82), (0.5, 0.75), (0.3, 0.2)]
 
 
@@ -107,7 +109,8 @@ def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     )
     for one in (compiled, mapped):
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(one), strict=True):
-            np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=1e-8, atol=1e-12)
+            # a variance is the difference of two numbers of order 100, and those of factors are of order 1e-6
+            np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"])
@@ -115,10 +118,10 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     def of(x):
         return jg.validity(x[0], x[1]).measured[name]
 
-    at, step = jnp.array([0.45, 0.71]), 1e-5
+    at, step = jnp.array([0.45, 0.71]), 1e-4
     exact = jax.grad(of)(at)
     by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(2)]
-    np.testing.assert_allclose(exact, by_steps, rtol=1e-6)
+    np.testing.assert_allclose(exact, by_steps, rtol=1e-5)  # truncation of step² over the range of the map squared
 
 
 def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
@@ -205,3 +208,22 @@ def test_what_pages_say_of_the_plane_follows_from_the_table(result: dict) -> Non
     assert f"{100 * share['share']:.0f} %" in page
     assert f"{100 * plane['0.05']['share']:.0f} %" in page
     assert f"{-100 * worst['error']:.0f} % too low" in page
+    where = (RESULTS.parents[1] / "docs" / "how-to" / "where.md").read_text(encoding="utf-8")
+    for name, one in result["coverage"].items():
+        shares = [f"{one[key]:.3g}".replace("1", "1.00", 1) if one[key] == 1 else f"{one[key]:.3g}" for key in SHARES]
+        assert f"| {name.replace('_', ' ')} | {shares[0]} | {shares[1]} | {100 * one['rms']:.1f} %" in where
+    head = shipped_table().head
+    counts = [head[f"points with the pressure of {name} within 10 %"] for name in reference.THEORIES]
+    assert (
+        f"at {counts[0]} of {plane['points']} points (Garzó and Dufty {counts[1]}, Jenkins and Richman {counts[2]})"
+        in where
+    )
+
+
+@pytest.mark.parametrize(("alpha", "nu"), FLOWS)
+def test_the_page_quotes_the_verdicts(alpha: float, nu: float) -> None:
+    where = (RESULTS.parents[1] / "docs" / "how-to" / "where.md").read_text(encoding="utf-8")
+    verdict = jg.validity(alpha, nu).verdict()
+    row = next(line for line in where.splitlines() if line.startswith(f"| {alpha:g}, {nu:g} |"))
+    for part in re.split(r"[;:(]", verdict)[:-1]:
+        assert part.split(" in the contact")[0].strip(" )") in row
