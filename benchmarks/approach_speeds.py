@@ -148,6 +148,7 @@ def row(nu: float, alpha: float, timestep: float, seeds: list[Sample]) -> dict:
             {
                 "collisions_over_independent": float(rate / theory["powers"][0]),
                 "collisional_temperature_over_independent": float(temperature / (powers[2] / 2)),
+                "pairs_independent_over_equilibrium": pairs_of_theory(theory, still),
                 "shape_independent": float(powers[3] * powers[1] / powers[2] ** 2),
                 "exponent_independent": exponent(float(powers[3] * powers[1] / powers[2] ** 2)),
                 "density": density.tolist(),
@@ -237,6 +238,14 @@ def independent(tensor: np.ndarray, nu: float, shear_rate: float = 1.0, polydisp
     flux = GRID * np.einsum("ijk,ijkx->x", weight, np.exp(-(z**2) / 2) / (np.sqrt(2 * np.pi) * spread[:, None]))
     powers = simpson(flux * GRID ** POWERS[:, None], GRID) * temperature ** (POWERS / 2)
     return {"powers": powers, "x": GRID, "density": flux / powers[0]}
+
+
+def pairs_of_theory(theory: Sums, still: float) -> list[float]:
+    """The result of ``independent`` as pairs at contact over those of equilibrium in ``SPEEDS``, see ``by_speed``."""
+    x = theory["x"]
+    here = [(x > low) & (x < high) for low, high in SPEEDS]
+    rate = theory["powers"][0] / still
+    return [float(rate * np.sum(theory["density"][k] / x[k]) / np.sum(np.exp(-(x[k] ** 2) / 2))) for k in here]
 
 
 def exponent(shape: float) -> float:

@@ -20,6 +20,7 @@ from benchmarks.approach_speeds import (
     independent,
     midpoints,
     observe,
+    pairs_of_theory,
     sums_of,
 )
 from jaxgran.statistics import standard_errors
@@ -34,6 +35,7 @@ def test_speeds_without_shear_are_those_of_equilibrium_for_any_sizes(temperature
     found = independent(temperature * np.eye(2), 0.6, shear_rate=0.0)
     x = found["x"]
     np.testing.assert_allclose(found["density"], x * np.exp(-(x**2) / 2), atol=1e-9)
+    np.testing.assert_allclose(pairs_of_theory(found, found["powers"][0]), 1, rtol=1e-5)
     moments = found["powers"] / found["powers"][0]
     np.testing.assert_allclose(moments, RAYLEIGH * temperature ** (np.arange(4) / 2), rtol=1e-5)
 

@@ -4,7 +4,7 @@ Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` o
 from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
 ``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
 the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPTIONS COMMAND}`` for its options, and ``{BENCHMARKS}`` for the table of
-``benchmarks/registry.py``. Pages are templates, see ``benchmarks/pages.py``.
+``benchmarks/registry.py``. Pages are templates, see ``benchmarks/pages.py``. A line between two ``$$`` is a formula of TeX.
 """
 
 import importlib
@@ -32,6 +32,7 @@ sys.path.insert(0, str(ROOT))
 from benchmarks import pages  # noqa: E402 - not installed, but beside the package
 CHARTS = ROOT / "benchmarks" / "results"
 CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.png)"[^>]*>)')
+MATHEMATICS = re.compile(r"^\$\$(.+)\$\$$", re.MULTILINE)
 PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "security.md": "SECURITY.md"}
 
 
@@ -61,7 +62,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
-    return markdown
+    return MATHEMATICS.sub(lambda formula: typeset(formula[1]), markdown)
+
+
+def typeset(formula: str) -> str:
+    """A formula of TeX as MathML, which browsers draw without a script."""
+    from latex2mathml.converter import convert
+
+    return f'<div class="formula">{convert(formula, display="block")}</div>'
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
