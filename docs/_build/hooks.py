@@ -83,7 +83,7 @@ def observables() -> str:
     """A table of what is measured."""
     rows = ["| name | unit | group in the file of a map | meaning |", "| --- | --- | --- | --- |"]
     for name, one in OBSERVABLES.items():
-        unit, group = ("–" if text in ("1", "/") else text for text in (one.unit, one.group))
+        unit, group = "–" if one.unit == "1" else one.unit, "root" if one.group == "/" else one.group
         rows.append(f"| `{name}` | {unit} | {group} | {one.meaning} |")
     return "\n".join(rows)
 
