@@ -45,7 +45,8 @@ def loads_of_grains(
 ) -> tuple[Float[Array, "grains 2"], Float[Array, " grains"]]:
     """Total impulse on every grain, and how many of its contacts have one; one scatter costs less than two."""
     along, loaded = contacts.normals * impulses[:, None], (impulses > 0).astype(impulses.dtype)[:, None]
-    total = _gathered(contacts, *(jnp.concatenate([x, loaded], axis=1) for x in (along, -along)), grains)
+    first, second = (jnp.concatenate([x, loaded], axis=1) for x in (along, -along))
+    total = _gathered(contacts, first, second, grains)
     return total[:, :2], total[:, 2]
 
 
