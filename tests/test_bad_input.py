@@ -242,7 +242,8 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
     pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
     assert jg.contact_residuals(pair, [0.5]).natural_map == 0
     points = jg.predict(known_closure(), [0.5, 0.6], [0.7, 0.6])
-    assert points.pressure[1] == jg.predict(known_closure(), 0.6, 0.6).pressure
+    arrays = jg.predict(known_closure(), np.array([0.5, 0.6]), np.array([0.7, 0.6]))
+    assert points.pressure.tolist() == arrays.pressure.tolist()
     with pytest.raises(WouldRun):
         jg.fields_at(SEEN, [[1.0, 2.0]], jg.lucy(1.0))
 

@@ -193,6 +193,7 @@ def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder
         if option.startswith("--") and parameter.name not in ("help", "scheduler"):
             wrong = f"{option}=" if getattr(parameter, "is_flag", False) else f"{option}=no\nsuch"
             needed = {"run": FLOW.split()[1:], "map": [], "info": [], "merge": ["text.nc", "-o", "a.nc"]}
+            needed |= {"where": ["--restitution", "0.5", "--packing-fraction", "0.5"]}
             needed = needed.get(name, ["text.nc"])
             outcome = jaxgran(folder, name, *needed, wrong)
             assert outcome.status == 2 and "Traceback" not in outcome.err, outcome

@@ -1,6 +1,5 @@
 """The file of tracked discs is what its command makes, and the page about it shows what the fit prints."""
 
-import json
 import re
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pandas as pd
 import pytest
 from command_line import jaxgran
 
-from benchmarks.output import RESULTS
 from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 
 ROOT = Path(__file__).parents[1]
@@ -79,20 +77,3 @@ def test_the_page_shows_the_fits_with_less(row: tuple[str, ...], folder: Path) -
     same_fit(dict(zip(names, shown, strict=True)), printed | {"collisions, rejected": used})
     low, high = numbers_of(shown[1])
     assert low <= RESTITUTION <= high
-
-
-def test_the_page_shows_the_fits_of_dumps_of_lammps() -> None:
-    result = json.loads((RESULTS / "fit_lammps.json").read_text(encoding="utf-8"))
-    for row in result["rows"]:
-        for name, of in row["fits"].items():
-            told = "refused" if "bias" not in of else f"{1e3 * of['bias']:.2f} ± {1e3 * of['bias_stderr']:.2f}"
-            held = "–" if "bias" not in of else f"{of['held']} of {of['fits']}"
-            assert f"| {row['contact_over_frame']:.2g} | {words(name)} | {told.replace('-', '−')} | " in PAGE
-            assert f" | {held} |" in PAGE
-
-
-def words(name: str) -> str:
-    name = name.replace("--every", "--stride")  # its name when the results were made
-    options = name.removesuffix(", positions alone")
-    shown = f"`{options}`" if options else "none"
-    return shown + (", positions alone" if options != name else "")
