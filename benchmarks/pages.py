@@ -27,6 +27,7 @@ from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.results import open_map
 from jaxgran.model.display import with_error
+from jaxgran.reference.table import FACTORS
 
 README = ROOT / "docs" / "_build" / "README.md"
 
@@ -117,9 +118,11 @@ def _map(file: str) -> Any:
 
 def point(file: str, name: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
     """A variable of a map at a point, and its standard error; 0 for a prediction, which has none."""
-    data, chosen = _map(file), {"restitution": restitution, "packing_fraction": packing_fraction}
-    error = float(data[f"{name}_stderr"].sel(chosen)) if f"{name}_stderr" in data else 0.0
-    return float(data[name].sel(chosen)), error
+    group, _, variable = name.rpartition("/")
+    data = _map(file)[group] if group else _map(file)
+    chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
+    error = float(data[f"{variable}_stderr"].sel(chosen)) if f"{variable}_stderr" in data else 0.0
+    return float(data[variable].sel(chosen)), error
 
 
 def percent_pm(value_and_error: Iterable[float]) -> str:
@@ -172,6 +175,12 @@ def farthest_from_one(rows: Iterable[Mapping[str, float]], name: str) -> Mapping
     return max(rows, key=lambda row: abs(row[name] - 1))
 
 
+def product_of(rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)) -> float:
+    """Measured contact pressure over Enskog's: the product of its factors in a flow of ``enskog_factors``, N = 256."""
+    row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
+    return math.prod(row[f"pressure_{name}"][0] for name in FACTORS)
+
+
 def ranked(summary: Iterable[Mapping[str, Any]], group: str, target: float) -> list[Mapping[str, Any]]:
     """The solvers that solve the median problem of a group to a target, the fastest first."""
     rows = [row for row in summary if row["group"] == group and row["target"] in (target, 0) and row["seconds"]]
@@ -220,13 +229,12 @@ ENVIRONMENT.filters |= {
     "g": lambda value: f"{float(value):g}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
-ENVIRONMENT.globals |= {
-    one.__name__: one for one in (abs, max, at, point, sig, percent, percent_pm, pm, duration, signed)
-}
-ENVIRONMENT.globals |= {
-    one.__name__: one for one in (peers_ratio, output_of_where, over, rms, found, flows_of, ranked, shares_of_clusters)
-}
-ENVIRONMENT.globals |= {one.__name__: one for one in (differences_in_sigmas, quotients, farthest_from_one)}
+for _functions in (
+    (abs, max, at, found, flows_of, point, quotients, over, rms, ranked, farthest_from_one),
+    (sig, percent, percent_pm, pm, duration, signed),
+    (peers_ratio, output_of_where, product_of, shares_of_clusters, differences_in_sigmas),
+):
+    ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
 
 
 def filled(page: str) -> str:

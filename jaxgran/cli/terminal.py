@@ -141,9 +141,9 @@ def stop_interrupted(sentence: str) -> NoReturn:
 def counted(items: Sequence[_T], words: str) -> Iterator[_T]:
     """The items one by one, with a progress bar on a terminal; ``words`` is its title."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
-    columns = TextColumn(words), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
+    columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield from bar.track(items)
