@@ -222,7 +222,7 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     chosen: dict[str, Any] = {one.name: _plain(getattr(asked, one.name), one.metadata["option"].kind) for one in rows}
     for name in ("restitution", "packing_fraction"):
         if _are_numbers((chosen[name],)):
-            chosen[name] = (float(chosen[name]),)
+            chosen[name] = (chosen[name],)
     by_point = chosen["grains_by_point"]
     if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
         chosen["grains"] = max(by_point)

@@ -3,7 +3,7 @@
 import hashlib
 import re
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -61,7 +61,7 @@ def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 
 def require_units(units: Any, names: Collection[str]) -> None:
     """Raise an InputError unless these are units by the names of what a function observes."""
-    if not isinstance(units, Mapping) or not all(isinstance(x, str) for one in units.items() for x in one):
+    if not isinstance(units, dict) or not all(isinstance(x, str) for one in units.items() for x in one):
         raise refused("observe_units", units, 'must be a dictionary of units by name, such as {"torque": "1"}')
     unknown = [name for name in units if name not in names]
     if unknown:
