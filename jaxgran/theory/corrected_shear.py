@@ -33,7 +33,7 @@ class CorrelationLaws:
     length                   (3,)   a, b, k of L = 1 + a (1 − α)² y + b (1 − α) y^k, y = 1/(1 − ν/ν_J), in mean
                                     diameters
     length_stderr            (3,)   their standard errors
-    pairs                    (3,)   c, e, m of R = [1 + c (1 − α)⁵] [1 + e (1 − α)^(1/3) y^m], pairs at contact
+    pairs                    (3,)   c, e, m of R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m), pairs at contact
                                     that carry the stress over those of equilibrium
     pairs_stderr             (3,)   their standard errors
     jamming_fraction         ()     ν_J
@@ -174,7 +174,7 @@ def correlation_length(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Ar
 
 
 def pair_factor(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
-    """R = [1 + c (1 − α)⁵] [1 + e (1 − α)^(1/3) y^m] with y = 1/(1 − ν/ν_J)."""
+    """R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m) with y = 1/(1 − ν/ν_J)."""
     crowding, loss = 1 / (1 - nu / laws.jamming_fraction), 1 - alpha
     return (1 + laws.pairs[0] * loss**5) * (1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2])
 
