@@ -73,6 +73,13 @@ BENCHMARKS = (
         ("paper_claims.json",),
     ),
     Benchmark(
+        "reference_map",
+        "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
+        (120, 1),
+        ("reference.nc",),
+        (Option("--seeds", "number of seeds, those that are kept included", int),),
+    ),
+    Benchmark(
         "reference_runs",
         "What are stresses and temperatures at random points that no table of `jg.validity` has seen?",
         (10, 0.5),
