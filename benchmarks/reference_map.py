@@ -7,11 +7,16 @@ seed makes all errors smaller.
 
     python -m benchmarks reference_map             # two hours on two cores
     python -m benchmarks reference_map --seeds 4   # two seeds more
+    python -m benchmarks reference_map --sizes     # 20 loose flows of 400 to 25,600 grains at dt = 5e-4
     python -m benchmarks reference_map --quick     # a plane of 3 × 3 points, 64 and 100 grains, a minute
+
+The flows of several sizes say how averages approach those of a large system (``python -m benchmarks size_limits``).
 """
 
 from pathlib import Path
 from typing import Any
+
+import xarray as xr
 
 import jaxgran as jg
 from benchmarks.output import RESULTS, Output
@@ -33,16 +38,27 @@ def parameters(quick: bool) -> dict[str, Any]:
     return plane | {"timestep": 5e-4 if quick else 1e-4, "seeds": 1}
 
 
-def run(output: Output, seeds: int = 2, folder: Path = KEPT) -> None:
-    """Map the seeds that are missing, and write all of them as one map, ``reference.nc``."""
+def parameters_of_sizes(quick: bool) -> dict[str, Any]:
+    """The arguments of ``ratio_map`` for several numbers of grains."""
+    plane = {"restitution": (0.1, 0.3, 0.5, 0.7, 0.9), "packing_fraction": (0.2, 0.4, 0.6, 0.7)}
+    sizes = {"grains": (64, 256)} if quick else {"grains": (400, 1600, 6400, 25600)}
+    return plane | sizes | {"timestep": 5e-4, "seeds": 1}
+
+
+def run(output: Output, seeds: int = 2, sizes: bool = False, folder: Path = KEPT) -> None:
+    """Map what is missing. Write all seeds as one map, ``reference.nc``; or several sizes, ``reference_sizes.nc``."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
     about = {"command": "python -m benchmarks reference_map", "commit": output.hardware["commit"]}
-    maps = []
-    for seed in range(seeds):
-        kept = folder / f"seed_{seed}.nc"
-        made = {"output": kept, "resume": True, "progress": True, "workers": usable_cores(), "attributes": about}
-        maps.append(jg.ratio_map(**parameters(output.quick), first_seed=seed, **made))
-    merged = jg.merge_maps(maps)
-    merged.attrs |= {"command": about["command"]}
+
+    def made(name: str, **chosen: Any) -> xr.DataTree:
+        kept = {"output": folder / f"{name}.nc", "resume": True, "progress": True, "attributes": about}
+        return jg.ratio_map(**chosen, **kept, workers=usable_cores())
+
+    if sizes:
+        data = made("sizes", **parameters_of_sizes(output.quick))
+        write_dataset(data, output.path("reference", "_sizes.nc"))
+        return
+    merged = jg.merge_maps([made(f"seed_{k}", **parameters(output.quick), first_seed=k) for k in range(seeds)])
+    merged.attrs["command"] = about["command"]
     write_dataset(merged, output.path("reference", ".nc"))

@@ -76,8 +76,11 @@ BENCHMARKS = (
         "reference_map",
         "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
         (120, 1),
-        ("reference.nc",),
-        (Option("--seeds", "number of seeds, those that are kept included", int),),
+        ("reference.nc", "reference_sizes.nc"),
+        (
+            Option("--seeds", "number of seeds, those that are kept included", int),
+            Option("--sizes", "maps loose flows of several numbers of grains instead", bool),
+        ),
     ),
     Benchmark(
         "reference_runs",
