@@ -7,7 +7,7 @@ seed makes all errors smaller.
 
     python -m benchmarks reference_map             # two hours on two cores
     python -m benchmarks reference_map --seeds 4   # two seeds more
-    python -m benchmarks reference_map --sizes     # 20 loose flows of 400 to 25,600 grains at dt = 5e-4
+    python -m benchmarks reference_map --sizes     # 20 loose flows of 400 to 25,600 grains, 15 dense ones up to 6400
     python -m benchmarks reference_map --quick     # a plane of 3 × 3 points, 64 and 100 grains, a minute
 
 The flows of several sizes say how averages approach those of a large system (``python -m benchmarks size_limits``).
@@ -38,15 +38,17 @@ def parameters(quick: bool) -> dict[str, Any]:
     return plane | {"timestep": 5e-4 if quick else 1e-4, "seeds": 1}
 
 
-def parameters_of_sizes(quick: bool) -> dict[str, Any]:
-    """The arguments of ``ratio_map`` for several numbers of grains."""
-    plane = {"restitution": (0.1, 0.3, 0.5, 0.7, 0.9), "packing_fraction": (0.2, 0.4, 0.6, 0.7)}
-    sizes = {"grains": (64, 256)} if quick else {"grains": (400, 1600, 6400, 25600)}
-    return plane | sizes | {"timestep": 5e-4, "seeds": 1}
+def parameters_of_sizes(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` for several numbers of grains, of loose and of dense flows."""
+    shared = {"restitution": (0.1, 0.3, 0.5, 0.7, 0.9), "seeds": 1}
+    loose = {"packing_fraction": (0.2, 0.4, 0.6, 0.7), "grains": (400, 1600, 6400, 25600), "timestep": 5e-4}
+    dense = {"packing_fraction": (0.74, 0.77, 0.8), "grains": (400, 1600, 6400), "timestep": 2e-4}
+    few = {"grains": (64, 256)} if quick else {}
+    return {"loose": shared | loose | few, "dense": shared | dense | few}
 
 
 def run(output: Output, seeds: int = 2, sizes: bool = False, folder: Path = KEPT) -> None:
-    """Map what is missing. Write all seeds as one map, ``reference.nc``; or several sizes, ``reference_sizes.nc``."""
+    """Map what is missing, and write all seeds as one map, ``reference.nc``, or maps of several sizes."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
     about = {"command": "python -m benchmarks reference_map", "commit": output.hardware["commit"]}
@@ -56,8 +58,8 @@ def run(output: Output, seeds: int = 2, sizes: bool = False, folder: Path = KEPT
         return jg.ratio_map(**chosen, **kept, workers=usable_cores())
 
     if sizes:
-        data = made("sizes", **parameters_of_sizes(output.quick))
-        write_dataset(data, output.path("reference", "_sizes.nc"))
+        for name, chosen in parameters_of_sizes(output.quick).items():
+            write_dataset(made(name, **chosen), output.path("reference", f"_sizes_{name}.nc"))
         return
     merged = jg.merge_maps([made(f"seed_{k}", **parameters(output.quick), first_seed=k) for k in range(seeds)])
     merged.attrs["command"] = about["command"]

@@ -76,7 +76,7 @@ BENCHMARKS = (
         "reference_map",
         "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
         (120, 1),
-        ("reference.nc", "reference_sizes.nc"),
+        ("reference.nc", "reference_sizes_loose.nc", "reference_sizes_dense.nc"),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option("--sizes", "maps loose flows of several numbers of grains instead", bool),
