@@ -2,15 +2,15 @@
 
 Packing fractions are 0.01 apart where averages change fast, and restitutions are close where grains cluster. Loose
 flows depend on N and have 6400 grains, dense ones 1600. Every seed is a map of its own, sampled over six correlation
-strains of each flow, and kept beside the results; all are merged. So a run that was stopped goes on, and another
-seed makes all errors smaller.
+strains of each flow, and kept beside the results; all are merged. So a run that was stopped goes on, and another seed
+makes all errors smaller. Flows of several sizes say how averages approach those of a large system
+(``python -m benchmarks size_limits``), and a map at dt = 1e-3 what becomes of the force ratio.
 
-    python -m benchmarks reference_map             # two hours on two cores
-    python -m benchmarks reference_map --seeds 4   # two seeds more
-    python -m benchmarks reference_map --sizes     # 20 loose flows of 400 to 25,600 grains, 15 dense ones up to 6400
-    python -m benchmarks reference_map --quick     # a plane of 3 × 3 points, 64 and 100 grains, a minute
-
-The flows of several sizes say how averages approach those of a large system (``python -m benchmarks size_limits``).
+    python -m benchmarks reference_map                 # two hours on two cores
+    python -m benchmarks reference_map --seeds 4       # two seeds more
+    python -m benchmarks reference_map --part sizes    # 20 loose flows of up to 25,600 grains and 15 dense ones
+    python -m benchmarks reference_map --part coarse   # dt = 1e-3
+    python -m benchmarks reference_map --quick         # a plane of 3 × 3 points, 64 and 100 grains, a minute
 """
 
 from pathlib import Path
@@ -23,44 +23,56 @@ from benchmarks.output import RESULTS, Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.results import write_dataset
 
+PARTS = ("plane", "sizes", "coarse")
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
 DENSE = (0.72, 0.73, 0.74, 0.75, 0.76, 0.77, 0.78, 0.79, 0.8, 0.81, 0.82, 0.83)
 
 
-def parameters(quick: bool) -> dict[str, Any]:
+def plane(quick: bool) -> dict[str, Any]:
     """The arguments of ``ratio_map`` for one seed."""
     alphas, loose, dense = ((0.1, 0.5, 0.9), (0.5, 0.7), (0.8,)) if quick else (RESTITUTIONS, LOOSE, DENSE)
     sizes = (100, 64) if quick else (6400, 1600)
     grains = [size for nus, size in zip((loose, dense), sizes, strict=True) for _ in nus for _ in alphas]
-    plane = {"restitution": alphas, "packing_fraction": loose + dense, "grains_by_point": grains}
-    return plane | {"timestep": 5e-4 if quick else 1e-4, "seeds": 1}
+    return {
+        "restitution": alphas,
+        "packing_fraction": loose + dense,
+        "grains_by_point": grains,
+        "timestep": 5e-4 if quick else 1e-4,
+    }
 
 
-def parameters_of_sizes(quick: bool) -> dict[str, dict[str, Any]]:
+def sizes(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` for several numbers of grains, of loose and of dense flows."""
-    shared = {"restitution": (0.1, 0.3, 0.5, 0.7, 0.9), "seeds": 1}
+    alphas: dict[str, Any] = {"restitution": (0.1, 0.3, 0.5, 0.7, 0.9)}
     loose = {"packing_fraction": (0.2, 0.4, 0.6, 0.7), "grains": (400, 1600, 6400, 25600), "timestep": 5e-4}
     dense = {"packing_fraction": (0.74, 0.77, 0.8), "grains": (400, 1600, 6400), "timestep": 2e-4}
     few = {"grains": (64, 256)} if quick else {}
-    return {"loose": shared | loose | few, "dense": shared | dense | few}
+    return {"sizes_loose": alphas | loose | few, "sizes_dense": alphas | dense | few}
 
 
-def run(output: Output, seeds: int = 2, sizes: bool = False, folder: Path = KEPT) -> None:
-    """Map what is missing, and write all seeds as one map, ``reference.nc``, or maps of several sizes."""
+def coarse(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters form."""
+    alphas, nus = [a for a in RESTITUTIONS if a <= 0.7], [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.8]
+    chosen: dict[str, Any] = {"restitution": alphas, "packing_fraction": nus, "grains": 1000, "timestep": 1e-3}
+    return {"coarse": chosen | ({"restitution": (0.1, 0.5), "packing_fraction": (0.6,), "grains": 64} if quick else {})}
+
+
+def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT) -> None:
+    """Map what is missing of a part, and write it: all seeds as one map, ``reference.nc``."""
     folder = folder.with_name(f"{folder.name}_quick") if output.quick else folder
     folder.mkdir(parents=True, exist_ok=True)
     about = {"command": "python -m benchmarks reference_map", "commit": output.hardware["commit"]}
 
     def made(name: str, **chosen: Any) -> xr.DataTree:
         kept = {"output": folder / f"{name}.nc", "resume": True, "progress": True, "attributes": about}
-        return jg.ratio_map(**chosen, **kept, workers=usable_cores())
+        return jg.ratio_map(**chosen, **kept, seeds=1, workers=usable_cores())
 
-    if sizes:
-        for name, chosen in parameters_of_sizes(output.quick).items():
-            write_dataset(made(name, **chosen), output.path("reference", f"_sizes_{name}.nc"))
+    if part == "plane":
+        merged = jg.merge_maps([made(f"seed_{k}", **plane(output.quick), first_seed=k) for k in range(seeds)])
+        merged.attrs["command"] = about["command"]
+        write_dataset(merged, output.path("reference", ".nc"))
         return
-    merged = jg.merge_maps([made(f"seed_{k}", **parameters(output.quick), first_seed=k) for k in range(seeds)])
-    merged.attrs["command"] = about["command"]
-    write_dataset(merged, output.path("reference", ".nc"))
+    for name, chosen in (sizes if part == "sizes" else coarse)(output.quick).items():
+        write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

@@ -76,10 +76,14 @@ BENCHMARKS = (
         "reference_map",
         "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
         (120, 1),
-        ("reference.nc", "reference_sizes_loose.nc", "reference_sizes_dense.nc"),
+        ("reference.nc", *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "coarse"))),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
-            Option("--sizes", "maps loose flows of several numbers of grains instead", bool),
+            Option(
+                "--part",
+                "the plane, flows of several sizes, or a coarse time step",
+                choices=("plane", "sizes", "coarse"),
+            ),
         ),
     ),
     Benchmark(
