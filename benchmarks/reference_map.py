@@ -54,7 +54,7 @@ def sizes(quick: bool) -> dict[str, dict[str, Any]]:
 
 def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters form."""
-    alphas, nus = [a for a in RESTITUTIONS if a <= 0.7], [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.8]
+    alphas, nus = [a for a in RESTITUTIONS if a <= 0.7], [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.79]
     chosen: dict[str, Any] = {"restitution": alphas, "packing_fraction": nus, "grains": 1000, "timestep": 1e-3}
     return {"coarse": chosen | ({"restitution": (0.1, 0.5), "packing_fraction": (0.6,), "grains": 64} if quick else {})}
 
