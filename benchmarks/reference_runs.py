@@ -1,9 +1,9 @@
 """Fresh flows at random points of the reference map, which its intervals are judged on.
 
-40 points, uniform in ln(1 − α) and ν over the range of the paper's map; N = 2000, dt = 1e-4, one run per point sampled
-over six correlation strains. Nothing is fitted to them.
+40 points, uniform in ln(1 − α) and ν over the range of the map; N = 6400 up to ν = 0.71 and 2500 above, dt = 1e-4, one
+run per point sampled over six correlation strains. Nothing is fitted to them.
 
-    python -m benchmarks reference_runs           # 10 minutes on two cores
+    python -m benchmarks reference_runs           # 20 minutes on one core
     python -m benchmarks reference_runs --quick   # 3 points of 64 grains, dt = 1e-3, under a minute
 """
 
@@ -15,12 +15,12 @@ import xarray as xr
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.maps.presets import PRESETS
+from benchmarks.reference_map import DENSE, LOOSE, RESTITUTIONS
 from jaxgran.maps.schema import flattened
 
 OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature", "force_ratio")
-FULL = {"points": 40, "grains": 2000, "timestep": 1e-4}
-QUICK = {"points": 3, "grains": 64, "timestep": 1e-3}
+FULL = {"points": 40, "grains": [6400, 2500], "timestep": 1e-4}  # of loose and of dense flows
+QUICK = {"points": 3, "grains": [64, 64], "timestep": 1e-4}
 FIRST_SEED = 9000  # of no map
 
 
@@ -36,20 +36,19 @@ def run(output: Output) -> None:
 
 
 def random_points(count: int) -> Iterator[tuple[float, float]]:
-    """Random restitutions and packing fractions in the range of the paper's map."""
-    rng, paper = np.random.default_rng(38), PRESETS["paper"]
-    alphas, nus = np.array(paper["restitution"]), np.array(paper["packing_fraction"])
+    """Random restitutions and packing fractions in the range of the reference map."""
+    rng, nus = np.random.default_rng(38), (LOOSE[0], DENSE[-1])
     for _ in range(count):
-        alpha = 1 - np.exp(rng.uniform(np.log(1 - alphas[-1]), np.log(1 - alphas[0])))
-        yield round(float(alpha), 4), round(float(rng.uniform(nus[0], nus[-1])), 4)
+        alpha = 1 - np.exp(rng.uniform(*np.log(1 - np.array(RESTITUTIONS)[[-1, 0]])))
+        yield round(float(alpha), 4), round(float(rng.uniform(*nus)), 4)
 
 
-def fresh_rows(points: int, grains: int, timestep: float) -> Iterator[dict]:
+def fresh_rows(points: int, grains: list[int], timestep: float) -> Iterator[dict]:
     """Averages, standard errors and the bounds of timestep and tolerance of every point."""
     for k, (alpha, nu) in enumerate(random_points(points)):
-        flow = {"restitution": [alpha], "packing_fraction": [nu], "grains": grains, "timestep": timestep}
-        data = jg.ratio_map(**flow, preset="paper", first_seed=FIRST_SEED + k, workers=1)
-        yield {"restitution": alpha, "packing_fraction": nu, **_row(data)}
+        one = {"restitution": alpha, "packing_fraction": nu, "grains": grains[nu > (LOOSE[-1] + DENSE[0]) / 2]}
+        data = jg.ratio_map(**one, timestep=timestep, seeds=1, first_seed=FIRST_SEED + k, workers=1)
+        yield one | _row(data)
 
 
 def _row(data: xr.DataTree) -> dict[str, float]:

@@ -89,7 +89,7 @@ BENCHMARKS = (
     Benchmark(
         "reference_runs",
         "What are stresses and temperatures at random points that no table of `jg.validity` has seen?",
-        (10, 0.5),
+        (20, 0.5),
         ("reference_runs.json",),
     ),
     Benchmark(

@@ -1,20 +1,27 @@
 """What are pressure, shear stress and temperatures of a large system, and how are they approached?
 
-Reads the flows of ``python -m benchmarks size_study`` with ν ≤ 0.7 and N ≥ 400 and fits three laws of two parameters to
-each average by weighted least squares: x∞ − a N^(−1/3), which long waves of velocity with an energy ∝ k^(−4/3) give in
-two dimensions, x∞ − a N^(−1/2), which k^(−1) gives, and a + b ln N, which has no limit and which k^(−2) gives. χ² over
-all flows says which laws the averages allow. The interval of a limit spans the 95 % intervals of the two laws that
-have one.
+Reads the flows of ``python -m benchmarks size_study`` and ``reference_map --part sizes`` with N ≥ 400. In two
+dimensions long waves of velocity with an energy ∝ k^(−β) make an average approach its limit as N^(−s), s = 1 − β/2, or
+grow as ln N if β = 2. First each flow with ν ≤ 0.7 has a limit and an amplitude of its own, and all share the exponent:
+χ² says which exponents the averages allow. Then all flows share one law of the missing part of an average,
+
+    x(N) = x∞ [1 − (a + b (1 − α)) exp(m (ν − 0.5)) w(ν) (N/1600)^(−s)],        w = min(1, (ν_w − ν)/0.1),
+
+where w ends the waves towards jamming. Standard errors are larger by the root of the reduced χ², as a profile of
+velocity that lasts longer than a sample is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
 
 import json
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares, minimize_scalar
 from scipy.stats import chi2
 
+import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 
@@ -22,72 +29,134 @@ AVERAGES = ("pressure", "shear_stress", "granular_temperature", "local_granular_
 LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "N^(-1/3)": lambda grains: grains ** (-1 / 3),
     "N^(-1/2)": lambda grains: grains**-0.5,
-    "ln N": np.log,
+    "ln N": lambda grains: -np.log(grains),
 }
-WITH_LIMIT = ("N^(-1/3)", "N^(-1/2)")
+EXPONENTS = np.arange(0.02, 1.5, 0.02)
 LARGEST_FRACTION, LEAST_GRAINS = 0.7, 400
+WIDTH = 0.1  # of the packing fractions over which waves end
+START = (0.4, 0.01, 0.1, 0.5, 0.84)  # s, a, b, m, ν_w
 
 
-def fitted(grains: np.ndarray, values: np.ndarray, errors: np.ndarray, law: str) -> tuple[float, float, float]:
-    """The constant of a law, which is the limit where it has one, its standard error, and χ²."""
-    design = np.stack([np.ones(len(grains)), LAWS[law](grains)], axis=1)
-    constants, covariance, chi_squared = weighted_fit(design, values, errors)
-    return constants[0], np.sqrt(covariance[0, 0]), chi_squared
+class Flow(NamedTuple):
+    """One average of one flow at several N."""
 
-
-def fits_of(rows: list[dict], average: str) -> dict:
-    """One average of one flow: its limit by each law with a standard error, the interval of both, and χ²."""
-    grains = np.array([row["grains"] for row in rows], float)
-    values, errors = np.array([row[average] for row in rows]).T
-    fits = {law: fitted(grains, values, errors, law) for law in LAWS}
-    ends = [fits[law][0] + sign * 1.96 * fits[law][1] for law in WITH_LIMIT for sign in (-1, 1)]
-    return {
-        "largest": [float(grains[-1]), values[-1], errors[-1]],
-        "limit": {law: list(fits[law][:2]) for law in WITH_LIMIT},
-        "interval": [min(ends), max(ends)],
-        "chi_squared": {law: fits[law][2] for law in LAWS},
-        "freedom": len(rows) - 2,
-    }
-
-
-def limits(study: list[dict]) -> list[dict]:
-    """A row for each loose flow of the study and each average."""
-    chosen = [row for row in study if row["packing_fraction"] <= LARGEST_FRACTION and row["grains"] >= LEAST_GRAINS]
-    flows = sorted({(row["restitution"], row["packing_fraction"]) for row in chosen})
-    return [
-        {
-            "restitution": alpha,
-            "packing_fraction": nu,
-            "average": average,
-            **fits_of([row for row in chosen if (row["restitution"], row["packing_fraction"]) == (alpha, nu)], average),
-        }
-        for alpha, nu in flows
-        for average in AVERAGES
-    ]
-
-
-def law_totals(rows: list[dict]) -> list[dict]:
-    """χ² of each law over all flows, with the probability of a larger one."""
-    found = []
-    for average in AVERAGES:
-        here = [row for row in rows if row["average"] == average]
-        freedom = sum(row["freedom"] for row in here)
-        total = {law: sum(row["chi_squared"][law] for row in here) for law in LAWS}
-        probability = {law: float(chi2.sf(x, freedom)) for law, x in total.items()}
-        found.append({"average": average, "freedom": freedom, "chi_squared": total, "probability": probability})
-    return found
+    restitution: float
+    packing_fraction: float
+    grains: np.ndarray
+    values: np.ndarray
+    stderrs: np.ndarray
 
 
 def run(output: Output) -> None:
     """Fit, print the tables of the page on the number of grains, and write them as JSON."""
-    study = json.loads((RESULTS / "size_study.json").read_text())
-    rows = limits(study["flows"])
-    laws = law_totals(rows)
-    for law in laws:
-        print(law["average"], law["freedom"], {name: round(float(x), 1) for name, x in law["chi_squared"].items()})
+    rows = [*json.loads((RESULTS / "size_study.json").read_text())["flows"], *rows_of_maps()]
+    laws, limits = {}, []
+    for average in AVERAGES:
+        flows = flows_of(rows, average)
+        loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
+        laws[average] = {"exponents": exponents(loose), "law": law_of(flows)}
+        limits += [{"average": average, **one} for one in limits_of(loose, laws[average]["exponents"]["interval"])]
+        print(average, rounded(laws[average], 4))
+    output.write_rows("size_limits", {"laws": rounded(laws, 5)}, "rows", rounded(limits, 5))
+
+
+def rows_of_maps() -> list[dict[str, Any]]:
+    """The points of the maps of several sizes, as rows of the study."""
+    rows = []
+    for name in ("loose", "dense"):
+        data = jg.open_map(RESULTS / f"reference_sizes_{name}.nc")
+        chosen = [*AVERAGES, *(f"{average}_stderr" for average in AVERAGES)]
+        frame = data.to_dataset()[chosen].to_dataframe().reset_index()
+        for one in frame.to_dict("records"):
+            row = {axis: one[axis] for axis in ("restitution", "packing_fraction", "grains")}
+            rows.append(row | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES} | {"source": name})
+    return rows
+
+
+def flows_of(rows: list[dict[str, Any]], average: str) -> list[Flow]:
+    """The flows of some rows, each with its sizes of at least 400 grains."""
+    kept: dict[tuple, list] = {}
     for row in rows:
-        each = ", ".join(f"{law}: {value:.4g} ± {error:.2g}" for law, (value, error) in row["limit"].items())
-        low, high = row["interval"]
-        print(f"{row['restitution']:4g} {row['packing_fraction']:4g} {row['average']}: {each}; {low:.4g} to {high:.4g}")
-    head = {"study": study["hardware"]["commit"], "laws": rounded(laws, 5)}
-    output.write_rows("size_limits", head, "rows", rounded(rows, 5))
+        if row["grains"] >= LEAST_GRAINS:
+            key = row.get("source"), row["restitution"], row["packing_fraction"]
+            kept.setdefault(key, []).append([row["grains"], *row[average]])
+    return [Flow(alpha, nu, *np.array(some, float).T) for (_, alpha, nu), some in kept.items() if len(some) > 2]
+
+
+def fitted(flow: Flow, shape: np.ndarray) -> tuple[float, float, float, float]:
+    """x∞ and amplitude of x∞ − c × shape, the standard error of x∞, and χ²."""
+    design = np.stack([np.ones(len(shape)), -shape], axis=1)
+    constants, covariance, chi_squared = weighted_fit(design, flow.values, flow.stderrs)
+    return constants[0], constants[1], np.sqrt(covariance[0, 0]), chi_squared
+
+
+def exponents(flows: list[Flow]) -> dict[str, Any]:
+    """χ² of the three laws and of the best exponent that all flows share, with its 95 % interval."""
+
+    def total(s: float) -> float:
+        return sum(fitted(flow, flow.grains**-s)[3] for flow in flows)
+
+    freedom = sum(len(flow.grains) - 2 for flow in flows)
+    chi_squared = {name: sum(fitted(flow, law(flow.grains))[3] for flow in flows) for name, law in LAWS.items()}
+    best = minimize_scalar(total, bounds=(EXPONENTS[0], EXPONENTS[-1]), method="bounded")
+    scale = max(1.0, best.fun / (freedom - 1))
+    allowed = EXPONENTS[np.array([total(s) for s in EXPONENTS]) < best.fun + 3.84 * scale]
+    return {
+        "flows": len(flows),
+        "freedom": freedom,
+        "chi_squared": chi_squared,
+        "probability": {name: float(chi2.sf(x / scale, freedom)) for name, x in chi_squared.items()},
+        "best": [best.x, best.fun],
+        "interval": [allowed[0], allowed[-1]],
+    }
+
+
+def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
+    """For each flow the limit by the exponents at both ends of their interval, and the 95 % interval of both."""
+    found = []
+    for flow in flows:
+        ends = [fitted(flow, flow.grains**-s) for s in interval]
+        bounds = [one[0] + sign * 1.96 * one[2] for one in ends for sign in (-1, 1)]
+        found.append(
+            {
+                "restitution": flow.restitution,
+                "packing_fraction": flow.packing_fraction,
+                "largest": [flow.grains[-1], flow.values[-1], flow.stderrs[-1]],
+                "limit": [list(one[::2]) for one in ends],
+                "interval": [min(bounds), max(bounds)],
+            }
+        )
+    return found
+
+
+def missing_part(constants: np.ndarray, flow: Flow) -> np.ndarray:
+    """The missing part of an average over its limit, at every N of a flow."""
+    s, a, b, m, end = constants
+    waves = (a + b * (1 - flow.restitution)) * np.exp(m * (flow.packing_fraction - 0.5))
+    return waves * np.clip((end - flow.packing_fraction) / WIDTH, 0, 1) * (flow.grains / 1600) ** -s
+
+
+def law_of(flows: list[Flow]) -> dict[str, Any]:
+    """The constants of the law that all flows share, their standard errors and correlations, and χ²."""
+
+    def residuals(constants: np.ndarray) -> np.ndarray:
+        found = []
+        for flow in flows:
+            shape = (1 - missing_part(constants, flow)) / flow.stderrs
+            scaled = flow.values / flow.stderrs
+            found.append(shape * (shape @ scaled) / (shape @ shape) - scaled)
+        return np.concatenate(found)
+
+    lowest, highest = (0.05, 0, 0, -3, 0.76), (1.5, 1, 2, 10, 0.9)
+    starts = [(s, *START[1:]) for s in (0.15, 0.4, 0.7)]
+    fits = [least_squares(residuals, start, bounds=(lowest, highest), x_scale="jac") for start in starts]
+    best = min(fits, key=lambda one: one.cost)
+    freedom = best.fun.size - len(flows) - best.x.size
+    covariance = np.linalg.pinv(best.jac.T @ best.jac) * max(1.0, 2 * best.cost / freedom)
+    return {
+        "flows": len(flows),
+        "constants": best.x.tolist(),
+        "stderrs": np.sqrt(np.diag(covariance)).tolist(),
+        "chi_squared": 2 * best.cost,
+        "freedom": freedom,
+    }
