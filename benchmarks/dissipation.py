@@ -1,12 +1,13 @@
 """How far Enskog's dissipation rate is from the measured one, and the theory that follows from a law of it.
 
-From the map of the paper (N = 1000, dt = 1e-5): the dissipation rate Γ, which is the power of the shear in a steady
-flow, Enskog's Γ_E at the measured temperature tensor scaled to the local temperature, and the lengths L = Γ_E/Γ and
-L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p. Laws of L up to ν = 0.75, and laws of L′ and p/p_E for all flows, are
-fitted to this map, with each restitution or packing fraction left out in turn, and judged on a map of 30 other flows
-(N = 400, dt = 3e-4), which also judges the temperature and the stresses of ``corrected_shear``.
+From the reference map (N = 6400 and 1600, dt = 1e-4): the dissipation rate Γ, which is the power of the shear in a
+steady flow, Enskog's Γ_E at the measured temperature tensor scaled to the local temperature, and the lengths L = Γ_E/Γ
+and L′ = (Γ_E/p_E)/(Γ/p) with the contact pressure p; and the same from the map of the paper (N = 1000, dt = 1e-5). Laws
+of L up to ν = 0.75, and laws of L′ and p/p_E for all flows, are fitted to the reference map, with each restitution or
+packing fraction left out in turn, and judged on the paper's map and on one of 30 other flows (N = 1600, dt = 3e-4),
+which also judge the temperature and the stresses of ``corrected_shear``.
 
-    python -m benchmarks dissipation           # two minutes on two cores
+    python -m benchmarks dissipation           # four minutes on two cores
     python -m benchmarks dissipation --quick   # judged on smaller flows, one minute
 """
 
@@ -38,7 +39,7 @@ from jaxgran.theory.steady_shear import contact_value
 JUDGED = {
     "restitution": (0.15, 0.35, 0.55, 0.75, 0.95),
     "packing_fraction": (0.15, 0.35, 0.48, 0.58, 0.68, 0.77),
-    "grains": 400,
+    "grains": 1600,
     "seeds": 1,
     "timestep": 3e-4,
 }
@@ -55,6 +56,7 @@ PREDICTED = {
 corrected = jax.jit(jax.vmap(lambda laws, alpha, nu: corrected_shear(alpha, nu, laws=laws), (None, 0, 0)))
 DENSEST = 0.75  # packing fraction up to which laws of L are fitted
 MODERATE = (0.3, 0.7)  # packing fractions between which errors of pressure and temperature are compared
+LENGTHS = ("alpha", "nu", "dissipation", "dissipation_error", "length_from_pressure", "length_from_pressure_error")
 WITHIN = (0.05, 0.1, 0.2)  # relative errors of the theory that are counted
 THEORY = ("pressure", "shear_stress", "granular_temperature")
 DRAWN = (0.1, 0.3, 0.5, 0.7, 0.9)  # restitutions
@@ -64,36 +66,44 @@ Points = dict[str, np.ndarray]  # numbers of the points of a map, each (points,)
 
 def run(output: Output) -> None:
     """Compare, fit, judge, print, and write JSON and PNG."""
-    tree = jg.open_map(RESULTS / "paper.nc")
-    data = flattened(tree)
-    another = flattened(jg.ratio_map(**JUDGED | (SMALLER if output.quick else {}), workers=usable_cores()))
-    points, judged = compared(data), compared(another)
+    tree = jg.open_map(RESULTS / "reference.nc")
+    another = jg.ratio_map(**JUDGED | (SMALLER if output.quick else {}), workers=usable_cores())
+    maps = {"map": tree, "paper": jg.open_map(RESULTS / "paper.nc"), "judged_on": another}
+    points, paper, judged = (compared(flattened(one)) for one in maps.values())
     result = {
         "counts": counts(points),
+        "counts_of_paper": counts(paper),
         "errors_of_theory": errors_of_theory(points),
-        "balance": balance(data),
+        "balance": balance(flattened(tree)),
         "laws": laws_of_length(points, judged),
-        "corrected_theory": corrected_theory(tree, points, judged),
+        "corrected_theory": corrected_theory(tree, points, {"paper": paper, "judged_on": judged}),
     }
     for name, one in result.items():
         print(name, *(f"  {key}: {rounded(x, 4)}" for key, x in one.items()), sep="\n")
     print("   ν     α        Γ/Γ_E             L′           L′√chaos   binary   chaos")
-    rows, judged_rows = (
+    rows, paper_rows, judged_rows = (
         [{name: rounded(float(x[k]), 4) for name, x in some.items()} for k in range(some["alpha"].size)]
-        for some in (points, judged)
+        for some in (points, paper, judged)
     )
     for one in rows:
         print(
             "{nu:5.2f}{alpha:6.2f}{dissipation:8.3f} ± {dissipation_error:.3f}{length_from_pressure:9.3f} ± "
             "{length_from_pressure_error:.3f}{times_root_chaos:9.3f}{binary:9.3f}{chaos:8.3f}".format(**one)
         )
-    maps = {
-        name: {"points": some["nu"].size, "grains": int(x.attrs["grains"]), "timestep": float(x.attrs["timestep"])}
-        for name, x, some in (("map", data, points), ("judged_on", another, judged))
+    heads = {
+        name: {"points": some["nu"].size, "timestep": float(one.attrs["timestep"])} | sizes_of(one)
+        for (name, one), some in zip(maps.items(), (points, paper, judged), strict=True)
     }
-    content = maps | rounded(result, 4) | {"judged_points": [keep(one) for one in judged_rows]}
+    content = heads | rounded(result, 4) | {"judged_points": [keep(one) for one in judged_rows]}
+    content |= {"paper_points": [{name: one[name] for name in LENGTHS} for one in paper_rows]}
     output.write_rows("dissipation", content, "points", rows)
     output.write_picture(draw(points, judged, fitted_laws(points)[0]), "dissipation")
+
+
+def sizes_of(data: xr.DataTree) -> dict[str, int]:
+    """The smallest and the largest number of grains of a map."""
+    sizes = np.ravel(data.attrs.get("grains_by_point", data.attrs["grains"]))
+    return {"fewest_grains": int(sizes.min()), "most_grains": int(sizes.max())}
 
 
 def keep(row: dict[str, float]) -> dict[str, float]:
@@ -257,9 +267,10 @@ def misfits(laws: CorrelationLaws, points: Points) -> dict[str, np.ndarray]:
     }
 
 
-def corrected_theory(data: xr.DataTree, points: Points, judged: Points) -> dict:
+def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points]) -> dict:
     """The laws, and errors with an inner restitution or packing fraction, or the densest, left out, and elsewhere."""
     laws, of_fit = fitted_laws(points)
+    judged = others["judged_on"]
     found: dict = {
         "laws": {
             **{name: np.asarray(getattr(laws, name)).tolist() for name in ("length", "length_stderr")},
@@ -287,7 +298,7 @@ def corrected_theory(data: xr.DataTree, points: Points, judged: Points) -> dict:
         "length_and_pairs": laws,
     }
     closure = jg.fit_closure(data)
-    for name, some in (("fitted_map", points), ("judged_on", judged)):
+    for name, some in {"fitted_map": points, **others}.items():
         within = {"all": some["nu"] > 0, "to_0.75": some["nu"] <= DENSEST, "core": in_core(some)}
         prediction = jg.predict(closure, some["alpha"], some["nu"])
         errors = {key: misfits(one, some) for key, one in variants.items()} | {

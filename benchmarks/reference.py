@@ -1,16 +1,15 @@
-"""The table from which ``jg.validity`` answers, made from a map; and whether its intervals hold.
+"""The table from which ``jg.validity`` answers, made from the reference map; and whether its intervals hold.
 
-A map with one number of grains, one time step and the factors of Enskog's pressure becomes ``averages.csv`` in
-``jaxgran/reference``: every average with its standard error and the bound on its other errors, and the shape of the
-Gaussian process that interpolates it, by maximum likelihood. The best of three theories, whose pressure is within 10 %
-at most points, becomes a Chebyshev series in ``theory.csv``. Then the intervals are judged: on points of the map that
-are left out, and on the fresh flows of ``python -m benchmarks reference_runs``. A second map adds the line of the force
-ratio at another time step to the figure.
+The map becomes ``averages.csv`` in ``jaxgran/reference``: every average with its standard error and the bound on its
+other errors, and the shape of the Gaussian process that interpolates it, by maximum likelihood. Stresses, temperatures
+and dissipation rate are extrapolated to a large system (``sampling.budget.SIZE_LAWS``), and the error of that is in the
+bound; force ratio and factors are those of the map's numbers of grains. The best of three theories, whose pressure is
+within 10 % at most points, becomes a Chebyshev series in ``theory.csv``, and so does the corrected theory. Then the
+intervals are judged: on points of the map that are left out, and on the fresh flows of ``python -m benchmarks
+reference_runs``. The maps of the paper and of a coarse time step give the force ratio at other time steps.
 
-    jaxgran map --preset paper --timestep 1e-4 --no-snapshots --output other.nc
-    python -m benchmarks reference --other other.nc      # from benchmarks/results/paper.nc, in half a minute
-    python -m benchmarks reference map.nc                # from another map
-    python -m benchmarks reference --quick               # into files named _quick and a folder of the output
+    python -m benchmarks reference              # from benchmarks/results/reference.nc, in two minutes
+    python -m benchmarks reference --quick      # into files named _quick and a folder of the output
 """
 
 import json
@@ -30,6 +29,7 @@ from jaxgran.maps.schema import flattened
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.surface import Shape, coordinates
 from jaxgran.reference.table import (
+    CORRECTED,
     FACTORS,
     FOLDER,
     MEASURED,
@@ -41,6 +41,8 @@ from jaxgran.reference.table import (
     theory_of,
     write_columns,
 )
+from jaxgran.sampling.budget import SIZE_LAWS, SIZE_SPREAD, jamming_error
+from jaxgran.theory.corrected_shear import corrected_shear
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.navier_stokes import garzo_dufty, jenkins_richman
 
@@ -49,15 +51,16 @@ TERMS = 20  # of the Chebyshev series along each coordinate
 MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range
 START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
 BOUNDED_BY = {"dissipation_rate": "shear_stress"}  # its power is what is dissipated
+SOURCE, OTHERS = "reference.nc", ("reference_coarse.nc", "paper.nc")
 
 
-def run(output: Output, dataset: Path | None = None, other: Path | None = None) -> None:
+def run(output: Output) -> None:
     """Make the table, judge its intervals, draw the figure, and write ``reference`` as JSON and PNG."""
-    source = RESULTS / "paper.nc" if dataset is None else dataset
     folder = output.folder / "reference_quick" if output.quick else FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    others = [] if other is None else [jg.open_map(other)]
-    make_table(jg.open_map(source), others, folder, {"map": source.name, "table commit": output.hardware["commit"]})
+    others = [jg.open_map(RESULTS / name) for name in OTHERS]
+    made_from = {"map": SOURCE, "table commit": output.hardware["commit"]}
+    make_table(jg.open_map(RESULTS / SOURCE), others, folder, made_from)
     table = read_table(folder)
     fresh = json.loads((RESULTS / "reference_runs.json").read_text())
     rows = list(judged(table, fresh["rows"]))
@@ -76,20 +79,30 @@ def run(output: Output, dataset: Path | None = None, other: Path | None = None) 
 def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_from: dict[str, Any]) -> None:
     """Write both files of the table of a map into a folder."""
     flat = flattened(data).stack(point=("packing_fraction", "restitution"))
-    flat = flat.isel(point=np.flatnonzero(np.isfinite(flat["pressure"].values)))
+    finite = np.flatnonzero(np.isfinite(flat["pressure"].values))
+    flat = flat.isel(point=finite)
     columns = {name: flat[name].values for name in ("restitution", "packing_fraction")}
+    where = *columns.values(), flat["point_grains"].values
+    columns["grains"] = where[-1]
     paths = {name: name for name in (*MEASURED, RATIO)} | {"dissipation_rate": "stresses/dissipation_rate"}
     paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS}
     for name, path in paths.items():
         columns |= {name: flat[path].values, f"{name}_stderr": flat[f"{path}_stderr"].values}
         bounded = BOUNDED_BY.get(name, name)
         if f"{bounded}_ci95" in flat:
-            parts = flat[f"{bounded}_ci95"].drop_sel(error_source=["total", "sampling"])
-            bound = np.sqrt((parts**2).sum("error_source").values)
+            sources = ["timestep", "tolerance", *(["size"] if name == RATIO else [])]
+            bound = np.sqrt((flat[f"{bounded}_ci95"].sel(error_source=sources) ** 2).sum("error_source").values)
             columns[f"{name}_bound"] = bound * columns[name] / flat[bounded].values
+        if name in MEASURED:
+            missing = SIZE_LAWS[bounded].missing(*where)
+            of_size = np.hypot(SIZE_SPREAD * missing, jamming_error(*where[1:])) * columns[name]
+            columns[f"{name}_bound"] = np.hypot(columns[f"{name}_bound"], of_size)
+            columns |= {f"{name}{end}": columns[f"{name}{end}"] / (1 - missing) for end in ("", "_stderr", "_bound")}
     for other in others:
         name = f"{RATIO}_at_{float(other.attrs['timestep']):g}"
-        at_points = flattened(other).stack(point=("packing_fraction", "restitution")).sel(point=flat.point)
+        plane = {axis: data[axis].values for axis in ("packing_fraction", "restitution")}
+        ratios = flattened(other)[[RATIO, f"{RATIO}_stderr"]].reindex(plane, method="nearest", tolerance=1e-6)
+        at_points = ratios.stack(point=("packing_fraction", "restitution")).isel(point=finite)
         columns |= {name: at_points[RATIO].values, f"{name}_stderr": at_points[f"{RATIO}_stderr"].values}
         paths[name] = RATIO
     theory, within = best_theory(columns)
@@ -99,9 +112,10 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
     table_of_terms = {"first": first, "second": second, **{k: v.ravel() for k, v in series.coefficients.items()}}
     about = {"contents": "Chebyshev series of ln(prediction) in sqrt(1 - alpha) and nu, see table.py"}
     write_columns(folder / "theory.csv", about | {"theory": theory.__name__} | terms, table_of_terms, digits=9)
-    attributes = {name: data.attrs[name] for name in ("grains", "timestep", "seeds", "polydispersity", "activation")}
+    attributes = {name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")}
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear rate, see table.py",
+        "system": "large, extrapolated from the grains of each point",
         **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
         "map commit": data.attrs["commit"],
         **made_from,
@@ -127,7 +141,7 @@ def best_theory(columns: dict[str, np.ndarray]) -> tuple[Callable, dict[str, int
 
 
 def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series:
-    """The series of the logarithms of a theory's predictions, over the range of the columns."""
+    """The series of the logarithms of the predictions of a theory and of the corrected one, over the columns' range."""
     alphas, nus = columns["restitution"], columns["packing_fraction"]
     low = np.array([np.sqrt(1 - alphas.max()), nus.min()])
     high = np.array([np.sqrt(1 - alphas.min()), nus.max()])
@@ -138,9 +152,11 @@ def chebyshev_series(theory: Callable, columns: dict[str, np.ndarray]) -> Series
     predicted = jax.vmap(theory)(1 - u**2, v)
     inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(nodes, TERMS - 1))
     coefficients = {}
+    mended = jax.vmap(corrected_shear)(1 - u**2, v)
     for name in THEORY:
-        values = np.log(np.asarray(getattr(predicted, name))).reshape(TERMS, TERMS)
-        coefficients[name] = inverse @ values @ inverse.T
+        for start, one in (("", predicted), (CORRECTED, mended)):
+            values = np.log(np.asarray(getattr(one, name))).reshape(TERMS, TERMS)
+            coefficients[f"{start}{name}"] = inverse @ values @ inverse.T
     return Series(low, high, coefficients)
 
 
@@ -184,16 +200,18 @@ def left_out(table: Table) -> dict[str, dict[str, float]]:
 def judged(table: Table, rows: list[dict[str, Any]]) -> Any:
     """For every fresh flow, ln(measured/table) of every average and the half-widths of its two intervals.
 
-    The whole interval is that of ``jg.validity``. The other one leaves out the bounds: sampling and interpolation only,
-    for flows of the map's number of grains. The errors of the fresh flow are added to both.
+    The whole interval is that of ``jg.validity``. The other one leaves out the bounds: sampling and interpolation only.
+    The errors of the fresh flow are added to both. What is missing at its number of grains is added to its averages by
+    the law that the table was made with, so neither interval tests this law.
     """
     for row in rows:
         where = coordinates(row["restitution"], row["packing_fraction"])
         one = {"restitution": row["restitution"], "packing_fraction": row["packing_fraction"]}
         for name in MEASURED:
             log, stderr = table.surfaces[name](where)
-            expected = log + table.series(where)[theory_of(name)]
             bounded = BOUNDED_BY.get(name, name)
+            missing = SIZE_LAWS[bounded].missing(row["restitution"], row["packing_fraction"], row["grains"])
+            expected = log + table.series(where)[theory_of(name)] + np.log1p(-missing)
             known = [row[f"{bounded}_{part}"] / row[bounded] for part in ("timestep", "tolerance")]
             own = np.hypot(HALF_INTERVAL * row[f"{name}_stderr"] / row[name], np.hypot(*known))
             narrow = np.hypot(HALF_INTERVAL * stderr, own)

@@ -97,10 +97,6 @@ BENCHMARKS = (
         "Which table does `jg.validity` answer from, and do its intervals hold?",
         (1, 1),
         ("reference.json", "reference.png"),
-        (
-            Option("dataset", "that of a map, as NetCDF, in place of the paper's", Path),
-            Option("--other", "a map of the same points with another time step", Path),
-        ),
         one_core=True,
     ),
     Benchmark(

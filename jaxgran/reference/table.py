@@ -25,10 +25,13 @@ MEASURED = {
 """Averages of which the table has a surface over a theory, and their units."""
 
 RATIO = "force_ratio"
-"""The force ratio at the time step of the map; ``force_ratio_at_DT`` is that of another map, at its time step."""
+"""The force ratio at the time step of the map; ``force_ratio_at_DT`` is another map's, NaN without a point there."""
 
 THEORY = ("pressure", "shear_stress", "granular_temperature")
 """What the series predict. The dissipation rate of a theory is its shear stress times the shear rate."""
+
+CORRECTED = "corrected_"
+"""What the names of the series of ``corrected_shear`` begin with."""
 
 FACTORS = ("local_temperature", "anisotropy", "chaos", "pairs", "binary")
 """Factors of the contact pressure over Enskog's, in the order of ``sampling.enskog_factors``."""
@@ -130,7 +133,8 @@ class Table:
         """The surface of an average, of a given shape."""
         theory = np.exp(self.series(self.points)[theory_of(name)]) if name in MEASURED else 1.0
         values, stderrs = to_surface(name, self.columns[name], self.columns[f"{name}_stderr"], theory)
-        return Surface(self.points, values, np.maximum(stderrs, _LEAST_STDERR), shape)
+        known = np.isfinite(values)
+        return Surface(self.points[known], values[known], np.maximum(stderrs[known], _LEAST_STDERR), shape)
 
 
 @cache
@@ -145,7 +149,7 @@ def read_table(folder: Path) -> Table:
     theory_head, terms = read_columns(folder / "theory.csv")
     low, high = (np.array([float(x) for x in theory_head[name].split()]) for name in ("low", "high"))
     count = round(np.sqrt(len(terms["first"])))
-    coefficients = {name: terms[name].reshape(count, count) for name in THEORY}
+    coefficients = {name: x.reshape(count, count) for name, x in terms.items() if name not in ("first", "second")}
     return Table(theory_head | head, columns, Series(low, high, coefficients))
 
 

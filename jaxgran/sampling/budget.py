@@ -9,11 +9,11 @@ part       law, and what it was measured with
 time step  ``stress_error``: the share of its free path that a grain moves in one step (``benchmarks stability``)
 tolerance  34 times the relative residual of a contact solve, for the part of the stress that contacts carry
            (``tests/test_solvers.py``)
-size       ``size_error``: loose, dissipative flows lose as 1/√N, dense ones gain faster (``benchmarks size_study``)
+size       ``size_error``: long waves of velocity are missing in small systems, and the packing fraction at which
+           they jam scatters (``benchmarks size_limits``)
 =========  ========================================================================================================
 
-The bounds of the size hold against N = 25,600. A granular temperature that grows without a limit is larger still in a
-larger system. A force ratio belongs to its time step, so it has no error of the time step.
+A force ratio belongs to its time step, so it has no error of the time step.
 """
 
 from collections.abc import Mapping
@@ -31,21 +31,49 @@ RESIDUAL_FACTOR = 34  # relative error of the stress of one solve over its resid
 SHARES = {"sampling": 0.65, "size": 0.6, "timestep": 0.4, "tolerance": 0.2}
 
 
+class SizeLaw(NamedTuple):
+    """The part of an average that is missing at N grains, over that of a large system, as long waves are missing:
+
+    (elastic + dissipative (1 − α)) exp(density (ν − 0.5)) min(1, (end − ν)/0.1) (N/1600)^(−exponent).
+    """
+
+    exponent: float
+    elastic: float
+    dissipative: float
+    density: float
+    end: float
+
+    def missing(self, restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
+        alpha, nu, count = (np.asarray(x, float) for x in (restitution, packing_fraction, grains))
+        waves = (self.elastic + self.dissipative * (1 - alpha)) * np.exp(self.density * (nu - 0.5))
+        return waves * np.clip((self.end - nu) / 0.1, 0, 1) * (count / 1600) ** -self.exponent
+
+
+SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``
+    "pressure": SizeLaw(0.387, 0.00356, 0.12, 1.01, 0.818),
+    "shear_stress": SizeLaw(0.516, 0.00645, 0.0355, 4.51, 0.802),
+    "granular_temperature": SizeLaw(0.139, 0.0297, 0.396, 1.1, 0.822),
+    "local_granular_temperature": SizeLaw(0.706, 0.0, 0.0173, 4.35, 0.803),
+}
+SIZE_SPREAD = 0.5  # half-width of the 95 % interval of the missing part of one flow, over the law
+
+
 class Law(NamedTuple):
     """How the errors of one average follow from those of the stresses, as factors; 0 where there is none."""
 
     timestep: float
     tolerance: float
     size: float
+    sized_as: str  # the average with the same law of the size
 
 
 BUDGET: dict[str, Law] = {
-    "force_ratio": Law(0.0, 1.0, 1.0),  # that of the size is the share of the excess, see ``error_budget``
-    "pressure": Law(1.0, 1.0, 1.0),
-    "shear_stress": Law(1.0, 1.0, 1.0),
-    "granular_temperature": Law(1.0, 1.0, 3.0),
-    "local_granular_temperature": Law(1.0, 1.0, 0.6),
-    "macroscopic_friction": Law(1.0, 1.0, 0.7),
+    "force_ratio": Law(0.0, 1.0, 1.0, "pressure"),  # that of the size is the share of the excess, see ``error_budget``
+    "pressure": Law(1.0, 1.0, 1.0, "pressure"),
+    "shear_stress": Law(1.0, 1.0, 1.0, "shear_stress"),
+    "granular_temperature": Law(1.0, 1.0, 1.0, "granular_temperature"),
+    "local_granular_temperature": Law(1.0, 1.0, 1.0, "local_granular_temperature"),
+    "macroscopic_friction": Law(1.0, 1.0, 0.7, "pressure"),
 }
 
 
@@ -59,8 +87,10 @@ class Budget(NamedTuple):
     error: np.ndarray  # together
 
 
-def size_error(restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
-    """Bound on the difference of the pressure at N grains from that of a large system, over the latter.
+def size_error(
+    restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike, average: str = "pressure"
+) -> np.ndarray:
+    """Bound on the difference of an average at N grains from that of a large system, over the latter.
 
     The first term is that of long waves of velocity. It grows with dissipation and ends towards dense flows. The second
     is that of jamming: the packing fraction at which a small system jams scatters.
@@ -69,12 +99,15 @@ def size_error(restitution: ArrayLike, packing_fraction: ArrayLike, grains: Arra
       The default number of grains, in a loose and in a dense flow:
 
       >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
-      [0.168, 0.136]
+      [0.214, 0.17]
     """
-    alpha, nu, count = (np.asarray(x, float) for x in (restitution, packing_fraction, grains))
-    waves = (0.03 + 0.13 * (1 - alpha**2)) * np.clip((0.83 - nu) / 0.06, 0, 1)
-    jamming = 0.007 / distance_to_jamming(nu)
-    return waves * np.sqrt(400 / count) + jamming * (100 / count) ** 1.25
+    waves = (1 + SIZE_SPREAD) * SIZE_LAWS[average].missing(restitution, packing_fraction, grains)
+    return waves + jamming_error(packing_fraction, grains)
+
+
+def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
+    """The second term of ``size_error``."""
+    return 0.007 / distance_to_jamming(packing_fraction) * (100 / np.asarray(grains, float)) ** 1.25
 
 
 def sampling_error(error: float) -> float:
@@ -121,10 +154,10 @@ def error_budget(
         step = stress_error(np.asarray(timestep) * np.sqrt(temperature), packing_fraction)
         in_contacts = np.asarray(values["contact_pressure"]) / np.asarray(values["pressure"])
     solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts
-    size = size_error(restitution, packing_fraction, grains)
-    size = size / np.maximum(1 - size, 0.1)  # over the average at N grains, which may be the smaller one
     budget = {}
     for name, law in BUDGET.items():
+        size = size_error(restitution, packing_fraction, grains, law.sized_as)
+        size = size / np.maximum(1 - size, 0.1)  # over the average at N grains, which may be the smaller one
         value, stderr = np.asarray(values[name], float), np.asarray(errors[name], float)
         scale = np.abs(value)
         sized = np.abs(value - 1) + 0.03 if name == "force_ratio" else scale
