@@ -40,6 +40,7 @@ START = (0.4, 0.01, 0.1, 0.5, 0.84)  # s, a, b, m, ν_w
 class Flow(NamedTuple):
     """One average of one flow at several N."""
 
+    source: str
     restitution: float
     packing_fraction: float
     grains: np.ndarray
@@ -78,9 +79,9 @@ def flows_of(rows: list[dict[str, Any]], average: str) -> list[Flow]:
     kept: dict[tuple, list] = {}
     for row in rows:
         if row["grains"] >= LEAST_GRAINS:
-            key = row.get("source"), row["restitution"], row["packing_fraction"]
+            key = row.get("source", "study"), row["restitution"], row["packing_fraction"]
             kept.setdefault(key, []).append([row["grains"], *row[average]])
-    return [Flow(alpha, nu, *np.array(some, float).T) for (_, alpha, nu), some in kept.items() if len(some) > 2]
+    return [Flow(*key, *np.array(some, float).T) for key, some in kept.items() if len(some) > 2]
 
 
 def fitted(flow: Flow, shape: np.ndarray) -> tuple[float, float, float, float]:
@@ -119,6 +120,7 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
         bounds = [one[0] + sign * 1.96 * one[2] for one in ends for sign in (-1, 1)]
         found.append(
             {
+                "source": flow.source,
                 "restitution": flow.restitution,
                 "packing_fraction": flow.packing_fraction,
                 "largest": [flow.grains[-1], flow.values[-1], flow.stderrs[-1]],
