@@ -74,7 +74,7 @@ def run(output: Output) -> None:
         "counts": counts(points),
         "counts_of_paper": counts(paper),
         "errors_of_theory": errors_of_theory(points),
-        "balance": balance(flattened(tree)),
+        "balance": balance(flattened(tree)) | {"largest_excess_of_root_chaos": root_chaos(points)},
         "laws": laws_of_length(points, judged),
         "corrected_theory": corrected_theory(tree, points, {"paper": paper, "judged_on": judged}),
     }
@@ -345,6 +345,11 @@ def balance(data: xr.Dataset) -> dict[str, float]:
         "least_share_of_binary_dissipation": float(binary.min()),
         "share_of_binary_dissipation_within_2_percent": int(np.sum(abs(binary - 1) < 0.02)),
     }
+
+
+def root_chaos(points: Points) -> float:
+    """How far L′ √chaos is from one where collisions are binary within 1 %."""
+    return float(np.max(abs(points["times_root_chaos"] - 1)[abs(points["binary"] - 1) < 0.01]))
 
 
 def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
