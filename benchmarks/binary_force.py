@@ -1,15 +1,14 @@
 """How much does the force ratio depend on what counts as the binary force?
 
-The same flows, contacts and impulses, divided by five binary sums:
+The same flows, contacts and impulses, divided by four binary sums:
 
 - ``approaching``: (1 + α) μ₁₂ max(0, −u⁻), which is that of ``force_ratio``;
 - ``signed``: −(1 + α) μ₁₂ u⁻, so that contacts that recede count with a negative sign;
 - ``magnitudes``: (1 + α) μ₁₂ |u⁻|;
-- ``half_mean_mass``: as ``approaching``, with half of the mean mass in place of the reduced mass μ₁₂;
-- ``separate_means``: F averaged over the contacts that push, F_bc over those that approach.
+- ``half_mean_mass``: as ``approaching``, with half of the mean mass in place of the reduced mass μ₁₂.
 
-    python -m benchmarks binary_force           # a minute
-    python -m benchmarks binary_force --quick   # one flow of 64 grains, half a minute
+    python -m benchmarks binary_force           # half a minute
+    python -m benchmarks binary_force --quick   # one flow of 64 grains, ten seconds
 """
 
 import jax
@@ -24,7 +23,7 @@ CHOICES = ("approaching", "signed", "magnitudes", "half_mean_mass")
 
 
 def sums_of(seen: jg.Snapshot) -> dict[str, jax.Array]:
-    """Sums over the contacts of a step: impulses by each choice, alone and times ℓ n_x n_y; numbers of contacts."""
+    """Sums over the contacts of a step: impulses by each choice, alone and times ℓ n_x n_y."""
     contacts, masses = seen.contacts, seen.state.grains.masses
     reduced = 1 / jnp.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, 1)
     speed = jnp.where(contacts.used, -(1 + seen.restitution) * contacts.approach, 0)
@@ -36,8 +35,7 @@ def sums_of(seen: jg.Snapshot) -> dict[str, jax.Array]:
         "half_mean_mass": jnp.mean(masses) / 2 * jnp.maximum(speed, 0),
     }
     moment = contacts.distances * contacts.normals[:, 0] * contacts.normals[:, 1]
-    sums = {name: jnp.stack([jnp.sum(p), jnp.sum(p * moment)]) for name, p in impulses.items()}
-    return sums | {"push": jnp.sum(1.0 * (seen.impulses > 0)), "approach": jnp.sum(1.0 * (speed > 0))}
+    return {name: jnp.stack([jnp.sum(p), jnp.sum(p * moment)]) for name, p in impulses.items()}
 
 
 def ratios(sample: jg.Sample) -> list[dict]:
@@ -47,10 +45,7 @@ def ratios(sample: jg.Sample) -> list[dict]:
         values, errors = sample.observed(lambda mean, name=name: mean["contact"] / mean[name])
         force, shear = zip(values.tolist(), errors.tolist(), strict=True)
         rows.append({"choice": name, "force_ratio": list(force), "shear_stress_ratio": list(shear)})
-    counted = sample.observed(
-        lambda mean: mean["contact"][0] / mean["approaching"][0] * mean["approach"] / mean["push"]
-    )
-    return [*rows, {"choice": "separate_means", "force_ratio": [float(x) for x in counted], "shear_stress_ratio": None}]
+    return rows
 
 
 def run(output: Output) -> None:
@@ -62,5 +57,5 @@ def run(output: Output) -> None:
         _, sample = jg.sample(flow, jg.prepare(flow, jax.random.key(0)), strain, observe=sums_of)
         head = {"restitution": alpha, "packing_fraction": nu, "status": jg.Status(int(sample.status)).name}
         rows += [rounded(head | one, 4) for one in ratios(sample)]
-        print(*rows[-len(CHOICES) - 1 :], sep="\n", flush=True)
+        print(*rows[-len(CHOICES) :], sep="\n", flush=True)
     output.write_json("binary_force", {"grains": grains, "timestep": TIMESTEP, "strain": strain, "rows": rows})

@@ -165,7 +165,7 @@ BENCHMARKS = (
     Benchmark(
         "binary_force",
         "How much does the force ratio depend on what counts as the binary force?",
-        (1, 0.5),
+        (0.5, 0.2),
         ("binary_force.json",),
     ),
     Benchmark(
