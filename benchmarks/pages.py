@@ -26,8 +26,10 @@ from benchmarks.output import RESULTS, ROOT
 from benchmarks.peers import front
 from benchmarks.solvers.groups import GROUPS
 from jaxgran.maps.results import open_map
+from jaxgran.maps.schema import shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS
+from jaxgran.sampling.budget import fewest_grains
 
 README = ROOT / "docs" / "_build" / "README.md"
 
@@ -123,6 +125,13 @@ def point(file: str, name: str, restitution: float, packing_fraction: float) -> 
     chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
     error = float(data[f"{variable}_stderr"].sel(chosen)) if f"{variable}_stderr" in data else 0.0
     return float(data[variable].sel(chosen)), error
+
+
+def shear_stress_ratio_at(file: str, restitution: float, packing_fraction: float) -> tuple[float, float]:
+    """Contact shear stress over the binary one at a point of a map, and its standard error."""
+    chosen = {"restitution": restitution, "packing_fraction": packing_fraction}
+    value, error = (float(one.sel(chosen)) for one in shear_stress_ratio(_map(file)))
+    return value, error
 
 
 def percent_pm(value_and_error: Iterable[float]) -> str:
@@ -232,6 +241,7 @@ ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVE
 for _functions in (
     (abs, max, at, found, flows_of, point, quotients, over, rms, ranked, farthest_from_one),
     (sig, percent, percent_pm, pm, duration, signed),
+    (fewest_grains, shear_stress_ratio_at),
     (peers_ratio, output_of_where, product_of, shares_of_clusters, differences_in_sigmas),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}

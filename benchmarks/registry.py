@@ -166,6 +166,12 @@ BENCHMARKS = (
         one_core=True,
     ),
     Benchmark(
+        "binary_force",
+        "How much does the force ratio depend on what counts as the binary force?",
+        (0.5, 0.2),
+        ("binary_force.json",),
+    ),
+    Benchmark(
         "contact_duration",
         "Is a time step a duration of contact of event-driven discs?",
         (10, 1),

@@ -49,7 +49,7 @@ def advance(
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
     (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
-    event, about 0.7 kB a grain. It computes contacts and impulses again in the backward pass.
+    event, about 0.6 kB a grain. It computes contacts and impulses again in the backward pass.
 
     Args:
       flow: parameters of the state; or those (replicas,) of a batch.
