@@ -84,6 +84,7 @@ BENCHMARKS = (
                 "the plane, flows of several sizes, or a coarse time step",
                 choices=("plane", "sizes", "coarse"),
             ),
+            Option("--folder", "where the maps that are done are kept", Path),
         ),
     ),
     Benchmark(
