@@ -268,6 +268,8 @@ def plane(table: Table) -> dict[str, Any]:
         found[f"{limit:g}"] |= {"points_binary_within": int(np.sum(binary & (np.abs(error) < limit)))}
     return found | {
         "points": len(alphas),
+        "fewest_grains": int(table.columns["grains"].min()),
+        "most_grains": int(table.columns["grains"].max()),
         "points_binary": int(binary.sum()),
         "worst_binary": {
             "restitution": float(alphas[worst]),
