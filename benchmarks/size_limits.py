@@ -24,6 +24,8 @@ from scipy.stats import chi2
 import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
+from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.sampling.budget import SIZE_SPREAD
 
 AVERAGES = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -161,4 +163,17 @@ def law_of(flows: list[Flow]) -> dict[str, Any]:
         "stderrs": np.sqrt(np.diag(covariance)).tolist(),
         "chi_squared": 2 * best.cost,
         "freedom": freedom,
+        "differences": sum(len(flow.grains) - 1 for flow in flows),
+        "within": float(np.mean(np.concatenate([within(best.x, flow) for flow in flows]))),
     }
+
+
+def within(constants: np.ndarray, flow: Flow) -> np.ndarray:
+    """Whether the value at each N over that at the largest is what the law says, within 95 % intervals.
+
+    The interval is that of both standard errors and of the spread that ``sampling.budget`` adds to the law.
+    """
+    missing, relative = missing_part(constants, flow), flow.stderrs / flow.values
+    apart = np.log(flow.values / flow.values[-1]) - np.log1p(-missing) + np.log1p(-missing[-1])
+    half = np.hypot(HALF_INTERVAL * np.hypot(relative, relative[-1]), SIZE_SPREAD * (missing - missing[-1]))
+    return (abs(apart) < half)[:-1]

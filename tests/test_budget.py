@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxgran.sampling.budget import BUDGET, error_budget, fewest_grains, size_error
+from jaxgran.sampling.budget import BUDGET, SIZE_LAWS, error_budget, fewest_grains, size_error
 from jaxgran.sampling.timestep import stress_error
 
-STUDY = Path(__file__).parents[1] / "benchmarks" / "results" / "size_study.json"
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 MEASURED = {
     "force_ratio": 1.3,
     "pressure": 2.0,
@@ -53,16 +53,10 @@ def test_chosen_grains_are_the_fewest_of_their_series():
             assert grains == 256 or size_error(alpha, nu, round(grains / 2**0.5)) > 0.02
 
 
-def test_bound_of_the_size_holds_in_the_study():
-    """Differences from the largest N of each flow, less two standard errors; two in a hundred may be larger."""
-    rows = json.loads(STUDY.read_text())["flows"]
-    largest = {(row["restitution"], row["packing_fraction"]): row for row in rows}  # the last one of each flow
-    inside = []
-    for row in (row for row in rows if row not in largest.values()):
-        flow = row["restitution"], row["packing_fraction"]
-        values = {name: row[name][0] for name in BUDGET} | {"contact_pressure": row["pressure"][0]}
-        budget = error_budget(values, dict.fromkeys(values, 0.0), *flow, row["grains"], 0.0, 0.0)
-        for name in BUDGET:
-            (value, error), (limit, limit_error) = row[name], largest[flow][name]
-            inside.append(abs(value - limit) <= budget[name].size + 2 * np.hypot(error, limit_error))
-    assert len(inside) >= 200 and np.mean(inside) >= 0.98
+@pytest.mark.parametrize("average", SIZE_LAWS)
+def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> None:
+    """Ratios of values at two N are those of the law within errors and spread, at as many flows as 95 % intervals do."""
+    found = json.loads((RESULTS / "size_limits.json").read_text())["laws"][average]["law"]
+    assert tuple(SIZE_LAWS[average]) == pytest.approx(found["constants"], rel=2e-3, abs=1e-4)
+    assert found["differences"] > 80
+    assert found["within"] >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / found["differences"])

@@ -50,10 +50,10 @@ class SizeLaw(NamedTuple):
 
 
 SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``
-    "pressure": SizeLaw(0.387, 0.00356, 0.12, 1.01, 0.818),
-    "shear_stress": SizeLaw(0.516, 0.00645, 0.0355, 4.51, 0.802),
-    "granular_temperature": SizeLaw(0.139, 0.0297, 0.396, 1.1, 0.822),
-    "local_granular_temperature": SizeLaw(0.706, 0.0, 0.0173, 4.35, 0.803),
+    "pressure": SizeLaw(0.438, 0.00367, 0.1062, 0.788, 0.8215),
+    "shear_stress": SizeLaw(0.577, 0.00591, 0.0346, 3.767, 0.8071),
+    "granular_temperature": SizeLaw(0.2, 0.0202, 0.312, 0.975, 0.8193),
+    "local_granular_temperature": SizeLaw(0.747, 0.0, 0.0195, 2.931, 0.8132),
 }
 SIZE_SPREAD = 0.5  # half-width of the 95 % interval of the missing part of one flow, over the law
 
