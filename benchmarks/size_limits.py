@@ -33,7 +33,7 @@ LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "N^(-1/2)": lambda grains: grains**-0.5,
     "ln N": lambda grains: -np.log(grains),
 }
-EXPONENTS = np.arange(0.02, 1.5, 0.02)
+EXPONENTS = np.arange(0.01, 1.5, 0.005)
 LARGEST_FRACTION, LEAST_GRAINS = 0.7, 400
 WIDTH = 0.1  # of the packing fractions over which waves end
 START = (0.4, 0.01, 0.1, 0.5, 0.84)  # s, a, b, m, ν_w

@@ -21,7 +21,7 @@ MEASURED = {
 }
 
 
-def budget_of(stderr=0.0, timestep=0.0, tolerance=0.0, grains=10**16):
+def budget_of(stderr=0.0, timestep=0.0, tolerance=0.0, grains=1e60):
     return error_budget(MEASURED, dict.fromkeys(MEASURED, stderr), 0.5, 0.6, grains, timestep, tolerance)
 
 
@@ -55,7 +55,7 @@ def test_chosen_grains_are_the_fewest_of_their_series():
 
 @pytest.mark.parametrize("average", SIZE_LAWS)
 def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> None:
-    """Ratios of values at two N are those of the law within errors and spread, at as many flows as 95 % intervals do."""
+    """Ratios of values at two N are those of the law within errors and spread, as often as 95 % intervals hold."""
     found = json.loads((RESULTS / "size_limits.json").read_text())["laws"][average]["law"]
     assert tuple(SIZE_LAWS[average]) == pytest.approx(found["constants"], rel=2e-3, abs=1e-4)
     assert found["differences"] > 80

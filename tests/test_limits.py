@@ -4,34 +4,38 @@ import numpy as np
 import pytest
 
 from benchmarks.dense_limit import fit, ratio_exponent
-from benchmarks.size_limits import AVERAGES, law_totals, limits
+from benchmarks.size_limits import AVERAGES, Flow, exponents, flows_of, law_of, limits_of, missing_part
 
 GRAINS = (400, 1600, 6400, 25600)
+LAW = (0.45, 0.004, 0.1, 0.8, 0.82)  # s, a, b, m, ν_w
 
 
-def study(exponent: float, noise: float, seed: int = 0) -> list[dict]:
-    """Ten flows whose averages approach 2 as N^(−exponent), with noise of the stated errors."""
-    rng = np.random.default_rng(seed)
-    rows = []
-    for k in range(10):
-        for grains in GRAINS:
-            value = 2 - 3 * grains**-exponent
-            row = {"restitution": 0.05 * k, "packing_fraction": 0.5, "grains": grains}
-            rows.append(row | {name: [value + noise * rng.normal(), noise] for name in AVERAGES})
+def study(noise: float, seed: int = 0) -> list[dict]:
+    """Twenty flows whose averages approach 2 by one law, with noise of the stated relative errors."""
+    rng, rows = np.random.default_rng(seed), []
+    for alpha in (0.1, 0.3, 0.5, 0.7, 0.9):
+        for nu in (0.2, 0.5, 0.7, 0.75):
+            flow = Flow("", alpha, nu, np.array(GRAINS, float), np.array(()), np.array(()))
+            for grains, missing in zip(GRAINS, missing_part(np.array(LAW), flow), strict=True):
+                values = {name: [2 * (1 - missing) * (1 + noise * rng.normal()), 2 * noise] for name in AVERAGES}
+                rows.append({"restitution": alpha, "packing_fraction": nu, "grains": grains} | values)
     return rows
 
 
-@pytest.mark.parametrize(("law", "exponent"), [("N^(-1/3)", 1 / 3), ("N^(-1/2)", 1 / 2)])
-def test_limits_scatter_as_their_errors_and_chi_squared_knows_the_law(law, exponent) -> None:
-    rows = limits(study(exponent, 1e-3))
-    deviations = [(row["limit"][law][0] - 2) / row["limit"][law][1] for row in rows]
-    assert np.std(deviations) == pytest.approx(1, abs=4 / np.sqrt(2 * len(rows)))
-    assert all(
-        low < 2 < high for low, high in (row["interval"] for row in rows if abs(row["limit"][law][0] - 2) < 1e-3)
-    )
-    for test in law_totals(rows):
-        assert test["freedom"] == 20
-        assert test["probability"][law] > 1e-3 and test["probability"]["ln N"] < 1e-6
+def test_the_law_that_made_the_averages_is_found_within_its_errors() -> None:
+    found = law_of(flows_of(study(1e-3), AVERAGES[0]))
+    assert np.all(abs(np.array(found["constants"]) - LAW) < 4 * np.array(found["stderrs"]))
+    assert found["chi_squared"] / found["freedom"] == pytest.approx(1, abs=4 * np.sqrt(2 / found["freedom"]))
+
+
+def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logarithm() -> None:
+    flows = [flow for flow in flows_of(study(1e-3), AVERAGES[0]) if flow.packing_fraction <= 0.7]
+    found = exponents(flows)
+    assert found["freedom"] == 30
+    assert found["interval"][0] < LAW[0] < found["interval"][1]
+    assert found["chi_squared"]["ln N"] > found["best"][1] + 50
+    for flow, one in zip(flows, limits_of(flows, found["interval"]), strict=True):
+        assert one["interval"][0] - 4e-3 < 2 < one["interval"][1] + 4e-3, flow
 
 
 def test_dense_fit_with_a_correction_finds_the_limit_within_its_error() -> None:
