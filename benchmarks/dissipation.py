@@ -13,7 +13,6 @@ which also judge the temperature and the stresses of ``corrected_shear``.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import jax
 import numpy as np
@@ -242,14 +241,31 @@ def rms(x: np.ndarray) -> float:
 
 
 def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
-    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and the rms of each."""
-    laws, scatters = MEASURED_LAWS, {}
+    """The laws of L′ and of the pairs at contact with the least squares of their logarithms, and the rms of each.
+
+    A point counts as much as the area of the plane of ln(1 − α) and ν that it stands for.
+    """
+    laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points))
     for name in CORRECTIONS:
-        found = least_squares(partial(law_misfit, laws, points, name), START[name], x_scale="jac", bounds=(0, np.inf))
+
+        def weighted(coefficients: np.ndarray, name: str = name) -> np.ndarray:
+            return roots * law_misfit(laws, points, name, coefficients)
+
+        found = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
         scatter = found.fun @ found.fun / (found.fun.size - found.x.size)
         stderr = np.sqrt(np.diag(scatter * np.linalg.inv(found.jac.T @ found.jac)))
-        laws, scatters[name] = replace(laws, **{name: found.x, f"{name}_stderr": stderr}), rms(found.fun)
-    return laws, scatters
+        rms_of[name] = rms(found.fun / roots)
+        laws = replace(laws, **{name: found.x, f"{name}_stderr": stderr})
+    return laws, rms_of
+
+
+def areas(points: Points) -> np.ndarray:
+    """The area of the plane of ln(1 − α) and ν that each point of a grid stands for, over the mean."""
+    found = np.ones(points["nu"].size)
+    for x in (-np.log(1 - points["alpha"]), points["nu"]):
+        values, place = np.unique(x, return_inverse=True)
+        found *= np.gradient(values)[place]
+    return found / found.mean()
 
 
 def law_misfit(laws: CorrelationLaws, points: Points, name: str, coefficients: np.ndarray | None = None) -> np.ndarray:
