@@ -248,7 +248,7 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
     laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points))
     for name in CORRECTIONS:
 
-        def weighted(coefficients: np.ndarray, name: str = name) -> np.ndarray:
+        def weighted(coefficients: np.ndarray, laws: CorrelationLaws = laws, name: str = name) -> np.ndarray:
             return roots * law_misfit(laws, points, name, coefficients)
 
         found = least_squares(weighted, START[name], x_scale="jac", bounds=(0, np.inf))
