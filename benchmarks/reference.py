@@ -51,6 +51,7 @@ TERMS = 20  # of the Chebyshev series along each coordinate
 MARGIN = 0.01  # by which the series reaches beyond the map, as a share of its range
 START = ((1.0, 1.0, 1.2, 0.1), (-0.5, -0.5, 0.5, 0.1))  # logarithms of a Shape
 BOUNDED_BY = {"dissipation_rate": "shear_stress"}  # its power is what is dissipated
+AVERAGES = ("pressure", "shear_stress", "local_granular_temperature")
 SOURCE, OTHERS = "reference.nc", ("reference_coarse.nc", "paper.nc")
 
 
@@ -66,6 +67,7 @@ def run(output: Output) -> None:
     rows = list(judged(table, fresh["rows"]))
     head = {"table": table.head, "left_out": left_out(table), "plane": plane(table)}
     head |= {"fresh": {key: fresh[key] for key in ("points", "grains", "timestep")}, "coverage": coverage(rows)}
+    head |= {"whole_errors": whole_errors(table)}
     for name, found in (head["left_out"] | {f"fresh {key}": one for key, one in head["coverage"].items()}).items():
         print(name, found)
     print(head["plane"])
@@ -193,6 +195,23 @@ def left_out(table: Table) -> dict[str, dict[str, float]]:
             "rms": round(float(np.sqrt(np.mean(errors**2))), 4),
             "noise": round(float(np.sqrt(np.mean(surface.stderrs**2))), 4),
             "covered": round(float(np.mean(np.abs(errors) < HALF_INTERVAL * expected)), 3),
+        }
+    return found
+
+
+def whole_errors(table: Table) -> dict[str, Any]:
+    """Half-widths of the 95 % intervals at the points of the map, relative to the averages.
+
+    For each average the median, the share of points within 3 %, and the largest for every packing fraction.
+    """
+    nus, found = table.columns["packing_fraction"], {}
+    for name in (*AVERAGES, "dissipation_rate"):
+        _, stderr = table.surfaces[name](table.points)
+        half = np.hypot(HALF_INTERVAL * stderr, np.exp(table.bounds[name](table.points)[0]))
+        found[name] = {
+            "median": round(float(np.median(half)), 4),
+            "within_3_percent": round(float(np.mean(half < 0.03)), 3),
+            "largest": {f"{nu:g}": round(float(half[nus == nu].max()), 4) for nu in np.unique(nus)},
         }
     return found
 
