@@ -36,8 +36,8 @@ from jaxgran.theory.corrected_shear import (
 from jaxgran.theory.steady_shear import contact_value
 
 JUDGED = {
-    "restitution": (0.15, 0.35, 0.55, 0.75, 0.95),
-    "packing_fraction": (0.15, 0.35, 0.48, 0.58, 0.68, 0.77),
+    "restitution": (0.12, 0.35, 0.55, 0.75, 0.93),
+    "packing_fraction": (0.15, 0.35, 0.48, 0.58, 0.68, 0.775),
     "grains": 1600,
     "seeds": 1,
     "timestep": 3e-4,

@@ -58,16 +58,16 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.2255, 0.01492, 1.645]),
-    length_stderr=np.array([0.01066, 0.004109, 0.06891]),
-    pairs=np.array([0.3454, 0.0105, 1.745]),
-    pairs_stderr=np.array([0.02789, 0.001003, 0.027]),
+    length=np.array([0.2226, 0.02445, 1.461]),
+    length_stderr=np.array([0.0076, 0.003236, 0.0303]),
+    pairs=np.array([0.3711, 0.01574, 1.613]),
+    pairs_stderr=np.array([0.0239, 0.0008276, 0.01444]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1175, 0.1374, 0.1499]),
+    scatter=np.array([0.1226, 0.1533, 0.1534]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
-    fitted_to="120 flows of N = 1000, dt = 1e-5",
-    judged_on="30 flows of N = 400, dt = 3e-4",
+    fitted_to="294 flows of N = 6400 or 1600, dt = 1e-4",
+    judged_on="30 flows of N = 1600, dt = 3e-4",
 )
 """The laws of the benchmark ``dissipation``."""
 
