@@ -23,6 +23,7 @@ from contextlib import suppress
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -209,8 +210,8 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
         sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
         instant = None
         if f"side-{row}" in arrays:
-            found = [arrays[f"{name}-{row}"] for name in Instant._fields]
-            instant = Instant(*(x if x.ndim else x.item() for x in found))
+            found: dict[str, Any] = {name: arrays[f"{name}-{row}"] for name in Instant._fields}
+            instant = Instant(**{name: x if x.ndim else x.item() for name, x in found.items()})
         replicas[point, seed] = Replica(sample, status, float(strain), instant)
     return replicas
 
