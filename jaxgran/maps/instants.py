@@ -72,11 +72,11 @@ def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, Instant
 
 
 def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
-    """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
+    """The instant after the state of a batch of one replica; None if the flow does not stay finite."""
     steps = _steps(flow)
     found: list[Instant] = []
     advance = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
-    # one step less than snapshots: a snapshot has the forces of the step that it begins
+    # one step fewer than snapshots: a snapshot has the forces of the step that begins with it
     advance(flow, numerics, state, jnp.array([steps - 1], jnp.int32))
     return averaged(found) if len(found) == steps else None
 
