@@ -401,7 +401,7 @@ def _shortened(batch: Batch, flow: ShearFlow, advance: AdvanceBatch) -> Batch:
     return _sheared(batch, relaxation, advance) if relaxation.any() else batch
 
 
-def _is_level(series: np.ndarray, least_correlation: float) -> bool:
+def _is_level(series: np.ndarray, least_correlation: float = 0.0) -> bool:
     """Whether the means of the two halves of a series agree, and the error of their difference is small."""
     difference, error = drift(series, least_correlation)
     return bool(
