@@ -67,12 +67,12 @@ def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
     scene, share, sizes = scene_of(snapshots), cluster_share(snapshots), cluster_sizes(snapshots)
     return {
         "alpha": restitution,
-        "pairs": len(scene.force),
-        "pairs_mostly_in_clusters": int(scene.clustered.sum()),
+        "pairs": len(scene.instant.force),
+        "pairs_mostly_in_clusters": int(scene.instant.clustered.sum()),
         "force_share_of_clusters": share.force.value.item(),
         "largest_cluster": float(sizes.at[np.nonzero(sizes.value)[0].max()]),
         "mean_speed": float(scene.speed.mean()),
-        "largest_force": float(scene.force.max()),
+        "largest_force": float(scene.instant.force.max()),
     }
 
 

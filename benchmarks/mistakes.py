@@ -178,8 +178,8 @@ MISTAKES = (
     Mistake(
         "strain of a kept replica",
         "jaxgran/maps/checkpoint.py",
-        "self.done[point, seed] = Replica(sample, status, float(strain), instant)",
-        "self.done[point, seed] = Replica(sample, status, float(area), instant)",
+        "replicas[point, seed] = Replica(sample, status, float(strain), instant)",
+        "replicas[point, seed] = Replica(sample, status, float(area), instant)",
         "what was kept of an unfinished map comes back as it was",
         ("test_checkpoint.py",),
     ),

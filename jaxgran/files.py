@@ -63,6 +63,14 @@ def read_cached(path: Path) -> bytes | None:
     return None
 
 
+def other_version(name: str, found: object, version: int) -> str:
+    """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if it has the same."""
+    if found == version:
+        return ""
+    has = "no format_version" if found is None else f"format_version {found}"
+    return f"{name} has {has}, and this version of jaxgran reads format_version {version}."
+
+
 def write_cached(path: Path, content: bytes, most: int) -> None:
     """Write a cache file, then remove the oldest files with its suffix beyond the newest ``most``.
 

@@ -62,12 +62,12 @@ class Lab:
             time.sleep(0.02)
 
     def wait_for_work(self, output: str, process: subprocess.Popen) -> None:
-        """Wait until the process has written or removed a journal or a batch, or ended."""
+        """Wait until the process has written or removed a file of the checkpoint, or ended."""
         folder, end = self.folder / f"{output}.unfinished", time.monotonic() + PATIENCE
 
         def now() -> set[tuple[str, int]]:
             found = set()
-            for path in folder.glob("[dj]o*.nc"):
+            for path in folder.glob("*.nc"):
                 with suppress(FileNotFoundError):
                     found.add((path.name, path.stat().st_mtime_ns))
             return found

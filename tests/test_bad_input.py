@@ -544,7 +544,7 @@ OUTPUTS = {
     "folder.nc": "is a folder",
     "folder.nc/": "is a folder",
     "file.txt/map.nc": "a folder that exists",
-    "taken.nc": "an unfinished map",
+    "taken.nc": "a file has this name",
     "流" * 90 + ".nc": "at most 200 bytes",
     "n" * 300 + "/map.nc": "a folder that exists",
 }

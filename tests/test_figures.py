@@ -184,7 +184,7 @@ def test_force_ratios_at_several_time_steps_are_neither_contoured_nor_joined(tmp
     figure = ratio_curves(data)
     curves = [one[0] for one in figure.axes[0].containers if isinstance(one, ErrorbarContainer)]
     assert len(curves) == 3 and {line.get_linestyle() for line in curves} == {"None"}
-    assert "do not compare" in caption(figure) and r"10^{-4}$ to $9\times 10^{-4}" in caption(figure)
+    assert "not comparable" in caption(figure) and r"10^{-4}$ to $9\times 10^{-4}" in caption(figure)
     assert [path.name for path in save_figures(data, tmp_path / "map")] == ["map_curves.png"]
 
 

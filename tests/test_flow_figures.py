@@ -70,7 +70,7 @@ def test_cell_is_the_sheared_one_around_the_origin(tilt: float) -> None:
 def test_a_picture_does_not_jump_where_the_tilt_begins_anew() -> None:
     """At a tilt of 1/2 and at one of −1/2 the lattice is the same: so is all that lies in both cells."""
     before, after = (scene_of(seen(tilt)) for tilt in (0.5, -0.5))
-    for one, other in zip(before.centres, after.centres, strict=True):
+    for one, other in zip(before.instant.positions, after.instant.positions, strict=True):
         apart = (one - other) / SIDE
         assert apart[1] == 0 and apart[0] == pytest.approx(round(apart[0]))
 
@@ -81,7 +81,7 @@ def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() 
     widths = {*clusters.get_linewidths(), *binaries.get_linewidths()}
     assert max(widths) == flow.WIDEST_LINE
     np.testing.assert_allclose(sorted(widths), flow.WIDEST_LINE * np.array([0.25, 0.5, 1.0]))
-    start, end = (scene.centres[k] for k in (4, 3))
+    start, end = (scene.instant.positions[k] for k in (4, 3))
     (middle,) = (line for line in binaries.get_segments() if np.allclose(line[0], start))  # the image not shifted
     lattice = np.linalg.solve(np.array([[SIDE, 0.2 * SIDE], [0, SIDE]]), middle[1] - end)
     np.testing.assert_allclose(lattice, np.round(lattice), atol=1e-9)
@@ -115,7 +115,7 @@ def test_pressures_of_grains_of_one_size_sum_up_to_the_contact_stress() -> None:
     positions[0, :, 0] = np.arange(GRAINS) % 8 * 1.0
     positions[0, :, 1] = np.arange(GRAINS) // 8 * 1.5
     scene = scene_of(snapshot_of(positions, [[(0, 1, 2.0), (2, 1, 3.0)]], side=SIDE))
-    assert np.sum(np.pi * scene.radii**2 * scene.pressure) == pytest.approx((2.0 + 3.0) * 1.0 / 2)
+    assert np.sum(np.pi * scene.instant.radii**2 * scene.pressure) == pytest.approx((2.0 + 3.0) * 1.0 / 2)
 
 
 def test_forces_of_a_series_are_means_over_its_times() -> None:
@@ -127,7 +127,7 @@ def test_forces_of_a_series_are_means_over_its_times() -> None:
     np.testing.assert_array_equal(np.stack([found.i, found.j], axis=-1), [[0, 1], [1, 2], [5, 6]])
     np.testing.assert_allclose(found.force, [1.0, 1.0, 0.5])
     np.testing.assert_allclose(found.cluster_share, [0.25, 1.0, 0.0])
-    np.testing.assert_array_equal(scene_of(series).clustered, [False, True, False])
+    np.testing.assert_array_equal(scene_of(series).instant.clustered, [False, True, False])
 
 
 def test_figure_names_what_without_which_it_means_nothing() -> None:
@@ -158,8 +158,7 @@ def test_picture_is_the_same_in_any_unit_of_time() -> None:
         impulses=other.impulses * 2,
         state=replace(other.state, velocities=other.state.velocities * 2),
     )
-    for this, that in zip(scene_of(one), scene_of(other), strict=True):
-        np.testing.assert_array_equal(this, that)
+    jax.tree.map(np.testing.assert_array_equal, scene_of(one), scene_of(other))
 
 
 @pytest.mark.parametrize("contacts", [(), ((0, 1, 0.0),)], ids=["no contacts", "no forces"])

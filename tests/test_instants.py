@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from flows import in_batches
-from synthetic import random_instant, random_replica, snapshot_of
+from synthetic import random_instant, random_replica
 
-from jaxgran.analysis.instant import instant_of
 from jaxgran.maps import instants
 from jaxgran.maps import run_replicas as run_replicas_module
 from jaxgran.maps.checkpoint import Checkpoint
@@ -24,27 +23,8 @@ from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.plotting.flow import scene_of
 
 SETTINGS = MapSettings((0.5, 0.9), (0.8,), grains=32, seeds=2, timestep=5e-4, equilibrate=0.5, strain=1.6)
-
-
-def test_instant_of_a_series_is_what_a_picture_of_it_shows() -> None:
-    rng = np.random.default_rng(0)
-    positions = rng.uniform(0, 10, (5, 8, 2))
-    contacts = [[(0, 1, 2.0)], [(1, 0, 1.0), (1, 2, 3.0)], [], [(5, 4, 1.0)], [(0, 1, 4.0), (6, 7, 1.0), (7, 5, 2.0)]]
-    seen = snapshot_of(positions, contacts, rng.normal(size=(5, 8, 2)), side=10.0, tilt=0.3)
-    found = instant_of(seen)
-    scene = scene_of(seen)
-    for name, expected in (("positions", scene.centres), ("radii", scene.radii), ("speed", scene.speed)):
-        np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-12)
-    np.testing.assert_allclose(found.force, scene.force, rtol=1e-12)
-    np.testing.assert_array_equal(found.clustered, scene.clustered)
-    i, j = found.pairs.T
-    np.testing.assert_allclose(
-        minimum_image(found.positions[i] - found.positions[j], 10.0, 0.3), scene.branches, atol=1e-12
-    )
-    assert (found.side, found.tilt, found.window) == (scene.side, scene.tilt, 5.0)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -24,6 +24,13 @@ KEYS = [(0, 0), (1, 0)]
 GRAINS = 32  # as in the tests of the protocol and of maps, whose keys are numbers too: compiled once
 
 
+@pytest.fixture
+def after_every_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A journal is written after every call."""
+    monkeypatch.setattr(journal_module, "SECONDS", 0.0)
+    monkeypatch.setattr(journal_module, "WRITING_SHARE", np.inf)
+
+
 class CutOff(Exception):
     pass
 
@@ -52,14 +59,15 @@ def whole() -> Any:
     return measured(advance_batch)
 
 
+@pytest.mark.usefixtures("after_every_call")
 @pytest.mark.parametrize("cuts", [(1,), (5, 20), (33,), (3, 3, 3, 40)])
 def test_a_batch_that_is_cut_off_goes_on_to_the_same_bits(whole, cuts, tmp_path: Path) -> None:
     for calls in cuts:
         try:
-            measured(Journal(tmp_path / "batch.nc", KEYS, cut_after(advance_batch, calls), seconds=0))
+            measured(Journal(tmp_path / "batch.nc", KEYS, cut_after(advance_batch, calls)))
         except CutOff:
             continue
-    resumed = measured(Journal(tmp_path / "batch.nc", KEYS, advance_batch, seconds=0))
+    resumed = measured(Journal(tmp_path / "batch.nc", KEYS, advance_batch))
     jax.tree.map(np.testing.assert_array_equal, resumed, whole)
 
 
@@ -83,6 +91,7 @@ def walk(advance, calls: int) -> list:
     return [seen, jax.tree.map(np.asarray, state)]
 
 
+@pytest.mark.usefixtures("after_every_call")
 def test_nothing_is_done_twice(tmp_path: Path) -> None:
     path, done = tmp_path / "batch.nc", []
 
@@ -90,15 +99,16 @@ def test_nothing_is_done_twice(tmp_path: Path) -> None:
         done.append(arguments)
         return fake_drive(*arguments)
 
-    walk(Journal(path, KEYS, counted, seconds=0), 7)
-    again = walk(Journal(path, KEYS, counted, seconds=0), 10)
+    walk(Journal(path, KEYS, counted), 7)
+    again = walk(Journal(path, KEYS, counted), 10)
     assert len(done) == 10
     jax.tree.map(np.testing.assert_array_equal, again, walk(fake_drive, 10))
 
 
+@pytest.mark.usefixtures("after_every_call")
 def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "batch.nc"
-    walk(Journal(path, KEYS, fake_drive, seconds=0), 3)
+    walk(Journal(path, KEYS, fake_drive), 3)
     with pytest.raises(CorruptFile, match="another batch"):
         Journal(path, [(0, 0), (2, 0)], fake_drive)
     journal = Journal(path, KEYS, fake_drive)
@@ -106,18 +116,21 @@ def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
         journal(None, None, small_state(), np.array([5, 5]))
 
 
+@pytest.mark.usefixtures("after_every_call")
 def test_a_folder_that_vanishes_does_no_harm(tmp_path: Path) -> None:
     jax.tree.map(
         np.testing.assert_array_equal,
-        walk(Journal(tmp_path / "gone" / "batch.nc", KEYS, fake_drive, seconds=0), 4),
+        walk(Journal(tmp_path / "gone" / "batch.nc", KEYS, fake_drive), 4),
         walk(fake_drive, 4),
     )
 
 
 def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time, "time", lambda: 0.0)
+    monkeypatch.setattr(journal_module, "SECONDS", 0.01)
+    monkeypatch.setattr(journal_module, "WRITING_SHARE", np.inf)
     path = tmp_path / "batch.nc"
-    journal = Journal(path, KEYS, fake_drive, seconds=0.01)
+    journal = Journal(path, KEYS, fake_drive)
     for k in range(3):
         time.sleep(0.02)
         journal(None, None, small_state(), np.array([k, k]))
@@ -134,10 +147,11 @@ def test_a_journal_that_takes_long_to_write_is_written_less_often(
     assert len(written) < 3
 
 
+@pytest.mark.usefixtures("after_every_call")
 def test_a_batch_goes_on_from_its_journal_without_compiling_anew(whole, tmp_path: Path) -> None:
     path = tmp_path / "batch.nc"
     with pytest.raises(CutOff):
-        measured(Journal(path, KEYS, cut_after(advance_batch, 5), seconds=0))
+        measured(Journal(path, KEYS, cut_after(advance_batch, 5)))
     compiled: list[str] = []
 
     def listen(event: str, seconds: float, **_) -> None:
@@ -145,6 +159,6 @@ def test_a_batch_goes_on_from_its_journal_without_compiling_anew(whole, tmp_path
             compiled.append(event)
 
     monitoring.register_event_duration_secs_listener(listen)
-    measured(Journal(path, KEYS, advance_batch, seconds=0))
+    measured(Journal(path, KEYS, advance_batch))
     monitoring.unregister_event_duration_listener(listen)
     assert compiled == []

@@ -6,12 +6,13 @@ from flows import GRAINS
 from scipy.special import ndtr
 from synthetic import SNAPSHOTS, assert_within_errors, snapshot_of
 
-from jaxgran.analysis.velocity_correlations import mixture_contact_value, near_contact, velocity_distribution
+from jaxgran.analysis.velocity_correlations import near_contact, velocity_distribution
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.averages import averages
 from jaxgran.theory.gaussian_moments import gaussian_moments
+from jaxgran.theory.mixture import mixture_contact_value
 from jaxgran.theory.steady_shear import contact_value
 
 STRAIN = 40.0
@@ -64,7 +65,7 @@ def test_temperatures_of_size_classes_are_those_of_their_grains() -> None:
 
 def test_contact_value_of_one_size_is_henderson() -> None:
     for nu in (0.1, 0.6):
-        np.testing.assert_allclose(mixture_contact_value(1.0, 1.0, np.full(3, 0.5), nu), float(contact_value(nu)))
+        np.testing.assert_allclose(mixture_contact_value(1.0, 1.0, nu, 1.0, 1.0), float(contact_value(nu)))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,11 @@ def test_points_at_random_obey_molecular_chaos(points) -> None:
     found = near_contact(seen, shell=0.5)
     assert_within_errors(found.contact_value, 1.0)
     nu = np.pi * np.sum(radii**2) / 81
-    assert_within_errors(found.contact_ratio, 1 / float(mixture_contact_value(1.0, 1.0, radii, nu)), least=0.02)
+    assert_within_errors(
+        found.contact_ratio,
+        1 / mixture_contact_value(1.0, 1.0, nu, 2 * radii.mean(), 4 * np.mean(radii**2)),
+        least=0.02,
+    )
     assert_within_errors(found.speed_ratio, 1.0)
     assert_within_errors(found.velocity_correlation, 0.0)
     assert (

@@ -10,7 +10,8 @@ from synthetic import one_sentence
 
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba, Pallas
-from jaxgran.maps import journal
+from jaxgran.io.atomic import read_arrays
+from jaxgran.maps import checkpoint, journal
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.merge import merge_maps
 from jaxgran.maps.own_names import RESERVED
@@ -89,19 +90,20 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     observed, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(journal, "SECONDS", 0.0)
-    monkeypatch.setattr(journal, "_WRITING_SHARE", 1e9)
+    monkeypatch.setattr(checkpoint, "WRITING_SHARE", 1e9)
+    monkeypatch.setattr(journal, "WRITING_SHARE", 1e9)
     folder, output = tmp_path / "map.nc.unfinished", tmp_path / "map.nc"
     calls = 0
 
     def cut_off(_: float) -> None:  # in the sample of the second batch
         nonlocal calls
-        calls += bool(list(folder.glob("done-*")))
+        calls += bool(len(read_arrays(folder / "map.nc")[0]["keys"]))
         if calls > 20:
             raise RuntimeError("cut off")
 
     with pytest.raises(RuntimeError, match="cut off"):
         ratio_map(**MAP, observe=observe, output=output, progress=cut_off, workers=1)
-    assert list(folder.glob("done-*")) and list(folder.glob("journal-*"))
+    assert len(read_arrays(folder / "map.nc")[0]["keys"]) and list(folder.glob("journal-*"))
     for other in (None, lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS}):
         with pytest.raises(InputError, match=r"has observe 'contacts_per_grain, own_stress: \w{16}', not ") as caught:
             ratio_map(**MAP, observe=other, output=output, resume=True)

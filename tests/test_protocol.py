@@ -338,9 +338,3 @@ def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, mo
 def test_a_preparation_shorter_than_the_correlation_strain_is_not_steady(batch) -> None:
     assert np.all(batch.correlation_strain > 0.5)  # the strain that it took
     assert np.all(batch.status == Status.not_steady)
-
-
-def test_hot_and_cold_starts_begin_at_their_share_of_the_expected_temperature(keys) -> None:
-    starts = [prepare_batch(stack(FLOWS), keys, equilibrate=0.0, heat=heat).state for heat in (0.1, 10.0)]
-    cold, hot = (np.sum(np.asarray(one.grains.masses)[..., None] * np.asarray(one.velocities) ** 2) for one in starts)
-    assert hot == pytest.approx(100 * cold)

@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import EXACT, GRAINS
+from synthetic import one_sentence
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
+from jaxgran.io import trajectory
+from jaxgran.io.track_files import read_tracks
 from jaxgran.io.trajectory import (
     Trajectory,
     check_trajectory,
@@ -479,6 +482,17 @@ def test_an_old_file_stays_until_the_first_frame_is_there(seen, tmp_path: Path, 
     assert [file.name for file in tmp_path.iterdir()] == ["flow.gsd"]
     write_frame(path, seen[0.3], 0)
     assert len(read_trajectory(path).step) == 1
+
+
+def test_a_file_of_another_format_is_refused_in_a_sentence(seen, tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "flow.gsd"
+    with monkeypatch.context() as patch:
+        patch.setattr(trajectory, "FORMAT_VERSION", 7)
+        write_frame(path, seen[0.3], 0)
+    for read in (read_trajectory, read_tracks):
+        with pytest.raises(InputError, match="has format_version 7, and this version of jaxgran reads") as refused:
+            read(path)
+        assert one_sentence(str(refused.value))
 
 
 def interrupts(*_, **__):

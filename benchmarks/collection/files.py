@@ -30,6 +30,7 @@ import numpy as np
 
 from benchmarks.collection.certificates import Problem, Solved, delassus
 from benchmarks.process import ROOT
+from jaxgran.files import other_version
 
 PATH = ROOT / "benchmarks" / "results" / "collection.h5"
 _HEAD = {
@@ -88,6 +89,8 @@ def load(path: Path = PATH, most_contacts: int | None = None) -> list[Entry]:
             raise ValueError(
                 f"{path} is not a collection of contact problems: make one by python -m benchmarks collection."
             )
+        if difference := other_version(str(path), file.attrs.get("version"), _HEAD["version"]):
+            raise ValueError(difference)
         return [
             _entry(name, group)
             for name, group in file.items()

@@ -14,7 +14,7 @@ a step's flight of contact.
 Snapshots are analysed on the host; standard errors come from blocks of times, see ``series``.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,7 @@ from scipy.special import ndtr
 
 from jaxgran.analysis.series import Measured, Sums, all_pairs, ratio, series, with_errors
 from jaxgran.dynamics.snapshots import Snapshot
+from jaxgran.theory.mixture import mixture_contact_value
 
 SIZE_CLASSES = 3  # classes of equally many grains
 WIDEST_SHELL = 0.1  # σ, largest range of gaps of an extrapolation to contact
@@ -94,18 +95,13 @@ class NearContact(NamedTuple):
     velocity_correlation: Measured
 
 
-def velocity_distribution(snapshots: Snapshot, classes: int = SIZE_CLASSES) -> VelocityDistribution:
-    """Temperature tensor, equipartition and kurtosis of the peculiar velocities.
-
-    Args:
-      snapshots: a series.
-      classes: number of size classes, with equally many grains each.
-    """
+def velocity_distribution(snapshots: Snapshot) -> VelocityDistribution:
+    """Temperature tensor, equipartition and kurtosis of the peculiar velocities of a series of snapshots."""
     state = series(snapshots).state
     w = np.sqrt(state.grains.masses)[..., None] * state.velocities
     square = np.sum(w**2, axis=-1)
     radii = state.grains.radii[0]
-    members = np.array_split(np.argsort(radii), classes)
+    members = np.array_split(np.argsort(radii), SIZE_CLASSES)
     class_sums = np.stack([np.einsum("tia,tib->tab", w[:, m], w[:, m]) for m in members], axis=1)
     sums = {
         "grains": np.ones((len(w), 1, 1, 1)) * np.array([len(m) for m in members])[:, None, None],
@@ -133,18 +129,6 @@ def velocity_distribution(snapshots: Snapshot, classes: int = SIZE_CLASSES) -> V
 
     diameters = np.array([2 * radii[m].mean() for m in members])
     return VelocityDistribution(**with_errors(estimate, sums), size_classes=diameters)
-
-
-def mixture_contact_value(d_i: Any, d_j: Any, radii: Float[np.ndarray, " grains"], nu: float) -> Any:
-    """Contact value χ of discs of diameters d_i and d_j (σ, broadcast) in an equilibrium mixture.
-
-    χ_ij = 1/(1 − ν) + (9/8) d_i d_j/(d_i + d_j) ν⟨d⟩/⟨d²⟩/(1 − ν)², with ⟨·⟩ over the ``radii`` (grains,) of the
-    mixture and ν its packing fraction. For discs of one size it is Henderson's value.
-
-    Source: J. T. Jenkins and F. Mancini, J. Appl. Mech. 54, 27 (1987).
-    """
-    mean, square = 2 * radii.mean(), 4 * np.mean(radii**2)
-    return 1 / (1 - nu) + 9 / 8 * d_i * d_j / (d_i + d_j) * nu * mean / square / (1 - nu) ** 2
 
 
 def contact_shell(packing_fraction: float) -> float:
@@ -212,8 +196,8 @@ def near_contact(snapshots: Snapshot, shell: float | None = None) -> NearContact
 def _grain_tensors(radii: np.ndarray, velocities: VelocityDistribution) -> Float[np.ndarray, "grains 2 2"]:
     """For each grain the temperature tensor of its size class, in mσ²γ̇²."""
     tensors = np.zeros((len(radii), 2, 2))
-    classes = len(velocities.size_classes)
-    for members, tensor in zip(np.array_split(np.argsort(radii), classes), velocities.size_tensors.value, strict=True):
+    classes = np.array_split(np.argsort(radii), SIZE_CLASSES)
+    for members, tensor in zip(classes, velocities.size_tensors.value, strict=True):
         tensors[members] = tensor
     return tensors
 
@@ -242,7 +226,8 @@ def _enskog(
     """
     i, j = np.triu_indices(len(radii), 1)
     contact_distances = radii[i] + radii[j]
-    chi = mixture_contact_value(2 * radii[i], 2 * radii[j], radii, np.pi * np.sum(radii**2) / side**2)
+    nu, mean, mean_square = np.pi * np.sum(radii**2) / side**2, 2 * radii.mean(), 4 * np.mean(radii**2)
+    chi = mixture_contact_value(2 * radii[i], 2 * radii[j], nu, mean, mean_square)
     sums = np.zeros(3)
     for angle in (np.arange(_ANGLES) + 0.5) * np.pi / _ANGLES:
         n = np.array([np.cos(angle), np.sin(angle)])

@@ -67,7 +67,7 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     ),
     "where": (
         where_command,
-        "Say where kinetic theory holds, at once.",
+        "Say whether kinetic theory holds for a flow.",
         "Say what kinetic theory can predict at a restitution and a packing fraction, from a map measured once.",
         WHERE_EXAMPLES,
     ),

@@ -1,4 +1,4 @@
-"""Options of a command from its table: their place in the help, and their values from text.
+"""The options of a command, from its table: their help texts, and their values from text.
 
 Typer sees texts, flags and paths only. Numbers, lists and choices are read here, so every mistake is an ``InputError``.
 """

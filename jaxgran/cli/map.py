@@ -102,7 +102,7 @@ def _ratio_table(data, name: str, ratio, stderr) -> Table:
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
     title = f"{name} at {size}dt = {timestep_text(data)} / shear rate, {rule} activation; a column is a restitution"
     if not has_one_timestep(data):
-        title += "\ndt differs between points, and the ratio depends on it: values do not compare"
+        title += "\ndt differs between points, and the ratio depends on it: values are not comparable"
     table = Table(title, ["packing fraction", *(f"{alpha:g}" for alpha in data.restitution.values)])
     for nu in data.packing_fraction.values:
         row = {"packing_fraction": nu}

@@ -25,12 +25,12 @@ MERGE_OPTIONS = {
 def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, format: FileFormat = "png") -> None:
     configured_jax()
     require_device()
+    from jaxgran.io.atomic import require_place
     from jaxgran.maps.merge import merge_maps
-    from jaxgran.maps.output import check_output
     from jaxgran.maps.results import write_dataset
     from jaxgran.plotting.map_figures import remove_pictures
 
-    check_output(output)
+    require_place(output, "output", ".nc")
     if os.path.exists(output) and not overwrite:
         raise InputError(
             f"output {short_repr(str(output))} already exists; pass `overwrite=True` to replace it.", field="output"

@@ -80,7 +80,7 @@ def plain(text: str) -> str:
 
 
 def use_plain_letters() -> None:
-    """Let standard output and error replace characters that they cannot encode, rather than end the command."""
+    """Replace characters that standard output and error cannot encode, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="in_ascii")

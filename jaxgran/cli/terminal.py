@@ -69,7 +69,7 @@ def _say_cache() -> None:
 
 
 def outlive_readers() -> None:
-    """Standard output and error whose reader has gone, as in ``| head``, take what is written and drop it."""
+    """Discard output whose reader has gone, as in ``| head``, instead of failing."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if type(stream) is TextIOWrapper and not stream.isatty():
@@ -80,7 +80,7 @@ def outlive_readers() -> None:
 
 
 class _Outliving(FileIO):
-    """A file whose reader may go."""
+    """A pipe that discards output once its reader has gone."""
 
     def write(self, content: Any) -> int:
         try:
@@ -108,7 +108,7 @@ def stop(sentence: str, status: int = INPUT_MISTAKE) -> NoReturn:
 
 @contextmanager
 def sigterm_interrupts() -> Iterator[None]:
-    """SIGTERM interrupts the block as Ctrl-C does, once; the exit status tells them apart."""
+    """The first SIGTERM interrupts the block as Ctrl-C does, but leads to another exit status."""
     global _terminated
     _terminated = False
 

@@ -45,7 +45,7 @@ def run_where_command(restitution: float, packing_fraction: float, json: bool = 
         error = ""
         if name in found.error:
             error = f"{_with_ci95(100 * found.error[name], 100 * found.error_ci95[name])} %"
-        averages.rows.append([name, measured, theory, error])
+        averages.rows.append([name.replace("_", " "), measured, theory, error])
     print_table(averages)
     assumed = "Enskog's contact pressure at the measured granular temperature, one assumption after the other"
     factors = Table(assumed, ("assumed", "factor if measured instead"))

@@ -31,7 +31,7 @@ from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError, as_array, require, require_number, short_repr
 from jaxgran.model.choices import MAX_PACKING_FRACTION
 from jaxgran.theory.gaussian_moments import gaussian_moments
-from jaxgran.theory.steady_shear import Scalar
+from jaxgran.theory.steady_shear import Scalar, outside
 
 Numbers = Array | np.ndarray
 
@@ -160,7 +160,7 @@ def prediction(closure: Closure, alpha: Array, nu: Array) -> Prediction:
         force_ratio_stderr=ratio * errors[2],
         pressure_stderr=pressure * errors[0],
         shear_stress_stderr=shear_stress * errors[1],
-        extrapolated=_outside(alpha, closure.restitution_range) | _outside(nu, closure.packing_fraction_range),
+        extrapolated=outside(alpha, closure.restitution_range) | outside(nu, closure.packing_fraction_range),
     )
 
 
@@ -194,11 +194,6 @@ def log_laws(closure: Closure, alpha: Array, nu: Array) -> tuple[Array, Array]:
         for gradient, law in zip(gradients, laws, strict=True)
     ]
     return logs, jnp.stack(variances)
-
-
-def _outside(value: Array, span: Numbers) -> Array:
-    slack = 8 * jnp.finfo(value.dtype).eps
-    return (value < span[0] - slack) | (value > span[1] + slack)
 
 
 def require_closure(closure: Closure) -> None:

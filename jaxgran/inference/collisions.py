@@ -257,6 +257,56 @@ def _of_windows(
     apart: np.ndarray,
 ) -> Candidates | None:
     """The candidates among pairs (pairs,) of discs i and j, whose separation is ``apart`` at the start of window k."""
+    frames, pair, centre = _around_windows(flights, k, i, j, apart)
+    of_pair, every = Noise(np.sqrt(2) * noise.position, np.sqrt(2) * noise.velocity, 0.0), np.arange(len(i))
+    flown = []
+    for outwards in (np.arange(LONGEST, -1, -1), np.arange(LONGEST + 1, 2 * LONGEST + 2)):
+        relative, straight = _straight_part(pair, centre, outwards, of_pair, noise)
+        if struck is not None:  # in the window before each further frame outwards
+            ends = np.minimum(np.minimum(frames[:, outwards[1:]], frames[:, outwards[:-1]]), len(struck) - 1)
+            passed = struck[ends, i[:, None]] | struck[ends, j[:, None]]
+            straight[:, 1:] &= np.cumsum(passed, axis=1) == 0
+        flown.append(_flown(pair, outwards, relative, straight))
+    before, after = flown
+    change = after.slope - before.slope
+    size = np.sum(change**2, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        clear = before.settled & after.settled & (size > _LEAST_CHANGE**2 * (before.variance + after.variance))
+        contact = -np.sum((after.start - before.start) * change, axis=-1) / size
+        until = pair.time[every, np.argmax(after.belongs, axis=1)]
+        late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # noise may shift it out of the window by as much
+        clear &= (contact > -late) & (contact < until + late)
+        contact = np.clip(contact, 0, until)
+    if not clear.any():
+        return None
+    place = sum(flight.start + flight.slope * contact[:, None] for flight in flown) / 2
+    both = before.belongs | after.belongs
+    drift = _lines(centre.only(both), np.arange(both.shape[1]), noise)
+    found = Candidates(
+        window=k,
+        grains=np.stack([i, j], axis=-1),
+        reach=(flights.diameters[i] + flights.diameters[j]) / 2,
+        time=pair.time,
+        separation=np.where(both[..., None], pair.positions, 0),
+        velocity=np.where((both & pair.has_velocity)[..., None], pair.velocities, 0),
+        has_velocity=pair.has_velocity,
+        before=before.belongs,
+        after=after.belongs,
+        duration=until,
+        guess=np.concatenate([place, contact[:, None], before.slope], axis=1),
+        drift=drift.misfit[:, -1],
+        drift_freedom=2.0 * (both * (1 + pair.has_velocity)).sum(axis=1) - 4,
+    )
+    return Candidates(*(x[clear] for x in found))
+
+
+def _around_windows(
+    flights: Flights, k: np.ndarray, i: np.ndarray, j: np.ndarray, apart: np.ndarray
+) -> tuple[np.ndarray, "_Observed", "_Observed"]:
+    """The frames (pairs, frames) around windows, and the motion there of disc i relative to j and of their centre.
+
+    That of the centre of mass is over the root mean square of the weights, so that it has the noise of one disc.
+    """
     around = k[:, None] + np.arange(-LONGEST, 2 + LONGEST)
     exists = (around >= 0) & (around < len(flights.time))
     frames = np.clip(around, 0, len(flights.time) - 1)
@@ -270,60 +320,27 @@ def _of_windows(
     v_image = v_j - slide[:, None]
     share = (flights.masses[i] / (flights.masses[i] + flights.masses[j]))[:, None, None]
     spread = np.sqrt(share**2 + (1 - share) ** 2)
-    pair = _Observed(time, of_i - image, v_i - v_image, exists)
-    centre = _Observed(
-        time, (share * of_i + (1 - share) * image) / spread, (share * v_i + (1 - share) * v_image) / spread, exists
-    )
-    of_pair = Noise(np.sqrt(2) * noise.position, np.sqrt(2) * noise.velocity, 0.0)
+    middle, v_middle = ((share * one + (1 - share) * other) / spread for one, other in ((of_i, image), (v_i, v_image)))
+    pair, centre = (_Observed(time, *motion, exists) for motion in ((of_i - image, v_i - v_image), (middle, v_middle)))
+    return frames, pair, centre
 
-    sides, lines = [], []
-    for outwards in (np.arange(LONGEST, -1, -1), np.arange(LONGEST + 1, 2 * LONGEST + 2)):
-        relative, straight = _straight_part(pair, centre, outwards, of_pair, noise)
-        if struck is not None:  # in the window before each further frame outwards
-            ends = np.minimum(np.minimum(frames[:, outwards[1:]], frames[:, outwards[:-1]]), len(struck) - 1)
-            passed = struck[ends, i[:, None]] | struck[ends, j[:, None]]
-            straight[:, 1:] &= np.cumsum(passed, axis=1) == 0
-        belongs = np.zeros(pair.present.shape, bool)
-        belongs[:, outwards] = straight & pair.present[:, outwards]
-        last = straight.sum(axis=1) - 1
-        sides.append(belongs)
-        lines.append(
-            [x[np.arange(len(i)), last] for x in (relative.settled, relative.start, relative.slope, relative.variance)]
-        )
-    (before, after), ((first, a, u, var_u), (second, b, w, var_w)) = sides, lines
-    change = w - u
-    size = np.sum(change**2, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        clear = first & second & (size > _LEAST_CHANGE**2 * (var_u + var_w))
-        contact = -np.sum((b - a) * change, axis=-1) / size
-        until = time[np.arange(len(i)), np.argmax(after, axis=1)]
-        late = 0.5 * until + 3 * of_pair.position / np.sqrt(size)  # noise may shift it out of the window by as much
-        clear &= (contact > -late) & (contact < until + late)
-        contact = np.clip(contact, 0, until)
-    if not clear.any():
-        return None
-    place = ((a + u * contact[:, None]) + (b + w * contact[:, None])) / 2
-    both = before | after
-    drift = _lines(_Observed(time, centre.positions, centre.velocities, exists, both), np.arange(time.shape[1]), noise)
-    freedom = 2.0 * (both * (1 + pair.has_velocity)).sum(axis=1) - 4
-    guess = np.concatenate([place, contact[:, None], u], axis=1)
-    return Candidates(
-        *(x[clear] for x in (
-            k,
-            np.stack([i, j], axis=-1),
-            (flights.diameters[i] + flights.diameters[j]) / 2,
-            time,
-            np.where(both[..., None], pair.positions, 0),
-            np.where((both & pair.has_velocity)[..., None], pair.velocities, 0),
-            pair.has_velocity,
-            before,
-            after,
-            until,
-            guess,
-            drift.misfit[:, -1],
-            freedom,
-        ))
-    )  # fmt: skip
+
+class _Flight(NamedTuple):
+    """The flight of each pair on one side of its window, and the line through it."""
+
+    belongs: np.ndarray  # (pairs, frames), whether a frame belongs to it
+    settled: np.ndarray  # as in ``_Lines``
+    start: np.ndarray
+    slope: np.ndarray
+    variance: np.ndarray
+
+
+def _flown(pair: "_Observed", outwards: np.ndarray, relative: "_Lines", straight: np.ndarray) -> _Flight:
+    """The flight that is straight up to a frame, and its line."""
+    belongs = np.zeros(pair.present.shape, bool)
+    belongs[:, outwards] = straight & pair.present[:, outwards]
+    end = np.arange(len(straight)), straight.sum(axis=1) - 1
+    return _Flight(belongs, *(x[end] for x in (relative.settled, relative.start, relative.slope, relative.variance)))
 
 
 def _straight_part(
@@ -342,11 +359,14 @@ def _straight_part(
 class _Observed:
     """Positions (pairs, frames, 2) and velocities of points at times (pairs, frames), and where they exist."""
 
-    def __init__(self, time, positions, velocities, exists, chosen=None):
+    def __init__(self, time, positions, velocities, exists):
         self.time, self.positions, self.velocities = time, positions, velocities
         self.present = exists & np.isfinite(positions[..., 0])
-        self.present = self.present if chosen is None else self.present & chosen
         self.has_velocity = self.present & np.isfinite(velocities[..., 0])
+
+    def only(self, chosen: np.ndarray) -> "_Observed":
+        """The same in the chosen frames only."""
+        return _Observed(self.time, self.positions, self.velocities, self.present & chosen)
 
 
 class _Lines(NamedTuple):

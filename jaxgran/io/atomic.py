@@ -16,10 +16,10 @@ from pathlib import Path
 import netCDF4  # noqa: F401 must precede h5py: if both bundle the same HDF5, netCDF4 fails when loaded second
 import numpy as np
 
-from jaxgran.files import atomic_write
+from jaxgran.files import atomic_write, other_version
 from jaxgran.model.checks import InputError, short_repr
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Version of the files of ``write_arrays``; a file of another one is not read."""
 
 _DIGEST = hashlib.sha256().digest_size  # bytes
@@ -97,9 +97,6 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, object]]:
             about = json.loads(str(file.attrs["about"]))
     except (OSError, KeyError, ValueError) as error:  # the checksum is right, but write_arrays did not write the file
         raise CorruptFile(f"{path.name} cannot be read: {error}") from error
-    if version != FORMAT_VERSION:
-        found = "no format_version" if version is None else f"format_version {version}"
-        raise InputError(
-            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
-        )
+    if difference := other_version(short_repr(str(path)), version, FORMAT_VERSION):
+        raise InputError(difference)
     return arrays, about

@@ -301,4 +301,4 @@ def require_observation(observation: Observation) -> None:
     if observation.shear_rate is not None:
         require_number("shear_rate", observation.shear_rate, np.isfinite, "a finite number")
     if observation.peculiar and not observation.shear_rate:
-        raise InputError(f"peculiar goes with a shear rate, and shear_rate is {short_repr(observation.shear_rate)}.")
+        raise InputError(f"peculiar requires a shear rate, and shear_rate is {short_repr(observation.shear_rate)}.")

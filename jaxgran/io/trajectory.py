@@ -28,6 +28,7 @@ log/jaxgran/force_strain       (1,)            –       strain over which force
 log/jaxgran/timestep           (1,)            1/γ̇     dt
 log/jaxgran/shear_rate         (1,)            1/t     γ̇
 log/jaxgran/restitution        (1,)            –       α
+log/jaxgran/format_version     (1,)            –       of these chunks; files of another one are refused
 =============================  ==============  ======  =================================================================
 """
 
@@ -47,7 +48,7 @@ from jaxgran.contact.clusters import cluster_labels
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import checked_numerics
 from jaxgran.dynamics.snapshots import Snapshot, snapshots_from
-from jaxgran.files import atomic_write
+from jaxgran.files import atomic_write, other_version
 from jaxgran.io.atomic import require_place
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import centred, remap_tilt, wrap
@@ -55,6 +56,9 @@ from jaxgran.model.checks import InputError, require_number, short_repr
 from jaxgran.model.flow import ShearFlow, steps_of_strain
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State, require_state
+
+FORMAT_VERSION = 1
+"""Version of the chunks of jaxgran."""
 
 _SCHEMA_VERSION = [1, 4]  # gsd 5 writes 2.0 by default, which older versions of gsd reject
 _NUMBERS = ("strain", "timestep", "shear_rate", "restitution")
@@ -64,7 +68,7 @@ _READ = (
     *(f"configuration/{name}" for name in ("step", "dimensions", "box")),
     *(f"particles/{name}" for name in ("N", "position", "velocity", "diameter", "mass")),
     *(f"{_EXACT}{name}" for name in ("position", "velocity", "radius", "mass")),
-    *(f"log/jaxgran/{name}" for name in ("side", "tilt", *_NUMBERS)),
+    *(f"log/jaxgran/{name}" for name in ("side", "tilt", "format_version", *_NUMBERS)),
 )
 Chunks = dict[str, Any]  # arrays of a frame by name
 
@@ -227,6 +231,7 @@ def _gsd_frame(seen: Snapshot, step: int):
         "shear_rate": shear_rate,
         "force_strain": len(steps) * timestep * shear_rate,
         "restitution": np.asarray(first.restitution, np.float64),
+        "format_version": FORMAT_VERSION,
     }
     frame.log = {
         "bonds/force": forces,
@@ -272,7 +277,8 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
       The states of all frames and the parameters of the flow.
 
     Raises:
-      InputError: (a ValueError) the file does not exist or is not such a trajectory; the message says why.
+      InputError: (a ValueError) the file does not exist, is not such a trajectory, or has another version of the
+        format; the message says why.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise InputError(f"path must be a file name, not {short_repr(path)}.")
@@ -282,6 +288,8 @@ def read_trajectory(path: str | os.PathLike) -> Trajectory:
     try:
         frames = list(_frames(os.fspath(path)))
     except InputError as reason:
+        if reason.field == "format_version":
+            raise
         raise InputError(f"{name} is not a trajectory of discs in a sheared cell: {reason}.") from None
     except Exception as error:  # a damaged file may raise any exception
         reason = short_repr(str(error)).strip("'\"").rstrip(".")
@@ -307,6 +315,10 @@ def _frames(path: str) -> Iterator[tuple[int, dict[str, float], State]]:
         if file.nframes == 0:
             raise InputError("it has no frames")
         first = _chunks(file, 0, {})
+        if f"{_EXACT}velocity" in first:  # jaxgran wrote it
+            found = first.get("log/jaxgran/format_version", [None])[0]
+            if difference := other_version(short_repr(path), found, FORMAT_VERSION):
+                raise InputError(difference, field="format_version")
         if "particles/position" in first and file.find_matching_chunk_names("particles/velocity"):
             at_rest = np.zeros_like(first["particles/position"])  # GSD does not store zeros
             first.setdefault("particles/velocity", at_rest)

@@ -1,6 +1,6 @@
 """Batches of a map: replicas of one number of grains and of similar cost, the most expensive first.
 
-So no core waits long at the end. The numbers of a replica do not depend on its batch.
+So no core is idle for long at the end. The numbers of a replica do not depend on its batch.
 """
 
 import math

@@ -3,33 +3,35 @@
 ==================  ================================================================================================
 file                content
 ==================  ================================================================================================
-``map.nc``          all parameters of the map, and the versions and precision that its results depend on
-``done-*.nc``       the replicas of a finished batch
+``map.nc``          the finished replicas, all parameters of the map, and the versions that its results depend on
 ``journal-*.nc``    a batch that is running, see ``journal``
 ``lock``            locked by the process that writes here; released when that process ends for any reason
 ==================  ================================================================================================
 
-Every file has a checksum. A damaged file is removed, and its replicas are computed again. The file name of a batch is a
-hash of the map and the replicas, so a file of another map is never taken for a part of this one.
+``map.nc`` is written again whenever a batch ends, but at most so often that this takes a twentieth of the time; the
+journals of batches that it lacks stay. Every file has a checksum. A damaged journal is removed, and its replicas are
+computed again.
 """
 
 import glob
-import hashlib
 import json
 import os
 import shutil
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
+from jaxgran.analysis.instant import Instant
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
-from jaxgran.maps.instants import as_arrays, from_arrays
 from jaxgran.maps.own_observables import identity_of, sums_by_name
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -41,6 +43,7 @@ try:
 except ImportError:  # a system without such locks: a second run on one output is not detected
     fcntl = None
 
+WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
 _VERSIONS = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 
@@ -63,63 +66,53 @@ class Checkpoint:
         self.done: dict[Key, Replica] = {}
         self.damaged: list[str] = []
         self._identity = _identity(settings)
+        self._ended: list[Path] = []  # journals of the batches that map.nc lacks
+        self._next_write = 0.0
         self._lock = _locked(self.folder, output)
         try:
             self._remove_leftovers()
-            unfinished = (self.folder / "map.nc").exists() and self._batches()
-            if unfinished and not resume:
-                raise InputError(
-                    f"output {str(output)!r} has an unfinished map: pass `resume=True` to continue it, or remove the "
-                    f"folder {str(self.folder)!r}.",
-                    field="output",
-                )
-            if unfinished:
-                self._require_same()
-                self._read()
-            else:
-                for path in self._batches():  # of a finished map whose folder was removed only in part
-                    path.unlink()
-                self._write_settings()
+            self._begin(resume)
         except BaseException:
-            self.close(finished=False)
+            self._unlock()
             raise
 
     def add(self, replicas: Mapping[Key, Replica]) -> None:
         """Keep the replicas of a finished batch."""
         self.done |= replicas
-        try:
-            self._write(replicas)
-        except FileNotFoundError:  # the folder was removed by hand: all results are written again
-            self._unlock()
-            self._lock = _locked(self.folder, self._output)
-            self._write_settings()
-            self._write(self.done)
-        self.journal_path(list(replicas)).unlink(missing_ok=True)
+        self._ended.append(self.journal_path(list(replicas)))
+        begun = time.monotonic()
+        if begun >= self._next_write:
+            self._write()
+            ended = time.monotonic()
+            self._next_write = ended + (ended - begun) / WRITING_SHARE
 
     def journal_path(self, keys: Sequence[Key]) -> Path:
-        """The file for the journal of a batch."""
-        return self.folder / f"journal-{self._name(keys)}.nc"
+        """The file for the journal of a batch, named after its first replica."""
+        point, seed = keys[0]
+        return self.folder / f"journal-{point}-{seed}.nc"
 
     def journals(self) -> list[list[Key]]:
         """The interrupted batches that can be continued from their journals."""
         found: list[list[Key]] = []
-        for path in sorted(self.folder.glob("journal-*.nc")):
-            arrays = self._arrays(path)
-            if arrays is None:
+        for path in self._journals():
+            try:
+                keys = [(point, seed) for point, seed in read_arrays(path)[0]["keys"].tolist()]
+            except CorruptFile:
+                self.damaged.append(path.name)
+                path.unlink(missing_ok=True)
                 continue
-            keys = [(point, seed) for point, seed in arrays["keys"].tolist()]
-            known = {*self.done, *(key for batch in found for key in batch)}
-            finished = bool(known & set(keys))  # its journal was about to be removed when the run ended
-            foreign = path != self.journal_path(keys)
-            if finished or foreign:
+            if self.done.keys() & set(keys):  # its journal was about to be removed when the run ended
                 path.unlink(missing_ok=True)
             else:
                 found.append(keys)
         return found
 
     def close(self, finished: bool) -> None:
-        """Release the lock, and remove the folder if the map is finished or has no batch yet."""
-        if (finished or not self._batches()) and _is_lock_of(self.folder, self._lock):
+        """Release the lock, and remove the folder if the map is finished or has not begun."""
+        if not finished and self._ended:
+            with suppress(OSError):  # the disc is full: the journals stay
+                self._write()
+        if (finished or not (self.done or self._journals())) and _is_lock_of(self.folder, self._lock):
             try:  # renamed in one operation, so that the next run finds the whole folder or none
                 os.replace(self.folder, self._discarded)
             except OSError:
@@ -140,69 +133,50 @@ class Checkpoint:
         for path in [*beside, *self.folder.glob(f".*-{unique}.nc")]:
             path.unlink(missing_ok=True)
 
-    def _batches(self) -> list[Path]:
-        """Files of finished and of running batches."""
-        return [path for kind in ("done", "journal") for path in self.folder.glob(f"{kind}-*.nc")]
+    def _begin(self, resume: bool) -> None:
+        """Read the unfinished map that is there, or write the parameters of a new one."""
+        path = self.folder / "map.nc"
+        if path.exists():
+            try:
+                arrays, begun = read_arrays(path)
+            except CorruptFile:
+                raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
+            if len(arrays["keys"]) or self._journals():
+                if not resume:
+                    raise InputError(
+                        f"output {str(self._output)!r} has an unfinished map: pass `resume=True` to continue it, or "
+                        f"remove the folder {str(self.folder)!r}.",
+                        field="output",
+                    )
+                self._require_same(begun)
+                self.done = _replicas_of(arrays, self.settings)
+                return
+        for journal in self._journals():
+            journal.unlink()
+        self._write()
+
+    def _journals(self) -> list[Path]:
+        return sorted(self.folder.glob("journal-*.nc"))
 
     def _unlock(self) -> None:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
 
-    def _name(self, keys: Sequence[Key]) -> str:
-        """A name that is unique to a batch of a map: a hash of both."""
-        text = json.dumps([self._identity, sorted(keys)], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    def _write(self, replicas: Mapping[Key, Replica]) -> None:
-        keys = [(*key, replica.status) for key, replica in replicas.items()]
-        samples = [replica.sample for replica in replicas.values()]
-        tallies = np.stack([flat_tally(sample.tally, np.shape(sample.tally.steps)) for sample in samples])
-        numbers = [(r.strain, r.sample.area, r.sample.shear_rate) for r in replicas.values()]
-        arrays = {"keys": np.array(keys, np.int64), "tallies": tallies, "numbers": np.array(numbers, np.float64)}
-        arrays |= as_arrays([replica.instant for replica in replicas.values()])
-        write_arrays(self.folder / f"done-{self._name(list(replicas))}.nc", arrays, {})
-
-    def _read(self) -> None:
-        dtype, own_sums = np.dtype(_precision()), sums_by_name(self.settings)
-        for path in sorted(self.folder.glob("done-*.nc")):
-            arrays = self._arrays(path)
-            if arrays is None:
-                continue
-            if path.name != f"done-{self._name([(point, seed) for point, seed, _ in arrays['keys'].tolist()])}.nc":
-                path.unlink(missing_ok=True)
-                continue
-            columns = arrays["keys"], arrays["tallies"], arrays["numbers"], from_arrays(arrays)
-            for row, tally, numbers, instant in zip(*columns, strict=True):
-                point, seed, status = row.tolist()
-                strain, area, shear_rate = numbers
-                tallies = tally_from_flat(tally, dtype, own_sums)
-                grains = self.settings.flows()[point].grains
-                sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), grains)
-                self.done[point, seed] = Replica(sample, status, float(strain), instant)
-
-    def _arrays(self, path: Path) -> dict[str, np.ndarray] | None:
-        """The content of a file; a damaged file is removed, its name noted, and the result is None."""
+    def _write(self) -> None:
+        path, arrays = self.folder / "map.nc", _arrays_of(self.done)
         try:
-            return read_arrays(path)[0]
-        except CorruptFile:
-            self.damaged.append(path.name)
-            path.unlink(missing_ok=True)
-            return None
+            write_arrays(path, arrays, self._identity)
+        except FileNotFoundError:  # the folder was removed by hand
+            self._unlock()
+            self._lock = _locked(self.folder, self._output)
+            write_arrays(path, arrays, self._identity)
+        for journal in self._ended:
+            journal.unlink(missing_ok=True)
+        self._ended = []
 
-    def _write_settings(self) -> None:
-        write_arrays(self.folder / "map.nc", {}, self._identity)
-
-    def _require_same(self) -> None:
+    def _require_same(self, begun: Mapping[str, object]) -> None:
         """Raise an InputError with the first difference between this map and the unfinished one."""
-        try:
-            _, begun = read_arrays(self.folder / "map.nc")
-        except CorruptFile:
-            if not self._has_batch_of_this_map():
-                raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
-            self.damaged.append("map.nc")
-            self._write_settings()
-            return
         for name, value in self._identity.items():
             if begun.get(name) != value:
                 raise InputError(
@@ -210,16 +184,36 @@ class Checkpoint:
                     "resume it with the same parameters, or remove the folder."
                 )
 
-    def _has_batch_of_this_map(self) -> bool:
-        """Whether the name of a file shows that it is a batch of this map."""
-        for path in self._batches():
-            try:
-                keys = [(row[0], row[1]) for row in read_arrays(path)[0]["keys"].tolist()]
-            except CorruptFile:
-                continue
-            if path.stem.endswith(f"-{self._name(keys)}"):
-                return True
-        return False
+
+def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
+    """Replicas as arrays for a file, in which each instant has arrays of its own."""
+    tallies = [flat_tally(one.sample.tally, np.shape(one.sample.tally.steps)) for one in replicas.values()]
+    arrays = {
+        "keys": np.array([(*key, one.status) for key, one in replicas.items()], np.int64).reshape(-1, 3),
+        "tallies": np.array(tallies),
+        "numbers": np.array([(one.strain, one.sample.area, one.sample.shear_rate) for one in replicas.values()], float),
+    }
+    for row, one in enumerate(replicas.values()):
+        if one.instant is not None:
+            arrays |= {f"{name}-{row}": np.asarray(x) for name, x in one.instant._asdict().items()}
+    return arrays
+
+
+def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dict[Key, Replica]:
+    """The replicas of ``_arrays_of``."""
+    dtype, own_sums, flows = np.dtype(_precision()), sums_by_name(settings), settings.flows()
+    replicas = {}
+    for row, ((point, seed, status), tally, (strain, area, shear_rate)) in enumerate(
+        zip(arrays["keys"].tolist(), arrays["tallies"], arrays["numbers"], strict=True)
+    ):
+        tallies = tally_from_flat(tally, dtype, own_sums)
+        sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
+        instant = None
+        if f"side-{row}" in arrays:
+            found: dict[str, Any] = {name: arrays[f"{name}-{row}"] for name in Instant._fields}
+            instant = Instant(**{name: x if x.ndim else x.item() for name, x in found.items()})
+        replicas[point, seed] = Replica(sample, status, float(strain), instant)
+    return replicas
 
 
 def _identity(settings: MapSettings) -> dict[str, object]:

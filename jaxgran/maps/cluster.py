@@ -1,6 +1,6 @@
 """Tasks on the workers of a running Dask cluster, on this machine or started by Slurm.
 
-The cluster replaces workers that die and repeats their tasks. It gives up a task whose workers have died too often.
+The cluster replaces workers that die and repeats their tasks. It gives up on a task whose workers have died too often.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -23,7 +23,7 @@ def run_on_cluster(address: str, function: Callable[..., T], tasks: Sequence[tup
       tasks: arguments of each call; the first tasks start first.
 
     Yields:
-      The number of the task, and its result when it is there; None if the cluster gave it up.
+      The number of a finished task and its result; None if the cluster gave up on it.
 
     Raises:
       InputError: (a ValueError) Dask is not installed, or no scheduler answers at the address.

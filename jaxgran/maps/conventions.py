@@ -8,7 +8,7 @@ units                  all numbers but flags                "1": all are in unit
 reduced_unit           numbers that are not pure numbers    this unit, such as "m sigma / t^2"
 ancillary_variables    values with errors, values by seed   names of their errors and of their status, "/status" where
                                                             it is in the root
-cell_methods           averages                             over what a value is an average; realization is the seed
+cell_methods           averages                             what a value is averaged over; a realization is a seed
 coordinates            all, in the file                     number of grains and time step where a map has one of each
 flag_values,           statuses, convergence                numbers and their meanings
 flag_meanings

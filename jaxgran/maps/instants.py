@@ -72,11 +72,11 @@ def first_of_points(replicas: Mapping[Key, Replica | None]) -> dict[int, Instant
 
 
 def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
-    """The instant that follows the state of a batch of one replica; None if the flow does not stay finite."""
+    """The instant after the state of a batch of one replica; None if the flow does not stay finite."""
     steps = _steps(flow)
     found: list[Instant] = []
     advance = Recorder(0.0, lambda frame, _: found.append(instant_of(frame))).recording(advance_batch)
-    # one step less than snapshots: a snapshot has the forces of the step that it begins
+    # one step fewer than snapshots: a snapshot has the forces of the step that begins with it
     advance(flow, numerics, state, jnp.array([steps - 1], jnp.int32))
     return averaged(found) if len(found) == steps else None
 
@@ -84,47 +84,6 @@ def _taken(flow: ShearFlow, numerics: Numerics, state: State) -> Instant | None:
 def _steps(flow: ShearFlow) -> int:
     """The number of time steps of the window."""
     return min(max(1, int(steps_of_strain(flow, WINDOW).item())), _MOST_STEPS)
-
-
-def as_arrays(instants: Sequence[Instant | None]) -> dict[str, np.ndarray]:
-    """The instants of replicas as a few arrays for a file, one after the other; ``from_arrays`` is the inverse."""
-    there = [one for one in instants if one is not None]
-    sizes = [(0, 0) if one is None else (len(one.radii), len(one.force)) for one in instants]
-    grains = [np.column_stack([one.positions, one.radii, one.speed]) for one in there]
-    forces = [np.column_stack([one.force, one.clustered]) for one in there]
-    return {
-        "instant_sizes": np.array(sizes, np.int64),
-        "instant_cells": np.array([(one.side, one.tilt, one.window) for one in there]).reshape(-1, 3),
-        "instant_grains": np.concatenate([np.zeros((0, 4)), *grains]),
-        "instant_pairs": np.concatenate([np.zeros((0, 2), np.int64), *(one.pairs for one in there)]),
-        "instant_forces": np.concatenate([np.zeros((0, 2)), *forces]),
-    }
-
-
-def from_arrays(arrays: Mapping[str, np.ndarray]) -> list[Instant | None]:
-    """The instants of ``as_arrays``, one or None for each replica."""
-    found: list[Instant | None] = []
-    grain, pair, cells = 0, 0, iter(arrays["instant_cells"].tolist())
-    for grains, pairs in arrays["instant_sizes"].tolist():
-        if grains == 0:
-            found.append(None)
-            continue
-        of_grains = arrays["instant_grains"][grain : grain + grains]
-        forces = arrays["instant_forces"][pair : pair + pairs]
-        of_pairs = arrays["instant_pairs"][pair : pair + pairs]
-        found.append(
-            Instant(
-                of_grains[:, :2],
-                of_grains[:, 2],
-                of_grains[:, 3],
-                of_pairs,
-                forces[:, 0],
-                forces[:, 1] > 0,
-                *next(cells),
-            )
-        )
-        grain, pair = grain + grains, pair + pairs
-    return found
 
 
 def instant_variables(grid: PointGrid, instants: Mapping[int, Instant]) -> dict[str, xr.Variable]:

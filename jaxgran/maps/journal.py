@@ -25,8 +25,8 @@ from jaxgran.sampling.batch import ObserveBatch
 from jaxgran.sampling.observe import Observable, observed_shapes
 
 SECONDS = 5.0  # shortest time between two writes of a journal
-_WRITING_SHARE = 0.05  # of the time: large journals are written less often
-_LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of large journals
+WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
+_LONGEST_PAUSE = 45.0  # seconds; longest time between two writes, also of a large journal
 
 
 class Journal:
@@ -36,19 +36,18 @@ class Journal:
       path: file of the journal. If its folder is removed, the journal is not written, and the batch continues.
       keys: point and seed of each replica of the batch, in order.
       advance: advances the batch after the end of the journal.
-      seconds: time between two writes; None for ``SECONDS``, or longer if a write itself takes long.
 
     Raises:
       CorruptFile: the file is the journal of another batch, or cannot be read.
     """
 
-    def __init__(self, path: Path, keys: Sequence[Sequence[int]], advance: ObserveBatch, seconds: float | None = None):
-        self.path, self.advance, self.seconds = path, advance, seconds
+    def __init__(self, path: Path, keys: Sequence[Sequence[int]], advance: ObserveBatch):
+        self.path, self.advance = path, advance
         self.keys = np.asarray(keys, np.int64)
         self.steps: list[np.ndarray] = []
         self.tallies: list[np.ndarray] = []
         self.leaves: list[np.ndarray] = []
-        self.position, self.next = 0, time.monotonic() + (SECONDS if seconds is None else seconds)
+        self.position, self.next = 0, time.monotonic() + SECONDS
         if path.exists():
             self._read()
 
@@ -85,10 +84,7 @@ class Journal:
         with suppress(FileNotFoundError):  # the folder was removed; ``Checkpoint.add`` makes it again
             write_arrays(self.path, {"keys": self.keys, **series, **states}, {})
         now = time.monotonic()
-        pause = (
-            max(SECONDS, min((now - begun) / _WRITING_SHARE, _LONGEST_PAUSE)) if self.seconds is None else self.seconds
-        )
-        self.next = now + pause
+        self.next = now + max(SECONDS, min((now - begun) / WRITING_SHARE, _LONGEST_PAUSE))
 
     def _read(self) -> None:
         arrays, _ = read_arrays(self.path)

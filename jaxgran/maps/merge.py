@@ -25,8 +25,8 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
     status ``not_run``.
 
     Args:
-      maps: data of maps, as ``ratio_map`` returns them, or their files. They have the same settings but ``part``,
-        ``seeds`` and ``first_seed``, and their seeds follow one another.
+      maps: data of maps, as ``ratio_map`` returns them, or their files. They have the same settings except
+        ``part``, ``seeds`` and ``first_seed``, and their seeds follow one another.
       observe: the function that the maps were made with, if they were made with one, as files do not contain it.
 
     Raises:
@@ -59,7 +59,9 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
         missing = next(seed for seed in range(numbers[0], numbers[-1]) if seed not in numbers)
         raise InputError(f"the seeds of the maps must follow one another, and seed {missing} is missing.")
     if chosen[0].get("error") is not None and len({one["seeds"] for one in chosen} | {len(numbers)}) > 1:
-        raise InputError("maps with an `error` sample by their number of seeds, so those of other seeds stay apart.")
+        raise InputError(
+            "maps with an `error` sample by their number of seeds, so they cannot be merged with other seeds."
+        )
     merged: dict[str, Any] = {**chosen[0], "first_seed": numbers[0], "seeds": len(numbers), "observe": observe}
     settings = MapSettings(**{name: value for name, value in merged.items() if name != "part"})
     if identity_of(settings) != chosen[0].get("observe"):

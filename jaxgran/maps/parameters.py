@@ -113,7 +113,7 @@ class MapParameters:
         default=None,
         metadata=row(
             "Relative error of force ratio and stresses to reach at every point, half of a 95 % interval: sets the "
-            "strain, and is what auto aims at.",
+            "strain, and is the target of auto.",
             range=_ERROR,
         ),
     )
@@ -211,7 +211,7 @@ class RunParameters(MapParameters):
     from_map: str | Path | None = field(
         default=None,
         metadata=row(
-            "Repeat the map of this file; other parameters replace its own.",
+            "Repeat the map of this file; parameters that are given replace those of the file.",
             Path,
             commands=("map",),
             example="FILE.nc",

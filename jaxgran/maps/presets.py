@@ -1,4 +1,4 @@
-"""What a map starts from: a preset or the map of a file, what is given on top, and what a requested error chooses.
+"""The parameters of a map: those of a preset or of a file, replaced by those that are given and what they imply.
 
 This module loads neither JAX nor xarray at once, as the help of the command line needs the names of the presets.
 """
@@ -56,7 +56,7 @@ def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a preset or a file, replaced by those that are given and by what these choose."""
+    """The parameters of a preset or a file, replaced by those that are given and by what these imply."""
     replaced = {"error": ("seeds", "strain"), "strain": ("error",), "polydispersity": ("diameters",)}
     left_out = {name for option, names in replaced.items() if given.get(option) is not None for name in names}
     kept = {name: value for name, value in start.items() if name not in left_out}
@@ -68,7 +68,7 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
 
 
 def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
-    """What a requested error chooses unless it is given; a longer sample is cheaper than a second seed."""
+    """What a requested error implies unless it is given; a longer sample is cheaper than a second seed."""
     automatic = {"grains": "auto", "timestep": "auto", "tolerance": "auto", "seeds": 1}
     return automatic if given.get("error") is not None else {}
 

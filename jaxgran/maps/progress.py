@@ -13,14 +13,14 @@ from jaxgran.maps.replica import Advance, Key
 from jaxgran.maps.settings import MapSettings
 
 _SECONDS_BETWEEN_LINES = 10  # without a terminal
-_MOST_STARTED = 0.95  # largest share of a replica that is done before it is finished
+_MOST_STARTED = 0.95  # largest share that counts as done before a replica is finished
 
 
 class Meter:
     """How much of a map is done, reported on standard error: a bar on a terminal, lines elsewhere.
 
-    A replica counts by its cost, and while it runs by the cost of the strain that it has been sheared, up to
-    ``_MOST_STARTED``: the strain until it is steady and its errors are small is not known before.
+    A finished replica counts by its cost. A running one counts by the cost of the strain it has been sheared so far, up
+    to ``_MOST_STARTED``, since the strain that it needs is not known in advance.
 
     Args:
       settings: the map.
@@ -33,7 +33,7 @@ class Meter:
         self.left = dict.fromkeys(points_of_part(settings), settings.seeds)
         self.running: dict[Key, float] = {}  # share of each replica that has been started
         self.total = sum(self.costs[point] for point in self.left) * settings.seeds
-        self.done_steps, self.done_cost, self.known_cost = 0.0, 0.0, 0.0
+        self.done_steps, self.done_cost, self.resumed_cost = 0.0, 0.0, 0.0
         self.start = self.last_line = time.perf_counter()
         self.console = Console(stderr=True, quiet=quiet)
         self.bar = Progress(
@@ -42,7 +42,7 @@ class Meter:
         self.task = self.bar.add_task("compiling", total=self.total)
 
     def advanced(self, advance: Advance) -> None:
-        """Count what replicas have been advanced by."""
+        """Count the steps of an advance."""
         self.done_steps += float(np.sum(advance.steps))
         columns = np.asarray(advance.timestep).tolist(), np.asarray(advance.steps).tolist()
         for key, timestep, steps in zip(advance.keys, *columns, strict=True):
@@ -51,10 +51,10 @@ class Meter:
         self._show()
 
     def resumed(self, keys: Iterable[Key]) -> None:
-        """Count the replicas of an earlier run; the estimate of the time left leaves them out."""
+        """Count the replicas of an earlier run, which the estimate of the time left excludes."""
         for point, _ in keys:
             self.left[point] -= 1
-            self.known_cost += self.costs[point]
+            self.resumed_cost += self.costs[point]
 
     def finished(self, key: Key) -> None:
         """Count a finished replica."""
@@ -65,12 +65,12 @@ class Meter:
 
     @property
     def _cost_of_run(self) -> float:
-        """Cost of what this run has done."""
+        """Cost of the work of this run so far."""
         return self.done_cost + sum(self.costs[point] * share for (point, _), share in self.running.items())
 
     def _show(self) -> None:
         if self.console.is_terminal:
-            self.bar.update(self.task, completed=self.known_cost + self._cost_of_run, description=self._line())
+            self.bar.update(self.task, completed=self.resumed_cost + self._cost_of_run, description=self._line())
         elif time.perf_counter() - self.last_line > _SECONDS_BETWEEN_LINES:
             self.last_line = time.perf_counter()
             self.console.print(self._line(), highlight=False)
@@ -78,8 +78,10 @@ class Meter:
     def _line(self) -> str:
         seconds, done = time.perf_counter() - self.start, self._cost_of_run
         points = sum(left == 0 for left in self.left.values())
-        percent = 100 * (self.known_cost + done) / self.total
-        left = _duration(seconds * max(self.total - self.known_cost - done, 0.0) / done) if done > 0 else "unknown time"
+        percent = 100 * (self.resumed_cost + done) / self.total
+        left = (
+            _duration(seconds * max(self.total - self.resumed_cost - done, 0.0) / done) if done > 0 else "unknown time"
+        )
         speed = f"{self.done_steps / seconds:.3g} replica-steps/s"
         return f"{points}/{len(self.left)} points, {percent:.0f} % done, {speed}, {left} left"
 

@@ -16,10 +16,10 @@ import numpy as np
 from jaxgran.dynamics.advance import register_numba
 from jaxgran.dynamics.engine import Numba, select_engine
 from jaxgran.environment import usable_cores
+from jaxgran.io.atomic import require_place
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.interruption import Interrupted, is_interruption
-from jaxgran.maps.output import check_output
 from jaxgran.maps.own_observables import label_units, sums_by_name
 from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
@@ -134,7 +134,7 @@ def _checked(run: RunParameters) -> Path | None:
     if run.record is not None and not callable(run.record):
         raise refused("record", run.record, "must be a function")
     if run.record is not None and (run.resume or several or run.scheduler is not None):
-        raise InputError("what is recorded cannot be resumed, and needs one worker.", field="record")
+        raise InputError("`record` requires one worker, and excludes `resume`.", field="record")
     if run.attributes is not None and not isinstance(run.attributes, dict):
         raise refused("attributes", run.attributes, "must be a dictionary")
     if run.output is None:
@@ -144,7 +144,7 @@ def _checked(run: RunParameters) -> Path | None:
     if not isinstance(run.output, (str, os.PathLike)):
         raise refused("output", run.output, "must be a file name")
     output = Path(run.output)
-    check_output(output)
+    require_place(output, "output", ".nc")
     return output
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from jaxgran.files import atomic_write
+from jaxgran.files import atomic_write, other_version
 from jaxgran.maps.parameters import BY_POINT
 from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
 from jaxgran.model.checks import InputError, refused, short_repr
@@ -58,12 +58,8 @@ def open_map(path: str | Path) -> xr.DataTree:
     problem = what_lacks(data, *RATIO, "status")
     if problem:
         raise InputError(f"{short_repr(str(path))} is not a ratio map: {problem}.")
-    version = data.attrs.get("format_version")
-    if version != FORMAT_VERSION:
-        found = "no format_version" if version is None else f"format_version {version}"
-        raise InputError(
-            f"{short_repr(str(path))} has {found}, and this version of jaxgran reads format_version {FORMAT_VERSION}."
-        )
+    if difference := other_version(short_repr(str(path)), data.attrs.get("format_version"), FORMAT_VERSION):
+        raise InputError(difference)
     return data
 
 

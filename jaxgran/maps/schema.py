@@ -1,4 +1,4 @@
-"""The groups and names in the data of a map, checked before they are drawn or fitted, and selections from them.
+"""The groups and names in the data of a map: checks before they are drawn or fitted, and selections.
 
 The data of a map are a DataTree. Functions that read it also accept a Dataset, such as its root alone, or a selection
 that has been flattened.
@@ -26,7 +26,7 @@ ERROR_SOURCES = ("total", "sampling", "timestep", "size", "tolerance")
 """Coordinate of ``NAME_ci95``."""
 
 FINEST: dict[str, Callable[[list], float]] = {"grains": max, "timestep": min}
-"""Dimensions of a map that has several numbers of grains or time steps, and which of them has the smallest errors."""
+"""Optional dimensions of a map, each with the function that picks the value of the smallest errors."""
 
 _AXES = ("packing_fraction", "restitution")
 
@@ -85,9 +85,9 @@ def what_lacks(data: Any, *names: str) -> str:
 
 
 def finest(data: MapData, *names: str) -> xr.Dataset:
-    """A map at its largest number of grains and its shortest time step, flattened; they become its attributes.
+    """A map at its largest number of grains and its shortest time step, flattened; these become its attributes.
 
-    With names of these two dimensions, only they are selected.
+    If names of these dimensions are given, the others remain.
     """
     data = flattened(data)
     for name in names or FINEST:
@@ -117,14 +117,14 @@ def timestep_text(data: MapData) -> str:
 
 
 def has_one_timestep(data: MapData) -> bool:
-    """Whether the force ratios of a map compare: they depend on the time step."""
+    """Whether all points have one time step, without which their force ratios are not comparable."""
     return "point_timestep" not in data
 
 
 def require_one_timestep(data: MapData, what: str) -> None:
-    """Raise an InputError if the force ratios of a map do not compare."""
+    """Raise an InputError if the force ratios of a map are not comparable."""
     if not has_one_timestep(data):
-        reason = f"force ratios of one time step, and those of this map are {timestep_text(data)} / shear rate"
+        reason = f"force ratios at one time step, and those of this map are at {timestep_text(data)} / shear rate"
         raise InputError(f"{what} needs {reason}: make a map with a number for `timestep`.")
 
 

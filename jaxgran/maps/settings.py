@@ -262,7 +262,7 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
     sentence = f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
     if chosen["timestep_by_point"] is not None:
-        sentence += " Force ratios at different time steps do not compare, and are not contoured."
+        sentence += " Force ratios at different time steps are not comparable, so they have no contours."
     return MapSettings(**chosen), sentence
 
 

@@ -1,4 +1,4 @@
-"""What a user can choose, the limits of numbers, and what an error means: all that needs no other module."""
+"""Choices of a user, limits of numbers, and the width of intervals: constants that need no other module."""
 
 from typing import Literal
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
@@ -18,10 +18,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.text import Annotation, Text
 
-from jaxgran.analysis.force_chains import pair_forces
+from jaxgran.analysis.instant import Instant, instant_of
 from jaxgran.analysis.series import series
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.model.cell import centred, minimum_image
+from jaxgran.model.cell import minimum_image
 from jaxgran.model.checks import InputError, require_untraced, short_repr
 from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TICK_SIZE, empty_figure, image_segments, scientific
 from jaxgran.plotting.encoding import (
@@ -56,23 +56,20 @@ _LINE_MARGIN = 0.05  # in sides of the cell, at least half of the width of a lin
 
 
 class Scene(NamedTuple):
-    """What a picture shows of a flow, in units of σ, m and 1/γ̇; the cell is centred at the origin."""
+    """What a picture shows of a flow, in units of σ, m and 1/γ̇."""
 
-    centres: Float[np.ndarray, "grains 2"]  # within the cell
-    radii: Float[np.ndarray, " grains"]
-    speed: Float[np.ndarray, " grains"]  # |c|, without the shear
+    instant: Instant
     pressure: Float[np.ndarray, " grains"]  # Σ F r/2πr² over the contacts of each grain
-    starts: Float[np.ndarray, "pairs 2"]  # centre of one grain of each loaded pair
-    branches: Float[np.ndarray, "pairs 2"]  # from there to the centre of the other grain
-    force: Float[np.ndarray, " pairs"]  # mean over the times of the window
-    clustered: Bool[np.ndarray, " pairs"]  # whether most of it acts within clusters of three or more
-    side: float
-    tilt: float
     restitution: float
     packing_fraction: float
     timestep: float
     times: int  # number of snapshots in the window
     window: float  # strain of the window; whole numbers between snapshots are not counted
+
+    @property
+    def speed(self) -> Float[np.ndarray, " grains"]:
+        """|c|, without the shear."""
+        return self.instant.speed
 
 
 class Scale(NamedTuple):
@@ -85,9 +82,7 @@ class Scale(NamedTuple):
     force: float
 
 
-def flow_figure(
-    seen: Snapshot, colour: Colour = "speed", strain: float | None = None, scale: Scale | None = None
-) -> Figure:
+def flow_figure(seen: Snapshot, colour: Colour = "speed", strain: float | None = None) -> Figure:
     """A picture of a flow: its grains and the forces between them.
 
     Args:
@@ -96,7 +91,6 @@ def flow_figure(
         with a snapshot of each of a hundred steps (``snapshot_series``) shows all collisions of that time.
       colour: "speed", |c| without the shear, or "pressure", of the contacts of each grain over its own area.
       strain: strain since the start for the title, or None to leave it out.
-      scale: values of the deepest colour and the widest line, or None to choose them from the data.
 
     Raises:
       ValueError: ``seen`` is not such a snapshot or not finite, or the colour is unknown.
@@ -104,7 +98,7 @@ def flow_figure(
     scene = scene_of(seen)
     require_colour(colour)
     figure = empty_figure(5.4, 5.4)
-    draw_picture(figure.subplots(), scene, colour, scale or common_scale([scene], colour), strain)
+    draw_picture(figure.subplots(), scene, colour, common_scale([scene], colour), strain)
     return figure
 
 
@@ -121,32 +115,21 @@ def scene_of(seen: Snapshot) -> Scene:
             f"seen must be a Snapshot of one flow or a series of them, not {short_repr(type(seen).__name__)}."
         )
     require_untraced("flow_figure", "draw what the transformed function returns", seen)
-    frames, pairs = series(seen), pair_forces(seen)
+    frames = series(seen)
     state, times = frames.state, len(frames.state.side)
     middle = times // 2
-    positions, velocities, radii = (x[middle] for x in (state.positions, state.velocities, state.grains.radii))
-    if not (np.isfinite(positions).all() and np.isfinite(velocities).all()):
+    if not (np.isfinite(state.positions[middle]).all() and np.isfinite(state.velocities[middle]).all()):
         raise InputError("seen must be a flow of finite positions and velocities.")
-    side, tilt = state.side[middle].item(), state.tilt[middle].item()
-    places = centred(positions, side, tilt)
-    pushed = sum(np.bincount(grain, pairs.force, minlength=len(radii)) for grain in (pairs.i, pairs.j))
     rate = frames.shear_rate[middle].item()
     if not rate > 0:
         raise InputError("seen must be of a sheared flow: its shear rate is the unit of the picture.")
-    step = frames.timestep[middle].item() * rate
+    step, instant = frames.timestep[middle].item() * rate, instant_of(seen)
+    radii = instant.radii
     return Scene(
-        centres=places,
-        radii=radii,
-        speed=np.hypot(*velocities.T) / rate,
-        pressure=pushed / (2 * np.pi * radii) / rate**2,
-        starts=places[pairs.j],
-        branches=minimum_image(positions[pairs.i] - positions[pairs.j], side, tilt),
-        force=pairs.force / rate**2,
-        clustered=pairs.cluster_share > 0.5,
-        side=side,
-        tilt=tilt,
+        instant=instant,
+        pressure=np.bincount(instant.pairs.ravel(), np.repeat(instant.force, 2), len(radii)) / (2 * np.pi * radii),
         restitution=frames.restitution[middle].item(),
-        packing_fraction=float(np.sum(np.pi * radii**2) / side**2),
+        packing_fraction=float(np.sum(np.pi * radii**2) / instant.side**2),
         timestep=step,
         times=times,
         window=times * (step if times == 1 else float(np.mean(np.diff(state.tilt) % 1))),
@@ -157,7 +140,7 @@ def common_scale(scenes: Iterable[Scene], colour: Colour) -> Scale:
     """One scale for several pictures, so that they can be compared."""
     scenes = list(scenes)
     values = np.concatenate([getattr(scene, colour) for scene in scenes])
-    forces = np.concatenate([scene.force for scene in scenes])
+    forces = np.concatenate([scene.instant.force for scene in scenes])
     return Scale(deepest(values), widest(forces))
 
 
@@ -190,9 +173,10 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artist
 
     Parts that reach over an edge of the cell are cut and drawn at the opposite edge.
     """
-    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * scene.side), default=1)
-    half_width = 0.505 * scene.side * (1 + abs(scene.tilt))
-    low, high = -0.6 * scene.side, 0.505 * scene.side
+    side = scene.instant.side
+    length = max((n for n in (1, 2, 5, 10, 20, 50, 100) if n <= 0.3 * side), default=1)
+    half_width = 0.505 * side * (1 + abs(scene.instant.tilt))
+    low, high = -0.6 * side, 0.505 * side
     axes.set(xlim=(-half_width, half_width), ylim=(low, high), aspect="equal")
     axes.set_axis_off()
     (scale_bar,) = axes.plot([0, length], [0, 0], color="black", linewidth=1.6, solid_capstyle="butt")
@@ -228,46 +212,47 @@ def draw_scene(axes: Axes, scene: Scene, colour: Colour, scale: Scale) -> Artist
 
 def show_scene(artists: Artists, scene: Scene, colour: Colour, scale: Scale) -> None:
     """Show another scene of a cell of the same side by artists that are there."""
-    corners = scene.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    corners[:, 0] += scene.tilt * corners[:, 1]
+    instant = scene.instant
+    corners = instant.side * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    corners[:, 0] += instant.tilt * corners[:, 1]
     artists.cell.set_xy(corners)
-    which, places = _images(scene)
-    diameters = 2 * scene.radii[which]
+    which, places = _images(instant)
+    diameters = 2 * instant.radii[which]
     artists.grains.set(widths=diameters, heights=diameters, angles=np.zeros(which.size), offsets=places)
     artists.grains.set_array(getattr(scene, colour)[which])
-    segments, pairs = _segments(scene)
-    widths = np.clip(WIDEST_LINE * scene.force / scale.force, THINNEST_LINE, WIDEST_LINE)
-    for lines, chosen in ((artists.clusters, scene.clustered[pairs]), (artists.binaries, ~scene.clustered[pairs])):
+    segments, pairs = _segments(instant)
+    widths = np.clip(WIDEST_LINE * instant.force / scale.force, THINNEST_LINE, WIDEST_LINE)
+    in_clusters = instant.clustered[pairs]
+    for lines, chosen in ((artists.clusters, in_clusters), (artists.binaries, ~in_clusters)):
         lines.set_segments(list(segments[chosen]))
         lines.set(linewidths=widths[pairs[chosen]])
     for artist in (artists.grains, artists.clusters, artists.binaries):
         artist.set_clip_path(artists.cell)
-    start, length = -0.5 * scene.side * (1 + scene.tilt), np.ptp(artists.scale_bar.get_xdata())
-    low = -0.57 * scene.side
+    start, length = -0.5 * instant.side * (1 + instant.tilt), np.ptp(artists.scale_bar.get_xdata())
+    low = -0.57 * instant.side
     artists.scale_bar.set_data([start, start + length], [low, low])
     artists.scale_label.xy = (start + length, low)
 
 
-def _segments(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _segments(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
     """Lines and images of lines that reach into the cell: their ends (images, 2, 2) in σ, and indices of the pairs."""
-    shifts = scene.side * np.array([(a + scene.tilt * b, b) for a, b in _LATTICE])
-    ends = image_segments(scene.starts, scene.branches, shifts)
-    along, up = ends[..., 0] - scene.tilt * ends[..., 1], ends[..., 1]
-    reach = (0.5 + _LINE_MARGIN) * scene.side
+    i, j = instant.positions[instant.pairs.T]
+    branches = minimum_image(i - j, instant.side, instant.tilt)
+    shifts = instant.side * np.array([(a + instant.tilt * b, b) for a, b in _LATTICE])
+    ends = image_segments(j, branches, shifts)
+    along, up = ends[..., 0] - instant.tilt * ends[..., 1], ends[..., 1]
+    reach = (0.5 + _LINE_MARGIN) * instant.side
     inside = np.all([(x.min(axis=-1) < reach) & (x.max(axis=-1) > -reach) for x in (along, up)], axis=0)
-    return ends[inside], np.tile(np.arange(len(scene.force)), len(shifts))[inside]
+    return ends[inside], np.tile(np.arange(len(instant.force)), len(shifts))[inside]
 
 
-def _images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _images(instant: Instant) -> tuple[np.ndarray, np.ndarray]:
     """Grains and images that reach into the cell: indices of the grains (images,) and positions (images, 2) in σ."""
-    shifts = np.array(_LATTICE, float)
-    places = scene.centres[:, None] + scene.side * np.stack(
-        [shifts[:, 0] + scene.tilt * shifts[:, 1], shifts[:, 1]], -1
-    )
+    side, tilt, radii = instant.side, instant.tilt, instant.radii[:, None]
+    places = instant.positions[:, None] + side * np.array([(a + tilt * b, b) for a, b in _LATTICE])
     y = places[..., 1]
-    x = places[..., 0] - scene.tilt * y
-    reach = scene.radii[:, None] * np.hypot(1, scene.tilt)
-    inside = (abs(x) <= scene.side / 2 + reach) & (abs(y) <= scene.side / 2 + scene.radii[:, None])
+    x = places[..., 0] - tilt * y
+    inside = (abs(x) <= side / 2 + radii * np.hypot(1, tilt)) & (abs(y) <= side / 2 + radii)
     which, image = np.nonzero(inside)
     return which, places[which, image]
 
@@ -288,7 +273,7 @@ def title_of(scene: Scene, strain: float | None = None) -> str:
     parts = [
         rf"$\alpha={scene.restitution:g}$",
         rf"$\nu={scene.packing_fraction:.4g}$",
-        rf"$N={len(scene.radii)}$",
+        rf"$N={len(scene.pressure)}$",
         rf"$\mathrm{{d}}t={scientific(scene.timestep)}/\dot\gamma$",
     ]
     if strain is not None:

@@ -101,7 +101,7 @@ def _drawings(figure: Figure, frames: Frames, follow: _Follow) -> Iterator[np.nd
     first, canvas = frames.scenes[0], FigureCanvasAgg(figure)
     axes = figure.add_axes(_AXES_PLACE)
     artists = draw_picture(axes, first, "speed", scale, frames.strains[0])
-    axes.set_xlim(-_HALF_WIDTH * first.side, _HALF_WIDTH * first.side)
+    axes.set_xlim(-_HALF_WIDTH * first.instant.side, _HALF_WIDTH * first.instant.side)
     for artist in artists:
         artist.set_animated(True)
     canvas.draw()

@@ -112,7 +112,9 @@ def ratio_curves(data: MapData) -> Figure:
     _set_ratio_scale(grid[0], np.concatenate([data[name].values for name in labels]))
     add_curve_legend(figure, data, handles, ALPHA_TITLE)
     measured = np.isfinite(data.force_ratio.values)
-    compare = "Time steps differ between points, and both ratios depend on them: they do not compare" if joined else ""
+    compare = (
+        "Time steps differ between points, and both ratios depend on them: they are not comparable" if joined else ""
+    )
     finish(figure, data, measured, [compare, status_note(data), missing_note(measured)])
     return figure
 

@@ -1,4 +1,4 @@
-"""The whole error of an average: sampling, time step, tolerance and number of grains, each by a measured law.
+"""The error budget of an average: sampling, time step, tolerance and number of grains, each by a measured law.
 
 A standard error says how an average scatters over samples of the same length. It does not say how far the average is
 from that of a large system, of short time steps and of exact contact solves. The laws here bound these differences.
@@ -11,10 +11,7 @@ tolerance  34 times the relative residual of a contact solve, for the part of th
            (``tests/test_solvers.py``)
 size       ``size_error``: long waves of velocity are missing in small systems, and the packing fraction at which
            they jam scatters (``benchmarks size_limits``)
-=========  ========================================================================================================
-
-A force ratio belongs to its time step, so it has no error of the time step.
-"""
+=========  ================================================================================================="""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -27,7 +24,7 @@ from jaxgran.sampling.timestep import distance_to_jamming, stress_error
 
 RESIDUAL_FACTOR = 34  # relative error of the stress of one solve over its residual, that 98 % of solves do not exceed
 
-# Largest part of a whole error that each of its parts may take where they are chosen; their squares add up to one.
+# Largest share of a requested error that each source may take; their squares add up to one.
 SHARES = {"sampling": 0.65, "size": 0.6, "timestep": 0.4, "tolerance": 0.2}
 
 
@@ -77,22 +74,12 @@ BUDGET: dict[str, Law] = {
 }
 
 
-class Budget(NamedTuple):
-    """The parts of an error, in the unit of the average; all but ``stderr`` are bounds or half-widths of 95 %."""
-
-    stderr: np.ndarray
-    timestep: np.ndarray
-    size: np.ndarray
-    tolerance: np.ndarray
-    error: np.ndarray  # together
-
-
 def size_error(
     restitution: ArrayLike, packing_fraction: ArrayLike, grains: ArrayLike, average: str = "pressure"
 ) -> np.ndarray:
     """Bound on the difference of an average at N grains from that of a large system, over the latter.
 
-    The first term is that of long waves of velocity. It grows with dissipation and ends towards dense flows. The second
+    The first term is that of long waves of velocity. It grows with dissipation and vanishes in dense flows. The second
     is that of jamming: the packing fraction at which a small system jams scatters.
 
     Examples:
@@ -111,14 +98,14 @@ def jamming_error(packing_fraction: ArrayLike, grains: ArrayLike) -> np.ndarray:
 
 
 def sampling_error(error: float) -> float:
-    """The standard error that takes the share of sampling in a whole error."""
+    """The standard error that takes the share of sampling in a requested error."""
     return SHARES["sampling"] * error / HALF_INTERVAL
 
 
 def fewest_grains(restitution: float, packing_fraction: float, size: float) -> int:
     """The smallest of 256, 362, 512, 724, ... grains, in steps of √2, whose ``size_error`` is within a given one.
 
-    Few numbers of grains are compiled for, and none is much larger than it has to be.
+    So programs are compiled for few numbers of grains, and no system is much larger than necessary.
     """
     step = 0
     while size_error(restitution, packing_fraction, _grains_at(step)) > size:
@@ -138,16 +125,24 @@ def error_budget(
     grains: ArrayLike,
     timestep: ArrayLike,
     tolerance: ArrayLike,
-) -> dict[str, Budget]:
-    """The budget of every average in ``BUDGET``, for arrays of points.
+) -> dict[str, dict[str, np.ndarray]]:
+    """Half-widths of the 95 % interval of every average in ``BUDGET``, by source and in its unit, for arrays of points.
+
+    ===========  ====================================================================================
+    source       half-width
+    ===========  ====================================================================================
+    total        of all sources together, √(sampling² + timestep² + size² + tolerance²)
+    sampling     1.96 standard errors
+    timestep     bound on the error from the time step
+    size         bound on the difference from a large system
+    tolerance    bound on the error from the tolerance of the contact solves
+    ===========  ====================================================================================
 
     Args:
       values, errors: averages and their standard errors, by name; also contact_pressure.
       restitution, packing_fraction, grains: of the flow.
       timestep: dt of the sample, in t.
       tolerance: relative residual of a contact solve.
-
-    The parts are independent, so ``error`` is √((1.96 stderr)² + timestep² + size² + tolerance²).
     """
     temperature = np.asarray(values["granular_temperature"], float)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -161,7 +156,12 @@ def error_budget(
         value, stderr = np.asarray(values[name], float), np.asarray(errors[name], float)
         scale = np.abs(value)
         sized = np.abs(value - 1) + 0.03 if name == "force_ratio" else scale
-        parts = law.timestep * step * scale, law.size * size * sized, law.tolerance * solve * scale
-        whole = np.sqrt((HALF_INTERVAL * stderr) ** 2 + sum(part**2 for part in parts))
-        budget[name] = Budget(stderr, *parts, whole)
+        sampling = HALF_INTERVAL * stderr
+        bounds = {
+            "timestep": law.timestep * step * scale,
+            "size": law.size * size * sized,
+            "tolerance": law.tolerance * solve * scale,
+        }
+        total = np.sqrt(sampling**2 + sum(bound**2 for bound in bounds.values()))
+        budget[name] = {"total": total, "sampling": sampling, **bounds}
     return budget

@@ -18,8 +18,8 @@ _CLUSTER_STRAIN = 1.0  # over which the clusters of a dissipative flow move; blo
 def is_drifting(seeds: Sequence[Sample], correlation_strain: float) -> bool:
     """Whether ln P or ln T drifts from the first to the second half of the samples, averaged over the seeds.
 
-    The means of the halves must differ by more than four standard errors and by more than 0.2. What one seed does for
-    itself is noise. Blocks are correlated at least as the correlation strain of the flow says.
+    The means of the halves must differ by more than four standard errors and by more than 0.2. A drift of
+    one seed alone is noise. Blocks are correlated over at least the correlation strain of the flow.
 
     Args:
       seeds: samples of one flow with NumPy arrays, of 16 blocks or a multiple.

@@ -38,7 +38,7 @@ _SMALLEST_CROSSING = 20  # smallest motion in one step of such a grain at the st
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Cooling:
-    """A free cooling; a batch has a leading (replicas,) axis everywhere.
+    """The record of a free cooling; a batch has a leading (replicas,) axis everywhere.
 
     ===========  ========  ======  ====================================================================
     field        shape     unit    meaning

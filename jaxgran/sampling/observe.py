@@ -1,4 +1,4 @@
-"""What a user's function observes: it runs in every time step of a sample, and is checked and identified before."""
+"""A user's function that observes every time step of a sample: its evaluation, its checks and its digest."""
 
 import hashlib
 import re

@@ -37,7 +37,7 @@ _NARROWEST_SKIN = 0.2  # σ; skin of the lists of near pairs
 _ATTEMPTS = 10  # random starts
 _ITERATIONS = 20_000  # of FIRE, for each start
 _FIRST_STEP = 0.1  # time step of FIRE at each start; overlap stiffness and masses are one
-_LONGEST_STEP = 0.5  # the longest one that it grows to
+_LONGEST_STEP = 0.5  # largest time step of FIRE
 
 
 class _Fire(NamedTuple):
@@ -116,9 +116,9 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
 def require_room(flow: ShearFlow, grains: Grains) -> None:
     """Raise an InputError unless the grains suit the flow and none is too large for the lists of near pairs.
 
-    Nearest images are unique if the cell is two largest diameters wide. The search of more than 512 grains assumes
-    similar sizes: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more at smaller ν. Traced
-    numbers are not checked here: ``pack`` then returns that no packing was found.
+    Nearest images are unique if the cell is at least two of the largest diameters wide. The search of more than 512
+    grains assumes similar sizes: the largest diameter may be 2.5 times the root mean square at ν = 0.83, and more at
+    smaller ν. Traced numbers are not checked here: ``pack`` then returns that no packing was found.
     """
     require_grains(grains, flow.grains)
     if is_traced(grains.radii, flow.packing_fraction):

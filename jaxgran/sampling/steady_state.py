@@ -74,7 +74,7 @@ _MEASURING_CHUNKS = 4  # which set the length of later chunks; the test leaves t
 _MOST_CHUNKS = 60  # before the flow counts as not steady
 _LARGEST_STEADY_RATIO = 2.0  # drift over its standard error, below which it is noise
 _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
-_LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; a larger error decides nothing before the last chunk
+_LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; above it the test is undecided until the last chunk
 _LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
 _UNCOMPILED = (
     "{} cannot be transformed by jax.jit or jax.grad, since it decides in Python: call it before, and pass its state "
@@ -162,18 +162,16 @@ def prepare_batch(
     advance: AdvanceBatch = advance_batch,
     coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
-    heat: float = 1.0,
     numerics: Numerics = DEFAULT_NUMERICS,
 ) -> Batch:
     """``prepare`` for a batch of flows: a failure is the status of its replica, not an exception.
 
-    Given grains have a leading (replicas,) axis too. ``heat`` is the first granular temperature over the expected one.
-    ``numerics`` are those of all replicas.
+    Given grains have a leading (replicas,) axis too. ``numerics`` are those of all replicas.
     """
     theory = predicted(flow, grains)
     check_timestep(flow, theory, grains)
     expected = expected_temperature(theory.granular_temperature, flow.packing_fraction, flow.shear_rate)
-    temperature = (heat * expected).astype(theory.granular_temperature.dtype)
+    temperature = expected.astype(theory.granular_temperature.dtype)
     state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep(numerics.engine))
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
@@ -283,7 +281,7 @@ def _replicas(
 
 
 def _heated_replica(
-    flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None = None
+    flow: ShearFlow, key: Array, temperature: Array, grains: Grains | None
 ) -> tuple[State, Bool[Array, ""]]:
     """A packing with Gaussian velocities of a given temperature and no total momentum; False if none was found."""
     key = jax.random.wrap_key_data(key) if key.dtype == jnp.uint32 else key

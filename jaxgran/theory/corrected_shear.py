@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxgran.theory.gaussian_moments import steady_moments
 from jaxgran.theory.mixture import uniform_mixture
 from jaxgran.theory.navier_stokes import garzo_dufty
-from jaxgran.theory.steady_shear import Scalar, as_floats
+from jaxgran.theory.steady_shear import Scalar, as_floats, outside
 
 Numbers = Array | np.ndarray
 
@@ -163,7 +163,7 @@ def corrected_shear(
         shear_stress_stderr=found.shear_stress * of_shear,
         correlation_length=length,
         pair_factor=pairs,
-        extrapolated=_outside(alpha, laws.restitution_range) | _outside(nu, laws.packing_fraction_range),
+        extrapolated=outside(alpha, laws.restitution_range) | outside(nu, laws.packing_fraction_range),
     )
 
 
@@ -177,8 +177,3 @@ def pair_factor(laws: CorrelationLaws, alpha: Numbers, nu: Numbers) -> Array:
     """R = (1 + c (1 − α)⁵) (1 + e (1 − α)^(1/3) y^m) with y = 1/(1 − ν/ν_J)."""
     crowding, loss = 1 / (1 - nu / laws.jamming_fraction), 1 - alpha
     return (1 + laws.pairs[0] * loss**5) * (1 + laws.pairs[1] * jnp.cbrt(loss) * crowding ** laws.pairs[2])
-
-
-def _outside(value: Array, span: Numbers) -> Array:
-    slack = 8 * jnp.finfo(value.dtype).eps
-    return (value < span[0] - slack) | (value > span[1] + slack)

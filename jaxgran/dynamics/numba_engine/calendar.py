@@ -51,7 +51,7 @@ def predict_contact_steps(count, t, earliest, horizon, flow, grains, pairs):
     """Write when, from the step ``earliest`` on, the listed pairs are contacts if their grains are not struck.
 
     ``t`` is the present time, and ``horizon`` the time from now after which the list is no longer valid. Pairs are
-    taken in blocks, and the arithmetic has no branches, so that a processor does it for several pairs at a time.
+    taken in blocks, and the arithmetic has no branches, so that a processor vectorises it.
     """
     listed, calendar, flights, entries = pairs.listed, pairs.calendar, pairs.flights, pairs.entries
     for start in range(0, count, LANES):
@@ -99,14 +99,14 @@ def _contact_steps(dx, dy, ux, uy, reach, t, earliest, horizon, flow):
 
 @inline_njit
 def _as_step(number):
-    """The number as a step of the calendar: -1 for what is past or no number, and never beyond its end."""
+    """A number as a step of the calendar: -1 if it is past or NaN, and at most the last step."""
     number = number if number > -1.0 else -1.0
     return number if number < MANY else MANY
 
 
 @inline_njit
 def clear_calendar(found, pairs):
-    """Fill the slots behind the pairs found up to whole ``LANES``; returns the number of these blocks."""
+    """Pad the calendar behind the pairs found to whole ``LANES``; returns the number of these blocks."""
     blocks = (found + LANES - 1) // LANES
     for p in range(found, blocks * LANES):
         pairs.calendar[STRIKES, p], pairs.calendar[BEGINS, p], pairs.calendar[ENDS, p] = NEVER, NEVER, -1

@@ -1,7 +1,7 @@
 """The impulses of one cluster of contacts, at restitution zero.
 
 Contacts are solved one after the other by projected Gauss–Seidel sweeps. Where these are slow (long chains, grains of
-very different mass, flows about to jam) the guarded method of Barzilai and Borwein goes on from where they stand.
+very different mass, flows about to jam) the guarded method of Barzilai and Borwein continues from their result.
 
 Source: the sweeps are those of C. W. Cryer, SIAM J. Control 9, 385 (1971), and converge for semidefinite W by
 O. L. Mangasarian, J. Optim. Theory Appl. 22, 465 (1977). The other method: ``contact.projected_methods``.
@@ -41,7 +41,7 @@ from jaxgran.dynamics.numba_engine.layout import (
 
 largest_eigenvalue = LAW["largest_eigenvalue"]
 
-SWEEPS = 200  # after which a cluster is taken for a stiff one
+SWEEPS = 200  # after which a cluster counts as stiff
 # Contacts are taken from so many parts of a cluster in turn: those that follow each other share no grain, so that no
 # update waits for the one before it.
 _PARTS = 8
@@ -80,7 +80,7 @@ def solve_cluster(m, target, most_iterations, grains, network, clusters):
 
 @inline_njit
 def _take_contacts(start, size, grains, network, clusters):
-    """Write what the contacts of a cluster bring to the solver, one of each part of the cluster in turn."""
+    """Copy the contacts of a cluster for the solver, one from each part of the cluster in turn."""
     source, places, ends, rows, dv = clusters.source, clusters.places, clusters.ends, clusters.rows, clusters.dv
     contacts, constants = network.rows, grains.constants
     one, last = np.uint64(1), np.uint64(start) + size
@@ -123,7 +123,7 @@ def _sweep(size, target, most_sweeps, clusters):
     """Projected Gauss–Seidel sweeps with over-relaxation; returns their number and the squared residual.
 
     The update of a contact, without relaxation and over its reduced mass, is its residual min(W_cc p, u), so a sweep
-    estimates the norm for nothing; that of one state decides. ``dv`` are the changes of the grains' velocities.
+    estimates the norm at no cost; the norm of a single state decides. ``dv`` are the changes of the grains' velocities.
     """
     rows, ends, dv = clusters.rows, clusters.ends, clusters.dv
     relaxation = _RELAXATION[min(size, np.uint64(_RELAXATION.size - 1))]

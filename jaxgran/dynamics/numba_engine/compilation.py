@@ -1,4 +1,4 @@
-"""How functions are compiled by numba: without its runtime, and the law of a contact from its one source."""
+"""Compilation by numba: without its runtime, and with the law of a contact from its only source."""
 
 import inspect
 import math

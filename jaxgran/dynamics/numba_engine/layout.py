@@ -1,7 +1,7 @@
-"""Where numbers lie in the memory of the numba engine, and what its functions are given together.
+"""The memory layout of the numba engine, and the groups of arrays that its functions take.
 
-Arrays are handed on whole and read by row and column. Indices are unsigned, which spares a test for negative ones.
-Nothing here needs the compiler, so that kept numba engine runs without it.
+Arrays are passed whole and indexed by row and column. Indices are unsigned, which spares a test for negative ones.
+Nothing here imports the compiler, so a cached engine runs without it.
 """
 
 from typing import Any, NamedTuple
@@ -16,7 +16,10 @@ STATUS, TILT, SUSPENDED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the su
 RESULTS = NUMBERS + 4
 BETWEEN_LISTS, WITHIN_LIST = 1, 2  # where a suspended loop goes on
 SAVED = 16  # numbers of a suspended loop, behind its sums
-WORDS, WORDS_PER_GRAIN = 1024 + 2 * NUMBERS + SAVED, 187  # of eight bytes: bounds of the memory that ``memory`` cuts up
+WORDS, WORDS_PER_GRAIN = (
+    1024 + 2 * NUMBERS + SAVED,
+    187,
+)  # of eight bytes: bounds of the memory that ``allocation`` divides
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
 RADIUS, INVERSE_MASS = range(2)  # columns of the grains
@@ -74,12 +77,12 @@ class Order(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Near pairs, filled up to whole ``LANES``, with a slot for one that there is no room for.
+    """Near pairs, padded to whole ``LANES``, with a spare slot for a pair beyond the room.
 
     ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; of_grain: (2 room,) pairs of the grains,
     those of grain g at ``offsets[g] : offsets[g + 1]``. For the search: starts: (cells + 1,); cells, sorted: (grains,)
     the cell of each grain, and the grains in the order of the cells; places: (3, grains) x, y and radius of these.
-    listed: (slots,) pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), memory of this for a block.
+    listed: (slots,) pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), scratch memory of a prediction.
     """
 
     ends: Any
@@ -117,7 +120,7 @@ class Clusters(NamedTuple):
 
     source: (contacts,) places in the network; those of cluster m at ``starts[m] : starts[m + 1]``; of_grain:
     (2 contacts,) contacts of the grains, those of grain g from ``offsets[g]`` on; queue, reached: (grains,) for the
-    search of clusters. Of the cluster that is solved: places: (contacts,) in the network; ends: (contacts, 2) grains;
+    search for clusters. Of the cluster that is solved: places: (contacts,) in the network; ends: (contacts, 2) grains;
     rows: (contacts, 8); stiff: (contacts, 5); dv: (grains, 2) changes of velocity; matrices: (grains, 3) Σ n ⊗ n.
     """
 

@@ -8,12 +8,12 @@ the same sums. It differs in what it visits:
 - *Fly.* Of every near pair the ``calendar`` knows in which steps it will be a contact. The next step to visit is its
   smallest entry. Flight moves nothing: positions in the laboratory are r + v t, with t counted from the search.
 - *Collide.* The contacts of a step fall into clusters. Isolated pairs have a closed form; the others are solved
-  cluster by cluster (``cluster_solver``). A cluster in which nothing approaches needs no impulses. Of the permitted
-  squared residual that the clusters before it have not used, each may leave the share of its number of contacts.
+  cluster by cluster (``cluster_solver``). A cluster in which nothing approaches needs no impulses. Each cluster may
+  leave a share of the permitted squared residual that earlier ones have not used, in proportion to its contacts.
 - *Renew the calendar.* An impulse changes the entries of the struck grains' pairs, and no others.
-- *Deliver.* At the end of a list the grains are moved to where they are.
-- *Suspend.* Where the records are full, the loop ends as it stands. The next call goes on in the same memory, so the
-  trajectory and its sums are those of one call, to the bit.
+- *Move.* When a list expires, the grains are moved to their present positions.
+- *Suspend.* When the records are full, the loop stops. The next call continues in the same memory, so the trajectory
+  and its sums are those of one call, to the bit.
 """
 
 import math
@@ -82,13 +82,13 @@ def advance_loop(
       positions, velocities: (grains, 2) as in a State; ``new_positions`` and ``new_velocities`` receive those after.
       radii, masses: (grains,).
       numbers: side, tilt, restitution, timestep, shear rate, tolerance, activation fraction, most iterations of a
-        solve, steps, and where an earlier call was suspended, 0 to begin.
-      results: (RESULTS,) receives the running sums, the status, the tilt, where the loop is suspended, 0 if it is
-        finished, and the number of records.
-      records: (room, numbers) receives ``records`` of steps; the loop is suspended where they are full, before it
+        solve, steps, and where an earlier call was suspended, or 0 to begin.
+      results: (RESULTS,) receives the running sums, the status, the tilt, where the loop is suspended (0 if it is
+        finished), and the number of records.
+      records: (room, numbers) receives ``records`` of steps; when they are full, the loop is suspended before it
         delivers anything. Without room it records nothing.
       arrays: memory of the loop, see ``allocation``; of the earlier call where one was suspended.
-      stop: (1,), a number that others set; the loop ends with the status ``failed`` where it is not zero.
+      stop: (1,), a word that another thread may set; unless it is zero, the loop ends with the status ``failed``.
     """
     side, tilt, alpha, dt, rate = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     flow = Flow(side, rate, dt, numbers[6], 1.0 + alpha, numbers[5], int(numbers[7]))
@@ -234,7 +234,7 @@ def _list_saved(saved):
 
 @njit
 def _take_grains(positions, velocities, radii, masses, places, rate, grains):
-    """Take the grains, with velocities of the laboratory; returns the largest diameter and whether all is finite."""
+    """Copy the grains, with velocities of the laboratory; returns the largest diameter and whether all is finite."""
     motion, constants = grains.motion, grains.constants
     largest, finite = 0.0, True
     for g in range(places.size):
@@ -328,7 +328,7 @@ def _list_struck(k, hits, contacts, overfull, pairs, network):
 
 @inline_njit
 def _move(t, grains):
-    """Move the grains to where they are at the time t since the search."""
+    """Move the grains to their positions at the time t since the search."""
     motion = grains.motion
     for g in range(motion.shape[0]):
         motion[g, X] += motion[g, VX] * t

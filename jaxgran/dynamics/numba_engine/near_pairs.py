@@ -7,14 +7,14 @@ import numpy as np
 from jaxgran.dynamics.numba_engine.compilation import inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import ACROSS, FIRST, INVERSE_MASS, RADIUS, ROW, SECOND, VX, VY, X, Y
 
-LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by 1.1 at most
+LIFE = 0.1  # strain: the longest life of a list, in which a peculiar speed grows by a factor of 1.1 at most
 _ATTEMPTS = 12  # with ever narrower skins, while a list has more pairs than room
 _CACHED_GRAINS, _ROW_HEIGHT = 2000, 2.0  # larger flows are put in order, in cells of two diameters
 
 
 @inline_njit
 def skin_loss(fastest, rate, distance):
-    """How much of its skin a list may lose in unit time, where pairs are within a distance."""
+    """The rate at which a list may lose its skin, for pairs within a distance."""
     return 2 * fastest * (1 + LIFE) + rate * distance / 2
 
 

@@ -61,7 +61,7 @@ def solve_isolated(contacts, grains, network):
 
 @inline_njit
 def find_clusters(contacts, hits, network, clusters):
-    """Find the clusters in which a contact approaches, each from such a contact outwards, neighbours after neighbours.
+    """Find the clusters in which a contact approaches, each by a breadth-first search from such a contact.
 
     Returns their number; the contacts of cluster m are ``source[starts[m] : starts[m + 1]]``.
     """
