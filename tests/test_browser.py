@@ -145,6 +145,18 @@ def test_map_opens_without_a_network_and_draws_every_point(page) -> None:
     assert list(zip(points["x"], points["y"], strict=True)) == expected
 
 
+def test_verdict_is_that_of_the_chosen_point(map_page) -> None:
+    for row, column in ((0, 1), (1, 2)):
+        choose(map_page, row=row, column=column)
+        point = here(map_page)
+        found = jg.validity(point["restitution"], point["packing_fraction"])
+        assert map_page.find_element("id", "verdict").text == found.verdict()
+        shown = map_page.execute_script(
+            "return [...element('verdict-numbers').tBodies[0].rows].map((row) => [...row.cells].map((x) => x.textContent))"
+        )
+        assert shown == found.rows()
+
+
 def test_map_opens_with_the_logarithmic_excess(page) -> None:
     chromium, file = page
     open_page(chromium, file)

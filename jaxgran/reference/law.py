@@ -19,10 +19,17 @@ from jaxgran.reference.table import LENGTH, MEASURED, Table, shipped_table, writ
 _UNITS = MEASURED | {LENGTH: "sigma"}
 _POWERS = dict.fromkeys(MEASURED, 2) | {"dissipation_rate": 3, LENGTH: 0}  # of the shear rate
 _STEP = 0.01  # between packing fractions of a file
-_INSIDE = ("contents", "theory", "low", "high", "surface", "points")  # of the head of a table: what else is in it
+_INSIDE = (
+    "contents",
+    "theory",
+    "low",
+    "high",
+    "surface",
+    "points",
+)  # lines of the head of a table that say what else it holds
 _MEANING = {  # of the numbers of a file
-    "units": "m mass and sigma diameter of the mean grain, m = pi/4 sigma^2 times the density of the grain; t = 1/shear "
-    "rate, so at shear rate s multiply by s^2, the dissipation rate by s^3, and the length by 1",
+    "units": "m and sigma are mass and diameter of the mean grain, m = pi/4 sigma^2 times the density of the grain",
+    "shear rate": "1/t; at shear rate s multiply by s^2, the dissipation rate by s^3, and the length by 1",
     "ci95": "half of the 95 % interval: sampling, interpolation, time step, tolerance and the difference from a large "
     "system, for the length sampling and interpolation; errors of neighbouring rows are correlated",
     "interpolation": "of logarithms, in sqrt(1 - restitution) and packing_fraction",

@@ -66,16 +66,38 @@ class Validity(NamedTuple):
         found = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
         return found if found.ndim else str(found)
 
+    def at(self, place: Any) -> "Validity":
+        """One flow of an array of flows, or a part of them; for values that are known, not traced."""
+
+        def part(x: Any) -> Any:
+            return {name: part(one) for name, one in x.items()} if isinstance(x, dict) else np.asarray(x)[place]
+
+        return Validity(*map(part, self))
+
     def verdict(self) -> Any:
         """One sentence for every flow: a string, or an array of strings. For values that are known, not traced."""
-        first = np.asarray(self.fails_first(), object)
-        sentences = np.empty(first.shape, object)
-        for place in np.ndindex(first.shape):
-            sentences[place] = self._sentence(place, str(first[place]))
+        sentences = np.empty(np.shape(self.error["pressure"]), object)
+        for place in np.ndindex(sentences.shape):
+            sentences[place] = self.at(place)._sentence()
         return sentences if sentences.ndim else sentences.item()
 
-    def _sentence(self, place: tuple[int, ...], first: str) -> str:
-        error, ci95 = (100 * float(np.asarray(x["pressure"])[place]) for x in (self.error, self.error_ci95))
+    def rows(self) -> list[list[str]]:
+        """Averages of one flow as texts: name, measured and its interval, theory, error and its interval."""
+        found = []
+        for name, measured in self.measured.items():
+            predicted = self.theory.get(name.removeprefix("local_"))
+            theory = "" if predicted is None else f"{predicted:.4g}"
+            error = ""
+            if name in self.error:
+                error = f"{with_error(100 * float(self.error[name]), 100 * float(self.error_ci95[name]))} %"
+            interval = with_error(float(measured), float(self.measured_ci95[name]))
+            found.append([name.replace("_", " "), interval, theory, error])
+        return found
+
+    def _sentence(self) -> str:
+        """The verdict on one flow."""
+        first = self.fails_first()
+        error, ci95 = (100 * float(x["pressure"]) for x in (self.error, self.error_ci95))
         if abs(error) > ci95:
             side = "over" if error > 0 else "under"
             start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
@@ -86,11 +108,10 @@ class Validity(NamedTuple):
         if first == "none":
             cause = "; no assumption changes the contact pressure by more than 2 %"
         else:
-            factor = float(np.asarray(self.factors[first])[place])
+            factor = float(self.factors[first])
             why = f"a factor of {factor:.2g} in the contact pressure at the measured temperature"
             cause = f"{before}{_CAUSES[first][factor > 1]} ({why})"
-        ratio = float(np.asarray(self.measured["force_ratio"])[place])
-        ratio_ci95 = float(np.asarray(self.measured_ci95["force_ratio"])[place])
+        ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         if off < 0.05:
             binary = f"collisions are binary to {100 * off:.1g} %"
