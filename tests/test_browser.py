@@ -66,10 +66,12 @@ def names(chromium) -> list[str]:
     return chromium.execute_script("return observables.map((one) => one.name)")
 
 
-def table(chromium) -> dict[str, list[str]]:
-    """The cells of the table of numbers, by the name of the row."""
+def table(chromium, name: str = "numbers") -> dict[str, list[str]]:
+    """The cells of a table, by the name of the row."""
     rows = chromium.execute_script(
-        "return [...element('numbers').tBodies[0].rows].map((row) => [...row.cells].map((cell) => cell.textContent))"
+        "const rows = [...element(arguments[0]).tBodies[0].rows];"
+        "return rows.map((row) => [...row.cells].map((cell) => cell.textContent))",
+        name,
     )
     return {first: others for first, *others in rows}
 
@@ -151,10 +153,7 @@ def test_verdict_is_that_of_the_chosen_point(map_page) -> None:
         point = here(map_page)
         found = jg.validity(point["restitution"], point["packing_fraction"])
         assert map_page.find_element("id", "verdict").text == found.verdict()
-        shown = map_page.execute_script(
-            "return [...element('verdict-numbers').tBodies[0].rows].map((row) => [...row.cells].map((x) => x.textContent))"
-        )
-        assert shown == found.rows()
+        assert table(map_page, "verdict-numbers") == {name: others for name, *others in found.rows()}
 
 
 def test_map_opens_with_the_logarithmic_excess(page) -> None:
