@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import jaxgran
 from made_up_maps import ratio_dataset, with_grains, with_timesteps
 from pages import MARKUP, made_up_film, page_map
 from synthetic import one_sentence, random_instant
@@ -271,6 +272,12 @@ def test_a_page_without_a_map_is_the_reference_map_with_every_point_of_its_table
         assert_same_numbers([by_name[name]["error"][k] for k in places], table.columns[f"{name}_stderr"])
     assert all(page["reference"]["flows"])
     assert page["title"].endswith(table.made_with)
+
+
+def test_explore_without_a_file_writes_the_reference_map(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "explore")
+    assert outcome.status == 0
+    assert (tmp_path / "reference_map.html").read_text(encoding="utf-8") == jg.explore().text
 
 
 def flows_of(table: Table) -> list[tuple[float, float]]:
