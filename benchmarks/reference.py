@@ -32,6 +32,7 @@ from jaxgran.reference.table import (
     CORRECTED,
     FACTORS,
     FOLDER,
+    LENGTH,
     MEASURED,
     RATIO,
     THEORY,
@@ -88,6 +89,7 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
     columns["grains"] = where[-1]
     paths = {name: name for name in (*MEASURED, RATIO)} | {"dissipation_rate": "stresses/dissipation_rate"}
     paths |= {f"pressure_{name}": f"theory/enskog_factor_pressure_{name}" for name in FACTORS}
+    paths[LENGTH] = f"theory/{LENGTH}"
     for name, path in paths.items():
         columns |= {name: flat[path].values, f"{name}_stderr": flat[f"{path}_stderr"].values}
         bounded = BOUNDED_BY.get(name, name)

@@ -46,6 +46,7 @@ from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
+from .reference.law import ConstitutiveLaw, Rheology, constitutive_law
 from .reference.validity import Validity, validity
 from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
@@ -56,6 +57,7 @@ __version__: str
 __all__ = [
     "BarzilaiBorwein",
     "Closure",
+    "ConstitutiveLaw",
     "ContactNetwork",
     "ContactResiduals",
     "ContactSolution",
@@ -76,6 +78,7 @@ __all__ = [
     "Pallas",
     "ProjectedMethod",
     "RestitutionFit",
+    "Rheology",
     "Sample",
     "ShearFlow",
     "Snapshot",
@@ -89,6 +92,7 @@ __all__ = [
     "advance",
     "averages_against_grains",
     "cluster_shares",
+    "constitutive_law",
     "contact_residuals",
     "cooling",
     "count_events",

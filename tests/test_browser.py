@@ -66,10 +66,12 @@ def names(chromium) -> list[str]:
     return chromium.execute_script("return observables.map((one) => one.name)")
 
 
-def table(chromium) -> dict[str, list[str]]:
-    """The cells of the table of numbers, by the name of the row."""
+def table(chromium, name: str = "numbers") -> dict[str, list[str]]:
+    """The cells of a table, by the name of the row."""
     rows = chromium.execute_script(
-        "return [...element('numbers').tBodies[0].rows].map((row) => [...row.cells].map((cell) => cell.textContent))"
+        "const rows = [...element(arguments[0]).tBodies[0].rows];"
+        "return rows.map((row) => [...row.cells].map((cell) => cell.textContent))",
+        name,
     )
     return {first: others for first, *others in rows}
 
@@ -143,6 +145,15 @@ def test_map_opens_without_a_network_and_draws_every_point(page) -> None:
     points = trace(chromium, "plane", "points")
     expected = [(round(1 - a, 12), nu) for nu in (0.5, 0.6) for a in (0.5, 0.7, 0.9)]
     assert list(zip(points["x"], points["y"], strict=True)) == expected
+
+
+def test_verdict_is_that_of_the_chosen_point(map_page) -> None:
+    for row, column in ((0, 1), (1, 2)):
+        choose(map_page, row=row, column=column)
+        point = here(map_page)
+        found = jg.validity(point["restitution"], point["packing_fraction"])
+        assert map_page.find_element("id", "verdict").text == found.verdict()
+        assert table(map_page, "verdict-numbers") == {name: others for name, *others in found.rows()}
 
 
 def test_map_opens_with_the_logarithmic_excess(page) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from command_line import jaxgran
 from made_up_maps import ratio_dataset, with_grains, with_timesteps
 from pages import MARKUP, made_up_film, page_map
 from synthetic import one_sentence, random_instant
@@ -24,6 +25,7 @@ from jaxgran.page.document import document
 from jaxgran.page.film import AVERAGES
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
+from jaxgran.reference.table import MEASURED, Table, shipped_table
 from jaxgran.sampling.observables import OBSERVABLES
 
 
@@ -245,3 +247,38 @@ def test_film_of_many_grains_keeps_a_part_of_its_frames(monkeypatch: pytest.Monk
 def test_data_of_a_page_have_no_numbers_that_json_lacks() -> None:
     with pytest.raises(ValueError, match="JSON"):
         document("map", (), "title", {"value": math.nan})
+
+
+def test_a_page_has_the_verdict_on_every_flow_in_the_range_of_the_reference_map() -> None:
+    table = shipped_table()
+    low, high = table.range("packing_fraction")
+    nus, alphas = np.array([low - 0.01, 0.5, high]), np.array([0.5, 0.9])
+    said = map_data(ratio_dataset(2, 3).assign_coords(packing_fraction=nus, restitution=alphas))["reference"]
+    assert said["flows"][:2] == [None, None] and f"{low:g} to {high:g}" in said["outside"]
+    for flow, (nu, alpha) in zip(said["flows"][2:], [(nu, alpha) for nu in nus[1:] for alpha in alphas], strict=True):
+        found = jg.validity(alpha, nu)
+        assert flow["verdict"] == found.verdict()
+        assert [row[0] for row in flow["rows"]] == [name.replace("_", " ") for name in found.measured]
+        assert all(len(row) == len(said["columns"]) for row in flow["rows"])
+
+
+def test_a_page_without_a_map_is_the_reference_map_with_every_point_of_its_table() -> None:
+    table, page = shipped_table(), written(jg.explore())
+    by_name = {one["name"]: one for one in page["observables"]}
+    nus, alphas = (page["axes"][k]["values"] for k in (2, 3))
+    places = [nus.index(nu) * len(alphas) + alphas.index(alpha) for alpha, nu in flows_of(table)]
+    for name in (*MEASURED, "force_ratio"):
+        assert_same_numbers([by_name[name]["value"][k] for k in places], table.columns[name])
+        assert_same_numbers([by_name[name]["error"][k] for k in places], table.columns[f"{name}_stderr"])
+    assert all(page["reference"]["flows"])
+    assert page["title"].endswith(table.made_with)
+
+
+def test_explore_without_a_file_writes_the_reference_map(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "explore")
+    assert outcome.status == 0
+    assert (tmp_path / "reference_map.html").read_text(encoding="utf-8") == jg.explore().text
+
+
+def flows_of(table: Table) -> list[tuple[float, float]]:
+    return list(zip(table.columns["restitution"], table.columns["packing_fraction"], strict=True))

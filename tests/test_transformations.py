@@ -53,6 +53,7 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "solve_contacts": lambda x, _: jg.solve_contacts(PAIR, x).velocities,
     "contact_residuals": lambda x, _: jg.contact_residuals(PAIR, x * jnp.ones(2)).natural_map,
     "validity": lambda x, _: jg.validity(x, 0.7).measured,
+    "constitutive_law": lambda x, _: jg.constitutive_law()(x, 0.7, 2 * x),
     "predict": lambda x, _: jg.predict(known_closure(), x, 0.7),
     "restitution_from_stresses": lambda x, _: jg.restitution_from_stresses(known_closure(), 0.7, x, 1.0).restitution,
 }
@@ -82,7 +83,7 @@ WITHOUT_ARRAYS = """
     cluster_shares dominating_errors explore Page fit_closure friction_figure friction_law
     ratio_against_timestep ratio_contours ratio_curves BarzilaiBorwein Jacobi JacobiCount JacobiDiagonal Nesterov
     ProjectedMethod Jax Numba Pallas Tracks merge_maps open_map read_tracks read_trajectory save_figures theory_errors
-    enskog_factors write_trajectory Validity
+    enskog_factors write_trajectory Validity ConstitutiveLaw Rheology
 """
 
 

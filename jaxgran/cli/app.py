@@ -10,6 +10,8 @@ import typer
 
 # XLA logs a long error if a cached program was compiled with tuning hints. The variable must be set before JAX loads.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+# Matrices here are small: threads of OpenBLAS, which NumPy loads, wait for each other longer than they calculate.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jaxgran
 from jaxgran.cli.arguments import examples

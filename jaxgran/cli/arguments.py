@@ -65,7 +65,11 @@ def command(
         run(*file, **{name: value(name, table[name], text) for name, text in given.items()})
 
     place, kind = ("files", list[Path]) if several else ("file", Path)
-    parameters = [] if argument is None else [_parameter(place, kind, typer.Argument(help=argument.help), ...)]
+    parameters = []
+    if argument is not None:
+        words = argument.help + (f" [default: {argument.default}]" if argument.default else "")
+        first, kind = (None, kind | None) if argument.default else (..., kind)
+        parameters = [_parameter(place, kind, typer.Argument(help=words, show_default=False), first)]
     for name, one in table.items():
         kind = one.kind if one.kind in (bool, Path) else str
         first = ... if name in required else None

@@ -2,35 +2,41 @@
 
 from pathlib import Path
 
-from jaxgran.cli.arguments import FILE, OVERWRITE, command
+from jaxgran.cli.arguments import OVERWRITE, command
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.parameters import Option
 from jaxgran.model.checks import InputError, short_repr
 
 EXPLORE_EXAMPLES = {
     "A page beside the map": "jaxgran explore jaxgran_map.nc",
+    "The reference map, from which jaxgran where answers": "jaxgran explore",
     "With another name": "jaxgran explore ratio.nc --output page.html",
 }
 
 
+EXPLORE_FILE = Option("Dataset of a map.", Path, default="the reference map")
 EXPLORE_OPTIONS = {
     "output": Option(
-        "HTML file of the page.", Path, default="the name of the dataset with .html", short="o", example="FILE.html"
+        "HTML file of the page.",
+        Path,
+        default="the name of the dataset, or reference_map, with .html",
+        short="o",
+        example="FILE.html",
     ),
     "overwrite": OVERWRITE,
 }
 
 
-def run_explore_command(file: Path, output: Path | None = None, overwrite: bool = False) -> None:
+def run_explore_command(file: Path | None, output: Path | None = None, overwrite: bool = False) -> None:
     from jaxgran.io.atomic import require_place
     from jaxgran.maps.results import open_map
     from jaxgran.page.document import require_plotly
     from jaxgran.page.explore import explore, shows_same_map
 
-    path = file.with_suffix(".html") if output is None else output
+    path = (file or Path("reference_map.nc")).with_suffix(".html") if output is None else output
     require_place(path, "output", ".html")
     require_plotly()
-    page = explore(open_map(file))
+    page = explore(None if file is None else open_map(file))
     if path.exists() and not overwrite and not shows_same_map(path, page):
         raise InputError(
             f"output {short_repr(str(path))} already exists and belongs to another map; "
@@ -41,4 +47,4 @@ def run_explore_command(file: Path, output: Path | None = None, overwrite: bool 
     say_written([path])
 
 
-explore_command = command(EXPLORE_OPTIONS, run_explore_command, argument=FILE)
+explore_command = command(EXPLORE_OPTIONS, run_explore_command, argument=EXPLORE_FILE)

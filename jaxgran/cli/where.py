@@ -1,13 +1,11 @@
 """The command ``where``: what kinetic theory can predict in a flow, without a simulation."""
 
-from typing import Any
-
 from jaxgran.cli.arguments import command
 from jaxgran.cli.json_output import JSON, Entry, print_json
 from jaxgran.cli.tables import Table, plain, print_table
 from jaxgran.maps.parameters import Option
 from jaxgran.model.display import with_error
-from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
+from jaxgran.reference.table import FACTORS, MEASURED, THEORIES, shipped_table
 from jaxgran.reference.validity import Validity, validity
 
 WHERE_EXAMPLES = {
@@ -38,26 +36,15 @@ def run_where_command(restitution: float, packing_fraction: float, json: bool = 
     table = shipped_table()
     print(plain(found.verdict()))
     about = f"α = {restitution:g}, ν = {packing_fraction:g}; ± 95 %; units of m, σ and 1/γ̇"
-    averages = Table(about, ("average", "measured", "kinetic theory", "error"))
-    for name in _UNITS:
-        measured = _with_ci95(found.measured[name], found.measured_ci95[name])
-        theory = f"{found.theory[name]:.4g}" if name in found.theory else ""
-        error = ""
-        if name in found.error:
-            error = f"{_with_ci95(100 * found.error[name], 100 * found.error_ci95[name])} %"
-        averages.rows.append([name.replace("_", " "), measured, theory, error])
+    averages = Table(about, ("average", "measured", "kinetic theory", "error"), found.rows())
     print_table(averages)
     assumed = "Enskog's contact pressure at the measured granular temperature, one assumption after the other"
     factors = Table(assumed, ("assumed", "factor if measured instead"))
     for name in FACTORS:
-        factors.rows.append([_ASSUMPTIONS[name], _with_ci95(found.factors[name], found.factors_ci95[name])])
+        factor = with_error(float(found.factors[name]), float(found.factors_ci95[name]))
+        factors.rows.append([_ASSUMPTIONS[name], factor])
     print_table(factors)
-    made_with = f"N = {table.head['grains']}, dt = {table.head['timestep']}/γ̇"
-    print(plain(f"Reference map: {made_with}. Theory: {table.head['theory']}."))
-
-
-def _with_ci95(value: Any, ci95: Any) -> str:
-    return with_error(float(value), float(ci95))
+    print(plain(f"Reference map: {table.made_with}. Kinetic theory: {THEORIES[table.head['theory']]}."))
 
 
 def _entries(found: Validity) -> dict[str, Entry]:
@@ -81,7 +68,8 @@ def _entries(found: Validity) -> dict[str, Entry]:
     for name, value in found.factors.items():
         entries[f"factor/{name}"] = Entry(value, f"contact pressure as measured, over that if {_ASSUMPTIONS[name]}")
         entries[f"factor/{name}_ci95"] = Entry(found.factors_ci95[name], half)
-    entries["grains"] = Entry(int(head["grains"]), "number of grains of the reference map")
+    grains = head["grains"]  # a number, or in words where it depends on the flow
+    entries["grains"] = Entry(int(grains) if grains.isdecimal() else grains, "number of grains of the reference map")
     entries["timestep"] = Entry(float(head["timestep"]), "time step of the reference map", "1 / shear rate")
     return entries
 

@@ -73,7 +73,7 @@ function planeTraces(view, levelCount, excessLevels) {
   const ticks = log ? logTicks(known) : levels.levels;
   const bar = {
     title: { text: escaped(view.label), side: "right" }, tickvals: ticks, ticktext: ticks.map((tick) => numberText(log ? 10 ** tick : tick, 3)),
-    thickness: 14, outlinewidth: 0, len: 1,
+    thickness: 14, outlinewidth: 0, len: 1, xpad: excessLevels ? 36 : 10, // the levels of the excess stand before it
   };
   const colours = { colorscale: SCALE, colorbar: bar, zmin: Math.min(...known), zmax: Math.max(...known) };
   const isPlane = x.length > 1 && y.length > 1;
@@ -134,9 +134,11 @@ function curveTraces(view, positions, cells, chosen) {
 }
 
 function curveLayout(view, title, label) {
+  const positive = flat(view.value).filter((v) => v > 0);
+  const dtick = Math.max(...positive) > 1e3 * Math.min(...positive) ? 1 : "D2"; // a tick a decade, or also at 2 and 5
   return chartLayout({
     xaxis: { title: { text: label } },
-    yaxis: { title: { text: escaped(view.label) }, type: view.log ? "log" : "linear", exponentformat: "power", ...(view.log ? { dtick: "D2" } : {}) },
+    yaxis: { title: { text: escaped(view.label) }, type: view.log ? "log" : "linear", exponentformat: "power", ...(view.log ? { dtick } : {}) },
     title: { text: escaped(title), font: { size: 14 }, x: 0.02, xanchor: "left" },
     showlegend: true,
     legend: { orientation: "h", y: 1.02, yanchor: "bottom", x: 1, xanchor: "right", font: { size: 12 } },

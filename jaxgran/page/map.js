@@ -79,7 +79,11 @@ function drawPoint(alpha, nu) {
   element("which").textContent = which.join(", ");
   element("status").textContent = `Status ${words(pageData.status[point])}.`;
   element("status").classList.toggle("bad", pageData.status[point] !== "ok");
-  fillTable(element("numbers"), tableRows(observables, point), observables.map((one) => one.meaning));
+  fillTable(element("numbers"), COLUMNS, tableRows(observables, point), observables.map((one) => one.meaning));
+  const { flows, columns, outside } = pageData.reference, flow = flows[chosen.row * restitutions.length + chosen.column];
+  element("verdict").textContent = flow ? flow.verdict : outside;
+  element("verdict-part").hidden = !flow;
+  fillTable(element("verdict-numbers"), columns, flow?.rows ?? []);
   const command = commandAgain(point, alpha, nu);
   element("again").hidden = !command;
   element("command").textContent = command;
@@ -181,6 +185,7 @@ function startMap() {
   if (pageData.about) belongs.push(pageData.about);
   element("about").textContent = `${belongs.join(", ")}. Error bars are one standard error of sampling. ` +
     `${ratio ? "The excess is the force ratio − 1. " : ""}Choose a point by a click, or with the arrow keys.`;
+  element("verdict-about").textContent = pageData.reference.about;
   element("notes").replaceChildren(...pageData.notes.map((note) => {
     const line = document.createElement("p");
     line.textContent = note;

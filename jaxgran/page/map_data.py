@@ -13,6 +13,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
 from jaxgran.page.grain_data import ENCODING, MOST_GRAINS, grain_data, scale_of
+from jaxgran.page.reference_map import verdicts
 from jaxgran.plotting.encoding import EXCESS_LEVELS
 
 MOST_POINTS = 2500
@@ -50,6 +51,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     grains,        the number of grains and the time step of each point, if they were chosen by point
     timesteps
     instants       grains and forces of each point, see ``grain_data``
+    reference      what the reference map says of each packing fraction and restitution, see ``verdicts``
     again          what the command needs that measures a point again, if the map was made by this program
     about, notes   sentences: parameters of the map, and what is left out
     =============  =====================================================================================
@@ -79,6 +81,7 @@ def map_data(data: MapData) -> dict[str, Any]:
         "instants": instants,
         "encoding": ENCODING,
         "again": _again(data, dims),
+        "reference": verdicts(data["packing_fraction"].values, data["restitution"].values),
         "about": _about(data),
         "notes": notes + more + ([] if has_one_timestep(data) else [_SEVERAL_TIMESTEPS]),
     }

@@ -10,7 +10,7 @@ function tableRows(observables, point) {
   });
 }
 
-function fillTable(table, rows, meanings) {
+function fillTable(table, columns, rows, meanings = []) {
   const row = (cells, tag) => {
     const line = document.createElement("tr");
     cells.forEach((text, k) => {
@@ -22,8 +22,8 @@ function fillTable(table, rows, meanings) {
     return line;
   };
   const lines = rows.map((cells) => row(cells, "td"));
-  lines.forEach((line, k) => (line.title = meanings[k]));
-  table.tHead.replaceChildren(row(COLUMNS, "th"));
+  lines.forEach((line, k) => (line.title = meanings[k] ?? ""));
+  table.tHead.replaceChildren(row(columns, "th"));
   table.tBodies[0].replaceChildren(...lines);
 }
 

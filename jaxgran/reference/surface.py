@@ -41,8 +41,8 @@ class Shape:
 
     def covariance(self, one: Any, other: Any, xp: Any = np) -> Any:
         """Prior covariance of (..., 2) and (points, 2) coordinates, (..., points)."""
-        apart = (one[..., None, :] - other) / np.array([self.lengths])
-        r = xp.sqrt(5 * xp.sum(apart**2, axis=-1) + _TINY)
+        first, second = ((one[..., None, k] - other[:, k]) / self.lengths[k] for k in (0, 1))
+        r = xp.sqrt(5 * (first**2 + second**2) + _TINY)
         return self.amplitude**2 * (1 + r + r**2 / 3) * xp.exp(-r) + _SLOPE**2 * (1 + one @ other.T)
 
     def variance(self, one: Any, xp: Any = np) -> Any:
@@ -60,14 +60,22 @@ class Surface:
     shape: Shape
 
     @cached_property
+    def _covariance(self) -> np.ndarray:
+        """Covariance of the values at the points."""
+        return self.shape.covariance(self.points, self.points) + np.diag((self.shape.noise * self.stderrs) ** 2)
+
+    @cached_property
     def _whitening(self) -> np.ndarray:
         """The inverse of the lower Cholesky factor of the covariance: the inverse itself would lose small variances."""
-        noise = np.diag((self.shape.noise * self.stderrs) ** 2)
-        return np.linalg.inv(np.linalg.cholesky(self.shape.covariance(self.points, self.points) + noise))
+        return np.linalg.inv(np.linalg.cholesky(self._covariance))
 
     @cached_property
     def _weights(self) -> np.ndarray:
-        return self._whitening.T @ (self._whitening @ self.values)
+        return np.linalg.solve(self._covariance, self.values)
+
+    def mean(self, where: Any, xp: Any = np) -> Any:
+        """Value at coordinates (..., 2)."""
+        return self.shape.covariance(where, self.points, xp) @ self._weights
 
     def __call__(self, where: Any, xp: Any = np) -> tuple[Any, Any]:
         """Value and standard error at coordinates (..., 2)."""

@@ -24,8 +24,18 @@ MEASURED = {
 }
 """Averages of which the table has a surface over a theory, and their units."""
 
+LENGTH = "correlation_length_from_pressure"
+"""L′ of ``sampling.enskog_factors``, in σ; its surface is that of the logarithm, and no bound is known."""
+
 RATIO = "force_ratio"
 """The force ratio at the time step of the map; ``force_ratio_at_DT`` is another map's, NaN without a point there."""
+
+THEORIES = {
+    "gaussian_moments": "moments of an anisotropic Gaussian",
+    "garzo_dufty": "Garzó and Dufty",
+    "jenkins_richman": "Jenkins and Richman",
+}
+"""What the theory of the series is called."""
 
 THEORY = ("pressure", "shear_stress", "granular_temperature")
 """What the series predict. The dissipation rate of a theory is its shear stress times the shear rate."""
@@ -81,7 +91,7 @@ class Series:
         return {name: xp.sum((first @ table) * second, axis=-1) for name, table in self.coefficients.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
     """The averages of a map as surfaces, and what it was made with."""
 
@@ -92,6 +102,16 @@ class Table:
     def range(self, name: str) -> tuple[float, float]:
         """Smallest and largest restitution or packing fraction."""
         return float(self.columns[name].min()), float(self.columns[name].max())
+
+    @property
+    def timestep(self) -> str:
+        """Time step of the map as it is written by hand."""
+        return self.head["timestep"].replace("e-0", "e-")
+
+    @property
+    def made_with(self) -> str:
+        """Number of grains and time step of the map, for a reader."""
+        return f"N = {self.head['grains']}, dt = {self.timestep}/γ̇"
 
     @cached_property
     def points(self) -> np.ndarray:

@@ -4,15 +4,15 @@ Nothing is simulated. Averages are read from the surfaces of a reference map tha
 ``table``), the prediction of the theory from a series. Both are smooth, so that derivatives exist.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxgran.model.checks import InputError, refused
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
-from jaxgran.reference.surface import coordinates
-from jaxgran.reference.table import FACTORS, MEASURED, Table, excess_from_surface, shipped_table, theory_of
+from jaxgran.reference.evaluation import estimates, over_range
+from jaxgran.reference.table import FACTORS, Table, excess_from_surface, shipped_table
 
 _NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
 _CAUSES = {  # what is said where a factor is below one, and where it is above
@@ -66,37 +66,58 @@ class Validity(NamedTuple):
         found = np.where(np.max(logs, axis=0) > _NEGLIGIBLE, names, "none")
         return found if found.ndim else str(found)
 
+    def at(self, place: Any) -> "Validity":
+        """One flow of an array of flows, or a part of them; for values that are known, not traced."""
+
+        def part(x: Any) -> Any:
+            return {name: part(one) for name, one in x.items()} if isinstance(x, dict) else np.asarray(x)[place]
+
+        return Validity(*map(part, self))
+
     def verdict(self) -> Any:
         """One sentence for every flow: a string, or an array of strings. For values that are known, not traced."""
-        first = np.asarray(self.fails_first(), object)
-        sentences = np.empty(first.shape, object)
-        for place in np.ndindex(first.shape):
-            sentences[place] = self._sentence(place, str(first[place]))
+        sentences = np.empty(np.shape(self.error["pressure"]), object)
+        for place in np.ndindex(sentences.shape):
+            sentences[place] = self.at(place)._sentence()
         return sentences if sentences.ndim else sentences.item()
 
-    def _sentence(self, place: tuple[int, ...], first: str) -> str:
-        error, ci95 = (100 * float(np.asarray(x["pressure"])[place]) for x in (self.error, self.error_ci95))
+    def rows(self) -> list[list[str]]:
+        """Averages of one flow as texts: name, measured and its interval, theory, error and its interval."""
+        found = []
+        for name, measured in self.measured.items():
+            predicted = self.theory.get(name.removeprefix("local_"))
+            theory = "" if predicted is None else f"{predicted:.4g}"
+            error = ""
+            if name in self.error:
+                error = f"{with_error(100 * float(self.error[name]), 100 * float(self.error_ci95[name]))} %"
+            interval = with_error(float(measured), float(self.measured_ci95[name]))
+            found.append([name.replace("_", " "), interval, theory, error])
+        return found
+
+    def _sentence(self) -> str:
+        """The verdict on one flow."""
+        first = self.fails_first()
+        error, ci95 = (100 * float(x["pressure"]) for x in (self.error, self.error_ci95))
         if abs(error) > ci95:
             side = "over" if error > 0 else "under"
-            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %: "
+            start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
+            before = ": "
         else:
-            start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %), although "
+            start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %)"
+            before = "; the largest departure from Enskog's assumptions: "
         if first == "none":
-            start = start.replace(", although ", "; ")
-            cause = "no assumption changes the contact pressure by more than 2 %"
+            cause = "; no assumption changes the contact pressure by more than 2 %"
         else:
-            factor = float(np.asarray(self.factors[first])[place])
+            factor = float(self.factors[first])
             why = f"a factor of {factor:.2g} in the contact pressure at the measured temperature"
-            cause = f"{_CAUSES[first][factor > 1]} ({why})"
-        ratio = float(np.asarray(self.measured["force_ratio"])[place])
-        ratio_ci95 = float(np.asarray(self.measured_ci95["force_ratio"])[place])
+            cause = f"{before}{_CAUSES[first][factor > 1]} ({why})"
+        ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
-        timestep = shipped_table().head["timestep"]
         if off < 0.05:
             binary = f"collisions are binary to {100 * off:.1g} %"
         else:
             binary = f"binary collisions explain {100 / ratio:.2g} % of the mean contact force"
-        return f"{start}{cause}; {binary} (dt = {timestep}/γ̇)."
+        return f"{start}{cause}; {binary} (dt = {shipped_table().timestep}/γ̇)."
 
 
 def validity(restitution: Any, packing_fraction: Any) -> Validity:
@@ -120,83 +141,27 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
       >>> bool(abs(found.error["pressure"]) < 0.05)
       True
     """
-    table, xp = shipped_table(), _module(restitution, packing_fraction)
-    if xp is np:
-        restitution = _checked("restitution", restitution, table)
-        packing_fraction = _checked("packing_fraction", packing_fraction, table)
-    alpha, nu = xp.broadcast_arrays(*(xp.asarray(x, float) for x in (restitution, packing_fraction)))
-    inside = _inside(table, alpha, nu)
-    middle = [sum(table.range(name)) / 2 for name in ("restitution", "packing_fraction")]
-    where = coordinates(xp.where(inside, alpha, middle[0]), xp.where(inside, nu, middle[1]), xp)
-    found = _evaluated(table, where) if xp is np else _mapped(table, where, alpha.shape)
-    masked = [{name: xp.where(inside, x, np.nan) for name, x in part.items()} for part in found]
-    return Validity(alpha, nu, *masked)
+    table = shipped_table()
+    alpha, nu, found = over_range(table, partial(_evaluated, table), restitution, packing_fraction)
+    return Validity(alpha, nu, *found)
 
 
-def _mapped(table: Table, where: Any, shape: tuple[int, ...]) -> Any:
-    """``_evaluated`` of traced points one by one, so that ranks are promoted nowhere."""
-    import jax
-    import jax.numpy as jnp
-
-    found = jax.vmap(lambda one: _evaluated(table, one, jnp))(where.reshape(-1, 2))
-    return jax.tree.map(lambda x: x.reshape(shape), found)
-
-
-def _evaluated(table: Table, where: Any, xp: Any = np) -> tuple[dict[str, Any], ...]:
+def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     """The dictionaries of a ``Validity`` at coordinates in the measured range."""
-    logs = table.series(where, xp)
-    theory = {name: xp.exp(logs[theory_of(name)]) for name in MEASURED if not name.startswith("local_")}
-    measured, ci95, error, error_ci95 = ({} for _ in range(4))
-    for name in MEASURED:
-        over, stderr = table.surfaces[name](where, xp)
-        half = xp.hypot(HALF_INTERVAL * stderr, xp.exp(table.bounds[name](where, xp)[0]))
-        measured[name] = xp.exp(over + logs[theory_of(name)])
-        ci95[name] = measured[name] * xp.sinh(half)
+    measured, ci95, theory, error, error_ci95 = ({} for _ in range(5))
+    for name, one in estimates(table, where, xp).items():
+        measured[name], ci95[name] = one.value_and_ci95(xp)
+        if not name.startswith("local_"):
+            theory[name] = xp.exp(one.theory)
         if name != "granular_temperature":
-            error[name] = xp.expm1(-over)
-            error_ci95[name] = xp.exp(-over) * xp.sinh(half)
+            error[name] = xp.expm1(-one.over)
+            error_ci95[name] = xp.exp(-one.over) * xp.sinh(one.half)
     value, stderr = table.surfaces["force_ratio"](where, xp)
     measured["force_ratio"] = 1 + excess_from_surface(value, xp)
     sampling = excess_from_surface(HALF_INTERVAL * stderr, xp) * xp.cosh(value)
-    ci95["force_ratio"] = xp.hypot(sampling, xp.exp(table.bounds["force_ratio"](where, xp)[0]))
+    ci95["force_ratio"] = xp.hypot(sampling, xp.exp(table.bounds["force_ratio"].mean(where, xp)))
     factors, factors_ci95 = {}, {}
     for name in FACTORS:
         log, stderr = table.surfaces[f"pressure_{name}"](where, xp)
         factors[name], factors_ci95[name] = xp.exp(log), xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr)
     return measured, ci95, theory, error, error_ci95, factors, factors_ci95
-
-
-def _module(*values: Any) -> Any:
-    """The module of arrays: that of JAX if it traces a value, else NumPy."""
-    if not any(type(value).__module__.startswith("jax") for value in values):
-        return np  # without loading JAX
-    import jax
-    import jax.numpy as jnp
-    from jax.core import Tracer
-
-    if not any(isinstance(value, Tracer) for value in values):
-        return np
-    if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
-        raise InputError(
-            "validity needs double precision under jax.jit, jax.vmap and jax.grad: "
-            'call jax.config.update("jax_enable_x64", True) first.'
-        )
-    return jnp
-
-
-def _checked(name: str, value: Any, table: Table) -> np.ndarray:
-    """A value that is known, as an array of floats in the measured range."""
-    low, high = table.range(name)
-    try:
-        numbers = np.asarray(value, float)
-    except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if numbers.size == 0 or not np.all((low <= numbers) & (numbers <= high)):
-        raise refused(name, value, f"must be between {low:g} and {high:g}, the range of the reference map")
-    return numbers
-
-
-def _inside(table: Table, alpha: Any, nu: Any) -> Any:
-    """Whether points are in the measured range."""
-    (first, last), (loosest, densest) = table.range("restitution"), table.range("packing_fraction")
-    return (first <= alpha) & (alpha <= last) & (loosest <= nu) & (nu <= densest)

@@ -1,0 +1,154 @@
+"""The constitutive law of the reference map: scaling, balance of energy, derivatives, range, file and example."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxgran as jg
+from jaxgran.reference.table import LENGTH, MEASURED, read_columns
+
+LAW = jg.constitutive_law()
+ALPHAS, NUS = (st.floats(*one) for one in (LAW.restitution_range, LAW.packing_fraction_range))
+PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "constitutive-law.md"
+
+
+def a_plane(rows: int = 15) -> tuple[np.ndarray, np.ndarray]:
+    """Restitutions and packing fractions over the whole range."""
+    return np.linspace(*LAW.restitution_range, rows)[:, None], np.linspace(*LAW.packing_fraction_range, rows)
+
+
+@settings(max_examples=20, deadline=None)
+@given(ALPHAS, NUS, st.floats(1e-3, 1e3))
+def test_bagnolds_scaling_is_exact(alpha: float, nu: float, rate: float) -> None:
+    slow, fast = LAW(alpha, nu)._asdict(), LAW(alpha, nu, rate)._asdict()
+    for name in MEASURED:
+        for field in (name, f"{name}_ci95"):
+            power = 3 if name == "dissipation_rate" else 2
+            assert fast[field] == pytest.approx(slow[field] * rate**power, rel=1e-14)
+    assert fast[LENGTH] == slow[LENGTH] and fast[f"{LENGTH}_ci95"] == slow[f"{LENGTH}_ci95"]
+
+
+def test_power_of_the_shear_is_dissipated_within_the_errors() -> None:
+    rate = 2.0
+    flow = LAW(*a_plane(), rate)
+    apart = np.abs(flow.dissipation_rate - flow.shear_stress * rate)
+    assert np.all(apart < np.hypot(flow.dissipation_rate_ci95, flow.shear_stress_ci95 * rate))
+    assert np.all(apart < 0.05 * flow.dissipation_rate)
+
+
+def test_long_waves_raise_the_granular_temperature() -> None:
+    flow = LAW(*a_plane())
+    assert np.all(flow.local_granular_temperature < flow.granular_temperature + flow.granular_temperature_ci95)
+
+
+def test_correlations_vanish_towards_elastic_grains_and_grow_with_dissipation() -> None:
+    nus = a_plane()[1]
+    nus = nus[nus < 0.7]
+    lengths = [LAW(alpha, nus)._asdict()[LENGTH] for alpha in (0.98, 0.8, 0.5, 0.2)]
+    np.testing.assert_allclose(lengths[0], 1, atol=0.02)
+    assert np.all(np.diff(lengths, axis=0) > 0)
+
+
+def test_length_follows_from_correlated_velocities_where_collisions_are_binary() -> None:
+    """Grains that approach more slowly by a factor f have f² of the contact pressure and f³ of the loss: L′ = 1/f."""
+    alphas, nus = (x.ravel() for x in np.broadcast_arrays(*a_plane()))
+    found = jg.validity(alphas, nus)
+    binary = found.measured["force_ratio"] < 1.01
+    length = LAW(alphas, nus)._asdict()[LENGTH]
+    product = (length * np.sqrt(found.factors["chaos"]))[binary]
+    assert binary.sum() > 100
+    assert np.all((product > 0.97) & (product < 1.05))
+
+
+@pytest.mark.parametrize("name", ["pressure", "shear_stress", "dissipation_rate", "pressure_ci95", LENGTH])
+def test_gradients_are_those_of_finite_differences(name: str) -> None:
+    def of(x: Any) -> Any:
+        return getattr(LAW(x[0], x[1], x[2]), name)
+
+    at, step = jnp.array([0.45, 0.71, 1.3]), 1e-4
+    by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(3)]
+    np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=1e-5, atol=1e-8)
+
+
+def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
+    assert jax.tree.leaves(LAW) == []
+    traced = []
+
+    @jax.jit
+    def pressures(law: jg.ConstitutiveLaw, nus: Any, rate: Any) -> Any:
+        traced.append(law)
+        return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
+
+    nus = jnp.array([0.3, 0.7])
+    for law in (LAW, jg.constitutive_law()):
+        np.testing.assert_allclose(pressures(law, nus, 2.0), LAW(0.6, nus, 2.0).pressure, rtol=1e-9)
+    assert len(traced) == 1  # equal laws are one to the cache
+
+
+def test_arrays_broadcast_with_the_shear_rate() -> None:
+    alphas, nus, rates = np.array([[0.3], [0.6]]), np.array([0.2, 0.5, 0.7]), [1.0, 2.0, 3.0]
+    flow, compiled = LAW(alphas, nus, rates), jax.jit(LAW)(alphas, nus, np.array(rates))
+    for one, same in zip(flow, compiled, strict=True):
+        assert one.shape == (2, 3)
+        np.testing.assert_allclose(one, same, rtol=1e-5)
+    assert flow.pressure[1, 2] == pytest.approx(LAW(0.6, 0.7, 3.0).pressure)
+
+
+def test_the_range_ends_where_it_says() -> None:
+    (low, high), (loose, dense) = LAW.restitution_range, LAW.packing_fraction_range
+    assert np.all(np.isfinite(LAW([low, high], [loose, dense]).pressure))
+    for alpha, nu in ((low - 1e-6, loose), (high + 1e-6, dense), (low, dense + 1e-6)):
+        with pytest.raises(jg.InputError, match="the range of the reference map"):
+            LAW(alpha, nu)
+        assert all(np.isnan(x) for x in jax.jit(LAW)(alpha, nu))
+    for rate in (0.0, -1.0, "1"):
+        with pytest.raises(jg.InputError, match="shear_rate must be a positive number"):
+            LAW(0.5, 0.5, rate)
+    with jax.enable_x64(False), pytest.raises(jg.InputError, match="double precision"):
+        jax.jit(lambda rate: LAW(0.5, 0.5, rate))(1.0)
+
+
+def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -> None:
+    LAW.to_csv(tmp_path / "law.csv")
+    head, columns = read_columns(tmp_path / "law.csv")
+    flows = columns["restitution"], columns["packing_fraction"]
+    for name, values in LAW(*flows)._asdict().items():
+        np.testing.assert_allclose(columns[name], values, rtol=1e-5)
+    for x, (low, high) in zip(flows, (LAW.restitution_range, LAW.packing_fraction_range), strict=True):
+        assert x.min() == low and x.max() == high
+    assert head["version"] == jg.__version__
+    assert {"map", "grains", "timestep", "ci95", "units", *(f"unit of {name}" for name in (*MEASURED, LENGTH))} <= {
+        *head
+    }
+    assert list(pd.read_csv(tmp_path / "law.csv", comment="#").columns) == list(columns)
+    LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
+    assert read_columns(tmp_path / "law.csv")[1]["restitution"].tolist() == [0.5, 0.6]
+
+
+def test_the_layer_of_the_page_is_in_mechanical_balance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        for block in re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+            exec(block, names)
+        stress, gravity, pressures = 0.3, 0.05, jnp.linspace(1.0, 1.2, 200)
+        depth, velocity, nu, temperature = names["layer"](0.6, pressures, stress, gravity)
+        weight = np.gradient(pressures, depth)
+        flow = LAW(0.6, np.asarray(nu), np.abs(np.gradient(velocity, depth)))
+    np.testing.assert_allclose(weight, gravity * 4 / np.pi * nu, rtol=1e-3)
+    inner = slice(1, -1)  # one-sided differences are of first order
+    np.testing.assert_allclose(flow.pressure[inner], pressures[inner], rtol=1e-3)
+    np.testing.assert_allclose(flow.shear_stress[inner], stress, rtol=1e-3)
+    np.testing.assert_allclose(flow.granular_temperature[inner], temperature[inner], rtol=1e-3)
+    dense = names["at_pressure"](20.0, 0.6, 1.5)
+    assert LAW(0.6, float(dense), 1.5).pressure == pytest.approx(20.0)
+    slope = jax.grad(lambda nu: LAW(0.6, nu, 1.5).pressure)(dense)
+    assert jax.grad(names["at_pressure"])(20.0, 0.6, 1.5) == pytest.approx(float(1 / slope))
