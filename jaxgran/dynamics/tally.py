@@ -179,7 +179,7 @@ class RunningSums(NamedTuple):
         kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
         begin = span_of(kind).start
         numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
-        return taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
+        return taken(numbers, np.asarray([0, 1, 1, 2], np.int32)).reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
 
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
