@@ -50,12 +50,6 @@ class Solution:
     status: Int[Array, ""]  # ok, iteration_limit, infeasible or nonfinite
 
 
-def no_solution(approach: Float[Array, " contacts"]) -> Solution:
-    """The solution of a network in which nothing acts."""
-    zeros, zero = jnp.zeros_like(approach), jnp.zeros((), approach.dtype)
-    return Solution(zeros, zeros, zero, jnp.int32(0), jnp.int32(0))
-
-
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def solve(
     contacts: Operator, grains: int, shear_rate: float | Array, solver: ProjectedMethod, active: Array

@@ -15,7 +15,7 @@ from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, PairMotion, contact_network, first_contact_time, is_contact
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.contact.solver import Solution, no_solution, solve
+from jaxgran.contact.solver import Solution, solve
 from jaxgran.dynamics.flight import pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
@@ -47,7 +47,7 @@ class AdvanceOptions(NamedTuple):
 
 def contact_buffers(grains: int) -> tuple[int, ...]:
     """Sizes of the buffers for the contacts of dilute and of dense flows, smallest first."""
-    return tuple(sorted({max(4, grains // 12), grains // 3, grains}))
+    return tuple(sorted({max(4, grains // 3), max(4, grains)}))
 
 
 class Touching(NamedTuple):
@@ -160,13 +160,9 @@ def collide(
     def by_iteration(active: Array, network: Contacts) -> Solution:
         return solve(network, grains.radii.size, flow.shear_rate, options.solver, active)
 
-    def of_few(active: Array) -> Collision:
-        def solved(network: Contacts) -> Solution:
-            branch = jnp.where(active, 1 + _above(contacts, 1), 0)
-            programs = [lambda _: _of_single(network, grains), partial(by_iteration, network=network)]
-            return switch_replica(branch, no_solution(network.approach), programs)
-
-        return acted(touching.picked(options.buffers[0], words), solved)
+    def single(active: Array) -> Collision:
+        # in one slot XLA would add up nothing, and then compute the terms once for each sum
+        return acted(touching.picked(4, words), partial(_of_single, grains))
 
     def in_buffer(size: int, active: Array) -> Collision:
         return acted(touching.picked(size, words), partial(by_iteration, active))
@@ -180,8 +176,9 @@ def collide(
         still, jnp.zeros_like(sums.contact), zero, jnp.int32(0), zero, jnp.int32(0), sums.user_sums, shift
     )
     sizes = options.buffers
-    programs = [of_few, *(partial(in_buffer, size) for size in sizes[1:]), on_list] if sizes else [on_list]
-    collision = switch_replica(_above(contacts, 0, *sizes), unchanged, programs)
+    programs = [single, *(partial(in_buffer, size) for size in sizes), on_list] if sizes else [on_list]
+    limits = jnp.asarray([0, 1, *sizes] if sizes else [0], jnp.int32)
+    collision = switch_replica(jnp.sum(contacts > limits, dtype=jnp.int32), unchanged, programs)
     kicks = collision.momenta / grains.masses[:, None]
     x, y = kicks.T
     felt_x, felt_y = (taken(a, near.i) - taken(a, near.j) for a in (x, y))
@@ -189,12 +186,7 @@ def collide(
     return velocities + kicks, pairs, _with_collision(sums, collision, meets), collision.shift
 
 
-def _above(contacts: Array, *limits: int) -> Array:
-    """How many of the limits a number of contacts exceeds."""
-    return jnp.sum(contacts > jnp.asarray(limits, jnp.int32), dtype=jnp.int32)
-
-
-def _of_single(network: Contacts, grains: Grains) -> Solution:
+def _of_single(grains: Grains, network: Contacts) -> Solution:
     """The closed form of a single contact, for which the iteration would need one product."""
     own = diagonal(network, grains.radii.size)
     impulses = jnp.maximum(0, -network.approach / own)
