@@ -27,7 +27,7 @@ LARGEST = "largest"  # each solved network; the largest value counts
 AT_END = "end"  # the end of an advance
 INSTANT = "instant"  # the state at the end of an advance, which stands for its whole duration
 KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST)
-_TENSOR, _SYMMETRIC = (2, 2), np.array([0, 1, 1, 2], np.int32)  # running sums hold xx, xy, yy
+_TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
 
 
 def _sum(kind: str, unit: str, meaning: str, shape: tuple[int, ...] = (), joined: str = "sum") -> Any:
@@ -179,7 +179,7 @@ class RunningSums(NamedTuple):
         kind, shape, place = TABLE[name]["kind"], TABLE[name]["shape"], LAYOUT[name]
         begin = span_of(kind).start
         numbers = getattr(self, kind)[place.start - begin : place.stop - begin]
-        return (taken(numbers, jnp.asarray(_SYMMETRIC)) if shape == _TENSOR else numbers).reshape(shape)
+        return taken(numbers, jnp.asarray([0, 1, 1, 2])).reshape(2, 2) if shape == _TENSOR else numbers.reshape(shape)
 
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
