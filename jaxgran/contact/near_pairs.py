@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxgran.contact.cell_list import cell_list_pairs, largest_cutoff, set_bit
@@ -33,7 +35,7 @@ NEAR_PAIRS_PER_GRAIN = 4
 OUTER_PAIRS_PER_GRAIN = 10
 _WORD, _FEW_WORDS = 32, 128
 _FILL = 0.8  # share of a buffer that the expected number of pairs may take
-_SKIN_SHARES = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1)  # tried in turn where the grains cluster and a buffer is too small
+_NARROWER, _LEAST_SHARE = 0.7, 0.15  # of the skin, where the grains cluster and a buffer is too small
 
 
 @jax.tree_util.register_dataclass
@@ -134,7 +136,8 @@ def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array,
     """Both lists, built from the positions; the frame starts here."""
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
     outer = _outer_pairs(positions, grains, side, tilt)
-    near = _near_pairs(outer, at_rest, outer.skin, grains, side)
+    skin = jnp.minimum(_nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side), outer.skin)
+    near = _near_pairs(outer, at_rest, skin, grains)
     return PairLists(outer, near, at_rest, at_rest, positions, tilt)
 
 
@@ -149,7 +152,7 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
     at_rest = Frame(jnp.zeros_like(lists.positions), jnp.zeros_like(lists.tilt))
     nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
     left = lists.outer.skin - consumed_skin(lists.frame, at_rest, 2 * jnp.max(grains.radii) + nominal)
-    left = jax.lax.stop_gradient(left)
+    left = lax.stop_gradient(left)
     search = stale & ~(left >= nominal)
 
     def searched() -> tuple:
@@ -158,8 +161,8 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
         return where_active(search, new, kept)
 
     kept = lists.outer, lists.frame, lists.positions, lists.tilt
-    outer, frame, positions, tilt = jax.lax.cond(any_replica(search), searched, lambda: kept)
-    near = _near_pairs(outer, frame, jnp.where(search, outer.skin, left), grains, side)
+    outer, frame, positions, tilt = lax.cond(any_replica(search), searched, lambda: kept)
+    near = _near_pairs(outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, left)), grains)
     return where_active(stale, PairLists(outer, near, frame, frame, positions, tilt), lists)
 
 
@@ -180,18 +183,18 @@ def bit_words(mask: Bool[Array, " m"]) -> UInt32[Array, " words"]:
     """The mask in words of 32 bits, the first entry in the lowest bit."""
     words = -(-mask.size // _WORD)
     bits = jnp.pad(mask, (0, words * _WORD - mask.size)).reshape(words, _WORD)
-    weights = jnp.uint32(1) << jnp.arange(_WORD, dtype=jnp.uint32)
-    return jnp.sum(jnp.where(bits, weights[None, :], jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+    weights = np.uint32(1) << np.arange(_WORD, dtype=np.uint32)
+    return jnp.sum(jnp.where(bits, weights[None, :], np.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
 def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Array, " size"]:
     """Positions of the first ``size`` set bits, padded with ``length``."""
     count = words.size
-    set_in_word = jax.lax.population_count(words).astype(jnp.int32)
+    set_in_word = lax.population_count(words).astype(jnp.int32)
     wanted = jnp.arange(size, dtype=jnp.int32)
     if count <= _FEW_WORDS:
-        triangle = jnp.tril(jnp.ones((count, count), bool))
-        running = jnp.sum(jnp.where(triangle, set_in_word[None, :], 0), axis=1, dtype=jnp.int32)
+        triangle = np.tri(count, dtype=bool)
+        running = jnp.sum(jnp.where(triangle, set_in_word[None, :], np.int32(0)), axis=1, dtype=jnp.int32)
         word = jnp.sum(running[None, :] <= wanted[:, None], axis=1, dtype=jnp.int32)
     else:
         running = jnp.cumsum(set_in_word, dtype=jnp.int32)
@@ -229,26 +232,26 @@ def _select(
       Where the pairs stand among the gaps, which slots of the buffer they fill, the skin, and whether even the smallest
       skin leaves pairs out.
     """
-    gaps, largest_skin = jax.lax.stop_gradient((gaps, largest_skin))  # the choice of pairs has no derivative
-    shares = jnp.asarray(_SKIN_SHARES, gaps.dtype)
+    gaps, largest_skin = lax.stop_gradient((gaps, largest_skin))  # the choice of pairs has no derivative
 
-    def unfinished(tried: Array, words: Array) -> Array:
-        return (tried == 0) | (_overflows(words, capacity) & (tried < len(_SKIN_SHARES)))
+    def crowded(now: tuple[Array, Array]) -> Array:
+        skin, words = now
+        return _overflows(words, capacity) & (skin > _LEAST_SHARE * largest_skin)
 
-    def next_skin(tried: Array, words: Array) -> tuple[Array, Array]:
-        new = tried + 1, bit_words(gaps <= largest_skin * shares.at[tried].get(mode="clip"))
-        return where_active(unfinished(tried, words), new, (tried, words))
+    def narrower(now: tuple[Array, Array]) -> tuple[Array, Array]:
+        skin = _NARROWER * now[0]
+        return where_active(crowded(now), (skin, bit_words(gaps <= skin)), now)
 
-    start = jnp.int32(0), jnp.zeros(-(-gaps.size // _WORD), jnp.uint32)
-    tried, words = jax.lax.while_loop(lambda now: any_replica(unfinished(*now)), lambda now: next_skin(*now), start)
+    widest = largest_skin, bit_words(gaps <= largest_skin)
+    skin, words = lax.while_loop(lambda now: any_replica(crowded(now)), narrower, widest)
     index = set_bits(words, capacity, gaps.size)
     filled = index < gaps.size
-    return jnp.where(filled, index, 0), filled, largest_skin * shares[tried - 1], _overflows(words, capacity)
+    return jnp.where(filled, index, 0), filled, skin, _overflows(words, capacity)
 
 
 def _overflows(words: UInt32[Array, " words"], capacity: int) -> Bool[Array, ""]:
     """Whether more bits are set than a buffer has slots."""
-    return jnp.sum(jax.lax.population_count(words).astype(jnp.int32), dtype=jnp.int32) > capacity
+    return jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32) > capacity
 
 
 def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> PairList:
@@ -264,10 +267,9 @@ def _pair_list(i, j, separations, filled, grains: Grains, skin, overflow) -> Pai
     )
 
 
-def _near_pairs(outer: PairList, frame: Frame, skin_left: Array, grains: Grains, side: Array) -> PairList:
-    """The pairs of the outer list that are near now, with the frozen separations of the outer list."""
+def _near_pairs(outer: PairList, frame: Frame, largest: Array, grains: Grains) -> PairList:
+    """The pairs of the outer list within the largest skin now, with the frozen separations of the outer list."""
     distance = jnp.sqrt(jnp.sum(separations_now(outer, frame) ** 2, axis=-1))
-    largest = jnp.minimum(_nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side), skin_left)
     capacity = _capacity(NEAR_PAIRS_PER_GRAIN, grains.radii.size)
     at, filled, skin, overflow = _select(distance - outer.reach, largest, capacity)
     i, j, separations = taken(outer.i, at), taken(outer.j, at), taken(outer.separations, at)
@@ -290,6 +292,6 @@ def _outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Arra
         gaps = jnp.sqrt(jnp.sum(separations**2, axis=-1)) - grains.radii[:, None] - grains.radii[None, :]
         gaps = jnp.where(jnp.triu(jnp.ones((count, count), bool), 1), gaps, jnp.inf).reshape(-1)
         at, filled, skin, overflow = _select(gaps, largest, capacity)
-        i, j = at // count, at % count
+        i, j = lax.div(at, jnp.int32(count)), lax.rem(at, jnp.int32(count))  # without the cases of negative numbers
     separations = displacement(taken(positions, i), taken(positions, j), side, tilt)
     return _pair_list(i, j, separations, filled, grains, skin, overflow)

@@ -181,11 +181,12 @@ class BarzilaiBorwein(ProjectedMethod):
         guarded = (k >= 0) | (judged & ~(best_residual < PROGRESS * before))
         step, response = point - now.point
         long = now.iterations % 2 == 1
-        left = jnp.where(long | guarded, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
-        own, mixed = dot(left, jnp.where(long | guarded, step, response)), dot(step, response)
+        along_step = long | guarded
+        left = jnp.where(along_step, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
+        own, mixed = dot(left, jnp.where(along_step, step, response)), dot(step, response)
         over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
-        longest = LONGEST_STRIDE
-        stride = jnp.where(under > 0, jnp.minimum(over / jnp.where(under > 0, under, 1), longest), longest)
+        curved = under > 0
+        stride = jnp.where(curved, jnp.minimum(over / jnp.where(curved, under, 1), LONGEST_STRIDE), LONGEST_STRIDE)
         momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
         return (
             jnp.where(guarded, 1, stride),

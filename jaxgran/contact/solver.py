@@ -69,36 +69,37 @@ def solve(
     bound = solver.bound(contacts, grains)
     closing = jnp.minimum(b, 0)
     scale = jnp.sqrt(dot(closing, closing))
-    target = residual_target(scale, solver.tolerance, shear_rate, jnp.finfo(b.dtype).eps)
+    tolerance, max_steps = jnp.asarray(solver.tolerance, b.dtype), jnp.asarray(solver.max_steps, jnp.int32)
+    target = residual_target(scale, tolerance, shear_rate, jnp.finfo(b.dtype).eps)
 
     def as_numbers(values: Any) -> Any:
         """What a method returns, in the precision of the contacts."""
         return jax.tree.map(lambda x: jnp.asarray(x, b.dtype), values)
 
-    def unfinished(now: _Progress):
-        going = ~(now.residual <= target) & (now.at.iterations < solver.max_steps) & jnp.isfinite(now.residual)
-        return active & (going | (now.at.iterations == 0))
-
     def iterate(now: _Progress) -> _Progress:
-        at = now.at
+        at, iterations = now.at, now.at.iterations + 1
         start, step = as_numbers(solver.propose(at))
         impulses = jnp.maximum(0, start[0] - step * (start[1] + b) / bound)
-        point = jnp.stack([impulses, delassus_product(contacts, impulses, grains)])
-        error = jnp.minimum(own * impulses, point[1] + b)
+        response = delassus_product(contacts, impulses, grains)
+        point = jnp.stack([impulses, response])
+        error = jnp.minimum(own * impulses, response + b)
         residual = jnp.sqrt(dot(error, error))
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
         memory = as_numbers(solver.learn(at, start, point, bound, best_residual))
         new = _Progress(
-            at=Iterate(point, at.point, memory, best_residual, at.iterations + 1),
+            at=Iterate(point, at.point, memory, best_residual, iterations),
             residual=residual,
             best=jnp.where(better, point, now.best),
+            unfinished=~(residual <= target) & (iterations < max_steps) & jnp.isfinite(residual),
         )
-        return where_active(unfinished(now), new, now)
+        return where_active(now.unfinished, new, now)
 
     zero, infinite = jnp.zeros((2, b.size), b.dtype), jnp.asarray(jnp.inf, b.dtype)
     start = Iterate(zero, zero, as_numbers(solver.init(b)), infinite, jnp.int32(0))
-    end = lax.while_loop(lambda now: any_replica(unfinished(now)), iterate, _Progress(start, infinite, zero))
+    end = lax.while_loop(
+        lambda now: any_replica(now.unfinished), iterate, _Progress(start, infinite, zero, jnp.asarray(active))
+    )
     impulses, response = end.best
 
     def is_jammed():
@@ -159,3 +160,4 @@ class _Progress(NamedTuple):
     at: Iterate
     residual: Array
     best: Array  # (2, contacts): the point of the smallest residual
+    unfinished: Array

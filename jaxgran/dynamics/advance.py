@@ -62,7 +62,8 @@ def advance(
       moving_contacts: whether derivatives include the shift of the contacts in time, see
         ``dynamics.jax_engine``. Values do not change.
       solver: solves the contacts of each step. New numbers in it do not recompile.
-      engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for an automatic choice, see ``dynamics.engine``.
+      engine: ``Jax()``, ``Numba()`` or ``Pallas()`` (experimental, not run on a device); None for an automatic choice,
+        see ``dynamics.engine``.
 
     Returns:
       The state after the last step, and the tally of the steps, with a leading (replicas,) axis for a batch. A replica

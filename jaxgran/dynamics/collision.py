@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -14,7 +15,7 @@ from jaxgran.contact.law import contact_terms
 from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pair_lists, set_bits
 from jaxgran.contact.network import Contacts, PairMotion, contact_network, first_contact_time, is_contact
 from jaxgran.contact.projected_methods import ProjectedMethod
-from jaxgran.contact.solver import solve
+from jaxgran.contact.solver import Solution, solve
 from jaxgran.dynamics.flight import pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
@@ -26,6 +27,7 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: the state, its contacts, their impulses
+_ABOVE, _UP_TO = np.append(-np.inf, RESIDUAL_EDGES[1:-1]), np.append(RESIDUAL_EDGES[1:-1], np.inf)  # bins of residuals
 MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
 
 
@@ -45,7 +47,7 @@ class AdvanceOptions(NamedTuple):
 
 def contact_buffers(grains: int) -> tuple[int, ...]:
     """Sizes of the buffers for the contacts of dilute and of dense flows, smallest first."""
-    return tuple(sorted({max(4, grains // 12), grains // 3, grains}))
+    return tuple(sorted({max(4, grains // 3), max(4, grains)}))
 
 
 class Touching(NamedTuple):
@@ -62,7 +64,8 @@ class Touching(NamedTuple):
         pairs = self.contact.size
         index = set_bits(words, size, pairs)
         used = index < pairs
-        i, j, reach, motion = jax.tree.map(lambda x: taken(x, jnp.where(used, index, 0)), self[:-1])
+        index = jnp.where(used, index, 0)
+        i, j, reach, motion = jax.tree.map(lambda x: taken(x, index), self[:-1])
         return Touching(i, j, reach, motion, used)
 
     def network(self, grains: Grains) -> Contacts:
@@ -81,16 +84,14 @@ def contacts_now(flow: ShearFlow, state: State) -> Contacts:
 
 
 class Impulses(NamedTuple):
-    """What a solve gives: impulses of the contacts, the change of their velocities u⁺ − u⁻, impulses of the grains,
-    contacts with an impulse of each grain, and how it went."""
+    """Impulses of the contacts, those if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻), the change of their
+    velocities u⁺ − u⁻, impulses of the grains, and contacts with an impulse of each grain."""
 
     contacts: Float[Array, " contacts"]
+    binary: Float[Array, " contacts"]
     changes: Float[Array, " contacts"]
     grains: Float[Array, "grains 2"]
     loaded: Float[Array, " grains"]
-    iterations: Array
-    residual: Array
-    status: Array
 
 
 class Collision(NamedTuple):
@@ -140,32 +141,34 @@ def collide(
     words = bit_words(contact)
     contacts = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
 
-    def acted(touching: Touching, network: Contacts, found: Impulses, delays: Array | None = None) -> Collision:
+    def acted(touching: Touching, solved: Callable[[Contacts], Solution], delays: Array | None = None) -> Collision:
+        """What the contacts do, from the network of those that touch and its solution."""
+        network = touching.network(grains)
+        solution = solved(network)
+        found = _impulses(flow, network, grains, solution)
         added, deepest = _contact_sums(flow, touching, network, found)
         user_sums, shift = sums.user_sums, None
         if observe_now is not None:
             user_sums = with_contacts(user_sums, observe_now, network, found.contacts)
         if delays is not None:
-            own = jnp.minimum(found.contacts, _binary_impulses(flow, network))
+            own = jnp.minimum(found.contacts, found.binary)
             delayed = grain_impulses(network, own * jnp.where(network.used, delays, 0), grains.radii.size)
             shift = -delayed / grains.masses[:, None]
-        return Collision(found.grains, added, deepest, *found[4:], user_sums, shift)
+        outcome = solution.iterations, solution.residual, solution.status
+        return Collision(found.grains, added, deepest, *outcome, user_sums, shift)
 
-    def of_few(active: Array) -> Collision:
-        picked = touching.picked(options.buffers[0], words)
-        network = picked.network(grains)
-        none = _no_impulses(network, grains)
-        programs = [partial(_of_single, flow, network, grains), partial(_solved, flow, network, grains, options.solver)]
-        return acted(picked, network, switch_replica(jnp.where(active, 1 + _above(contacts, 1), 0), none, programs))
+    def by_iteration(active: Array, network: Contacts) -> Solution:
+        return solve(network, grains.radii.size, flow.shear_rate, options.solver, active)
+
+    def single(active: Array) -> Collision:
+        # in one slot XLA would add up nothing, and then compute the terms once for each sum
+        return acted(touching.picked(4, words), partial(_of_single, grains))
 
     def in_buffer(size: int, active: Array) -> Collision:
-        picked = touching.picked(size, words)
-        network = picked.network(grains)
-        return acted(picked, network, _solved(flow, network, grains, options.solver, active))
+        return acted(touching.picked(size, words), partial(by_iteration, active))
 
     def on_list(active: Array) -> Collision:
-        network = touching.network(grains)
-        return acted(touching, network, _solved(flow, network, grains, options.solver, active), delays)
+        return acted(touching, partial(by_iteration, active), delays)
 
     still = jnp.zeros_like(velocities)
     shift = None if delays is None else still
@@ -173,8 +176,9 @@ def collide(
         still, jnp.zeros_like(sums.contact), zero, jnp.int32(0), zero, jnp.int32(0), sums.user_sums, shift
     )
     sizes = options.buffers
-    programs = [of_few, *(partial(in_buffer, size) for size in sizes[1:]), on_list] if sizes else [on_list]
-    collision = switch_replica(_above(contacts, 0, *sizes), unchanged, programs)
+    programs = [single, *(partial(in_buffer, size) for size in sizes), on_list] if sizes else [on_list]
+    limits = jnp.asarray([0, 1, *sizes] if sizes else [0], jnp.int32)
+    collision = switch_replica(jnp.sum(contacts > limits, dtype=jnp.int32), unchanged, programs)
     kicks = collision.momenta / grains.masses[:, None]
     x, y = kicks.T
     felt_x, felt_y = (taken(a, near.i) - taken(a, near.j) for a in (x, y))
@@ -182,47 +186,21 @@ def collide(
     return velocities + kicks, pairs, _with_collision(sums, collision, meets), collision.shift
 
 
-def _above(contacts: Array, *limits: int) -> Array:
-    """How many of the limits a number of contacts exceeds."""
-    return jnp.sum(contacts > jnp.asarray(limits, jnp.int32), dtype=jnp.int32)
-
-
-def _no_impulses(network: Contacts, grains: Grains) -> Impulses:
-    zeros, zero = jnp.zeros_like(network.approach), jnp.zeros((), network.approach.dtype)
-    on_grains = jnp.zeros((grains.radii.size, 2), zero.dtype)
-    return Impulses(zeros, zeros, on_grains, on_grains[:, 0], jnp.int32(0), zero, jnp.int32(0))
-
-
-def _of_single(flow: ShearFlow, network: Contacts, grains: Grains, _: Array) -> Impulses:
+def _of_single(grains: Grains, network: Contacts) -> Solution:
     """The closed form of a single contact, for which the iteration would need one product."""
     own = diagonal(network, grains.radii.size)
     impulses = jnp.maximum(0, -network.approach / own)
     status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
-    outcome = jnp.int32(1), jnp.zeros((), impulses.dtype), status
-    return _impulses(flow, network, grains, impulses, own * impulses, *outcome)
+    return Solution(impulses, own * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status)
 
 
-def _solved(flow: ShearFlow, network: Contacts, grains: Grains, solver: ProjectedMethod, active: Array) -> Impulses:
-    """The impulses of a network, by iteration."""
-    solution = solve(network, grains.radii.size, flow.shear_rate, solver, active)
-    outcome = solution.iterations, solution.residual, solution.status
-    return _impulses(flow, network, grains, solution.impulses, solution.response, *outcome)
-
-
-def _impulses(
-    flow: ShearFlow, network: Contacts, grains: Grains, impulses: Array, response: Array, *outcome: Array
-) -> Impulses:
-    """What a solve gives, from the impulses p₀ at restitution zero and their response W p₀."""
+def _impulses(flow: ShearFlow, network: Contacts, grains: Grains, solution: Solution) -> Impulses:
+    """The impulses of a network, from its solution at restitution zero."""
     one_plus_alpha = 1 + flow.restitution
-    impulses = one_plus_alpha * impulses
-    on_grains = loads_of_grains(network, impulses, grains.radii.size)
-    return Impulses(impulses, one_plus_alpha * response, *on_grains, *outcome)
-
-
-def _binary_impulses(flow: ShearFlow, network: Contacts) -> Float[Array, " contacts"]:
-    """The impulses if every collision were binary, (1 + α) μ₁₂ max(0, −u⁻)."""
-    response = jnp.where(network.used, network.inverse_mass_i + network.inverse_mass_j, 1)
-    return (1 + flow.restitution) / response * jnp.maximum(0, -network.approach)
+    impulses = one_plus_alpha * solution.impulses
+    binary = one_plus_alpha * jnp.maximum(0, -network.approach) / diagonal(network, grains.radii.size)
+    changes = one_plus_alpha * solution.response
+    return Impulses(impulses, binary, changes, *loads_of_grains(network, impulses, grains.radii.size))
 
 
 def _contact_sums(flow: ShearFlow, touching: Touching, network: Contacts, found: Impulses) -> tuple[Array, Array]:
@@ -242,7 +220,7 @@ def _contact_sums(flow: ShearFlow, touching: Touching, network: Contacts, found:
         found.changes / 2,
         1 + flow.restitution,
         impulses,
-        _binary_impulses(flow, network),
+        found.binary,
         jnp.where(clustered, impulses, 0),
         *flags,
     )
@@ -253,8 +231,8 @@ def _with_collision(sums: RunningSums, collision: Collision, meets: Array) -> Ru
     """The sums with what the contacts of one step add."""
     dtype = sums.contact.dtype
     solve_counts = [meets, collision.iterations, collision.status != Status.ok]
-    above = jnp.append(jnp.ones(1, bool), collision.residual > jnp.asarray(RESIDUAL_EDGES[1:-1], dtype)) & meets
-    by_residual = above & ~jnp.append(above[1:], False)
+    above, up_to = jnp.asarray(_ABOVE, dtype), jnp.asarray(_UP_TO, dtype)
+    by_residual = (collision.residual > above) & (collision.residual <= up_to) & meets
     solves = jnp.concatenate([jnp.stack([x.astype(dtype) for x in solve_counts]), by_residual.astype(dtype)])
     return sums._replace(
         contact=sums.contact + collision.contact_sums,

@@ -40,8 +40,8 @@ from jaxgran.model.state import State
 
 MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
 _EXPERIMENTAL = (
-    "flows take the engine pallas, which is experimental: it has passed its tests in an interpreter and a trial on "
-    "this device, and nothing has been measured with it. The engine jax is the reference."
+    "flows take the engine pallas, which is experimental, not run on a device by its authors: it has passed its tests "
+    "in an interpreter and a trial on this device, and nothing was measured with it. The engine jax is the reference."
 )
 _SINGLE_PRECISION = (
     "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
@@ -85,10 +85,10 @@ class Numba:
 
 @dataclass(frozen=True)
 class Pallas:
-    """Experimental engine for NVIDIA GPUs, one kernel for all steps: up to 1024 grains, ``BarzilaiBorwein`` only.
+    """Engine for NVIDIA GPUs, experimental, not run on a device: up to 1024 grains, ``BarzilaiBorwein`` only.
 
-    It has run in an interpreter only, not on a device. The compiler it needs, Pallas' Triton backend, is deprecated
-    since JAX 0.11.
+    One kernel takes all steps. It has run in an interpreter only, and a warning says so where it is taken. The compiler
+    it needs, Pallas' Triton backend, is deprecated since JAX 0.11.
 
     Examples:
       >>> Pallas()

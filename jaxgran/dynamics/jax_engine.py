@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.near_pairs import PairLists, no_lists, present
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.network import Contacts, PairMotion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_buffers, shifted
 from jaxgran.dynamics.flight import (
@@ -33,7 +33,6 @@ from jaxgran.dynamics.flight import (
     closing_speed,
     fly,
     is_stale,
-    pairs_now,
     steps_to_contact,
     with_new_lists,
 )
@@ -184,15 +183,14 @@ class EventLoop(NamedTuple):
 
 def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, options: AdvanceOptions):
     """Start and body of the loop of an advance, and whether it has to continue."""
-    dt, shear_rate, grains, side = flow.timestep, flow.shear_rate, state.grains, state.side
+    grains, side, observe = state.grains, state.side, options.observe
+    observe = None if observe is None else partial(observe, flow)
+    flow = jax.tree.map(lambda x: jnp.asarray(x, side.dtype), flow)
+    dt, shear_rate = flow.timestep, flow.shear_rate
 
     def observer_at(lists: PairLists, velocities: Array) -> ObserveNow | None:
         """What the user observes of the flow as it is; None where nothing is observed."""
-        return (
-            None
-            if options.observe is None
-            else partial(_observed_at, partial(options.observe, flow), lists, grains, velocities, side)
-        )
+        return None if observe is None else partial(_observed_at, observe, lists, grains, velocities, side)
 
     def unfinished(now: Carry):
         return (now.step < steps) & (now.sums.status < Status.nonfinite)
@@ -240,7 +238,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         return with_new_lists(now, flow, grains, side, stale(now))
 
     lists = no_lists(state.positions, state.tilt)
-    pairs = pairs_now(lists, state.velocities, shear_rate)
+    pairs = PairMotion(*4 * [jnp.zeros_like(lists.near.reach)])
     sums = empty_sums(state.positions.dtype)
     sums = sums._replace(status=status_if_finite(state.positions, state.velocities))
     observe_now = observer_at(lists, state.velocities)

@@ -1,12 +1,14 @@
 """Batches of flows and states: a function of one replica applied to all of them, as their engine does it fastest."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array
 
 from jaxgran.dynamics.engine import Jax, Numerics, in_lockstep, select_engine
 from jaxgran.dynamics.interruption import waited
@@ -75,6 +77,18 @@ def over_replicas(function: Callable, numerics: Numerics, batch: Arguments, opti
     if isinstance(select_engine(flow, numerics, state, option), Jax):
         return lax.map(lambda one: function(*one), batch)
     return jax.vmap(function)(*batch)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def compiled_over_replicas(
+    function: Callable, static: tuple, option: str, numerics: Numerics, flow: ShearFlow, state: State, *numbers: Array
+) -> Any:
+    """``over_replicas`` of ``function(flow, numerics, state, *numbers, *static)``, compiled."""
+
+    def one(flow: ShearFlow, state: State, *numbers: Array) -> Any:
+        return function(flow, numerics, state, *numbers, *static)
+
+    return over_replicas(one, numerics, (flow, state, *numbers), option)
 
 
 def compiled_for_few_sizes(program: Callable[..., Any], numerics: Numerics, batch: Arguments) -> Any:

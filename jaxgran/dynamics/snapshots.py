@@ -22,7 +22,7 @@ from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.collision import contacts_now
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
-from jaxgran.dynamics.replicas import checked_batch, over_replicas
+from jaxgran.dynamics.replicas import checked_batch, compiled_over_replicas
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
@@ -113,7 +113,7 @@ def snapshot_series(
     strain = as_array(strain)
     require("strain", strain, lambda x: (x > 0) & np.isfinite(x), "a positive number")
     if batch := checked_batch(partial(_require_series, count), flow, state, strain):
-        return _snapshot_series_of_replicas(count, numerics, *batch)
+        return compiled_over_replicas(_snapshot_series, (count,), "", numerics, *batch)
     return _snapshot_series(flow, numerics, state, strain, count)
 
 
@@ -121,16 +121,6 @@ def _require_series(count: int, flow: ShearFlow, state: State, strain: Any) -> N
     require_state(flow, state)
     require_whole("count", count, 1, _MOST_GRAIN_SNAPSHOTS // flow.grains, "as memory is limited")
     require_strain(flow, strain, count)
-
-
-@partial(jax.jit, static_argnums=0)
-def _snapshot_series_of_replicas(
-    count: int, numerics: Numerics, flow: ShearFlow, state: State, strain: Array
-) -> tuple[State, Snapshot]:
-    def one(flow: ShearFlow, state: State, strain: Array) -> tuple[State, Snapshot]:
-        return _snapshot_series(flow, numerics, state, strain, count)
-
-    return over_replicas(one, numerics, (flow, state, strain))
 
 
 @partial(jax.jit, static_argnames="count")

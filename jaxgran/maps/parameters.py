@@ -134,7 +134,12 @@ class MapParameters:
         default="midpoint", metadata=row("When a pair of grains is a contact.", get_args(Activation))
     )
     engine: Any = field(
-        default=None, metadata=row("Program that advances the flows.", get_args(EngineName), default="auto")
+        default=None,
+        metadata=row(
+            "Program that advances the flows; pallas is experimental, not run on a device.",
+            get_args(EngineName),
+            default="auto",
+        ),
     )
     grains_by_point: Sequence[int] | None = field(
         default=None,

@@ -117,6 +117,6 @@ def relative_momentum(grains: Grains, velocities: Array) -> Float[Array, ""]:
 
 
 def status_if_finite(*values: Array) -> Int[Array, ""]:
-    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``."""
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+    """``Status.ok`` if all numbers are finite, or else ``Status.nonfinite``; the values have one shape."""
+    finite = jnp.all(jnp.isfinite(jnp.stack(values)))
     return jnp.where(finite, Status.ok, Status.nonfinite).astype(jnp.int32)

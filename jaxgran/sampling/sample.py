@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
-from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, over_replicas
+from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, compiled_over_replicas
 from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.model.batches import Indexable, equal_values, in_numpy
 from jaxgran.model.checks import (
@@ -308,7 +308,8 @@ def sample(
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
         One block is then compiled at a time, and neither batches nor JAX transformations apply.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
-      engine: ``Jax()``, ``Numba()`` or ``Pallas()``; None for the fastest that can do this, see ``advance``.
+      engine: ``Jax()``, ``Numba()`` or ``Pallas()`` (experimental, not run on a device); None for the fastest that can
+        do this, see ``advance``.
 
     Returns:
       The final state and the sample; those of a batch have a leading (replicas,) axis.
@@ -330,7 +331,8 @@ def sample(
     if callback is None:
         if batch is None:
             return waited(_sample(flow, numerics, state, strain, blocks, observe))
-        program = partial(_sample_replicas, blocks, observe, numerics)
+        option = "" if observe is None else "observe"
+        program = partial(compiled_over_replicas, _sample, (blocks, observe), option, numerics)
         return compiled_for_few_sizes(program, numerics, batch)
     if batch or is_traced(flow, numerics, state, strain):
         raise InputError("callback must be None for a batch, and where a sample is transformed, as by jax.jit.")
@@ -350,16 +352,6 @@ def _sample(
     flow: ShearFlow, numerics: Numerics, state: State, strain: Array, blocks: int, observe: Observable | None = None
 ) -> tuple[State, Sample]:
     return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _sample_replicas(
-    blocks: int, observe: Observable | None, numerics: Numerics, flow: ShearFlow, state: State, strain: Array
-) -> tuple[State, Sample]:
-    def one(flow: ShearFlow, state: State, strain: Array) -> tuple[State, Sample]:
-        return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
-
-    return over_replicas(one, numerics, (flow, state, strain), "" if observe is None else "observe")
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
