@@ -58,17 +58,6 @@ def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
     assert list(output.parent.iterdir()) == []
 
 
-def test_replicas_of_every_number_of_grains_come_back(output: Path) -> None:
-    settings, rng = replace(SETTINGS, grains=(64, 128)), np.random.default_rng(0)
-    run = Checkpoint(output, settings, resume=False)
-    run.add({(point, 0): random_replica(rng, settings, Status.ok, point) for point in (0, 5)})
-    run.close(finished=False)
-    resumed = Checkpoint(output, settings, resume=True)
-    assert_same_bits(resumed.done, run.done)
-    assert [resumed.done[point, 0].sample.grains for point in (0, 5)] == [64, 128]
-    resumed.close(finished=False)
-
-
 def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     cut_off(output)
     with pytest.raises(InputError, match="to continue it") as refused:
@@ -77,21 +66,12 @@ def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
-@pytest.mark.parametrize(
-    "change", [{"solver": LOOSE}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}, {"engine": Jax()}]
-)
+@pytest.mark.parametrize("change", [{"solver": LOOSE}, {"restitution": (0.4, 0.9)}, {"engine": Jax()}])
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
     with pytest.raises(InputError, match=f"has {next(iter(change))} ") as refused:
         Checkpoint(output, replace(SETTINGS, **change), resume=True)
     assert one_sentence(str(refused.value))
-
-
-def test_another_version_is_refused_and_named(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cut_off(output)
-    monkeypatch.setattr(checkpoint, "version", lambda name: "0.0.1")
-    with pytest.raises(InputError, match=r"version of jaxgran .*, not '0.0.1'"):
-        Checkpoint(output, SETTINGS, resume=True)
 
 
 def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,7 +84,7 @@ def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch:
     assert one_sentence(str(no.value)) and sorted(folder.iterdir()) == there
 
 
-@pytest.mark.parametrize("how", ["torn", "flipped", "empty"])
+@pytest.mark.parametrize("how", ["torn", "flipped"])
 def test_a_damaged_file_costs_its_own_batch_alone(output: Path, how: str) -> None:
     kept = cut_off(output)
     folder = output.with_name("map.nc.unfinished")
@@ -112,7 +92,7 @@ def test_a_damaged_file_costs_its_own_batch_alone(output: Path, how: str) -> Non
     whole = bytearray(lost.read_bytes())
     middle = len(whole) // 2
     whole[middle : middle + 64] = bytes(255 - x for x in whole[middle : middle + 64])
-    lost.write_bytes({"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how])
+    lost.write_bytes({"torn": bytes(whole[:middle]), "flipped": bytes(whole)}[how])
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert resumed.damaged == [lost.name] and not lost.exists()
     assert len(resumed.done) == 4
@@ -175,28 +155,19 @@ def test_no_replica_is_under_way_twice(output: Path) -> None:
     run.close(finished=True)
 
 
-def test_a_folder_that_is_removed_is_made_again_with_all_that_was_known(output: Path) -> None:
-    run = Checkpoint(output, SETTINGS, resume=False)
-    first, second, third = batches()
-    run.add(first)
-    run.add(second)
-    for path in run.folder.iterdir():
-        path.unlink()
-    run.folder.rmdir()
-    run.add(third)
-    run.close(finished=False)
-    resumed = Checkpoint(output, SETTINGS, resume=True)
-    assert_same_bits(resumed.done, first | second | third)
-    resumed.close(finished=True)
-
-
 def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) -> None:
+    """And all that was known."""
     run = Checkpoint(output, SETTINGS, resume=False)
+    first, second, _ = batches()
+    run.add(first)
     shutil.rmtree(run.folder)
-    run.add(batches()[0])
+    run.add(second)
     with pytest.raises(InputError, match="another process is writing"):
         Checkpoint(output, SETTINGS, resume=True)
-    run.close(finished=True)
+    run.close(finished=False)
+    resumed = Checkpoint(output, SETTINGS, resume=True)
+    assert_same_bits(resumed.done, first | second)
+    resumed.close(finished=True)
     assert list(output.parent.iterdir()) == []
 
 
@@ -241,11 +212,6 @@ def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch: p
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert_same_bits(resumed.done, kept)
     resumed.close(finished=True)
-    assert list(output.parent.iterdir()) == []
-
-
-def test_a_map_that_had_hardly_begun_leaves_nothing(output: Path) -> None:
-    Checkpoint(output, SETTINGS, resume=False).close(finished=False)
     assert list(output.parent.iterdir()) == []
 
 

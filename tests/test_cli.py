@@ -1,7 +1,6 @@
 """The command line does what it says, and says in one sentence what it cannot do."""
 
 import json
-import math
 import os
 import re
 import shlex
@@ -13,7 +12,6 @@ from contextlib import redirect_stdout
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NoReturn
 from unittest.mock import Mock
 
@@ -42,7 +40,6 @@ from synthetic import one_sentence, random_replica
 
 from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
-from jaxgran.cli.json_output import Entry, print_json
 from jaxgran.cli.tables import print_table
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
@@ -58,7 +55,6 @@ from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting import movie
 from jaxgran.plotting.map_figures import FIGURES
-from jaxgran.plotting.ratio import ratio_curves
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.observables import OBSERVABLES
@@ -73,7 +69,6 @@ PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "fa
 FRAMES = ["--trajectory", "flow.gsd", "--frame-strain", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
-STRESSES = ["--packing-fraction", "0.7", "--pressure", "3", "--shear-stress", "1"]
 
 
 @pytest.fixture
@@ -102,11 +97,7 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
 
 
-def test_range_has_no_noise_in_its_last_digits() -> None:
-    assert restitutions("0.1:0.9:9") == (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-
-
-@pytest.mark.parametrize("text", ["", ",", "0.1,", "a", "0.1;0.5", "0.1:0.9", "0.1:0.9:1", "0.1:0.9:x", "0:1:2:3"])
+@pytest.mark.parametrize("text", ["", "0.1,", "0.1;0.5", "0.1:0.9:1", "0:1:2:3"])
 def test_what_is_no_list_is_refused(text: str) -> None:
     with pytest.raises(
         InputError, match=r"restitution must be a number or a list like 0\.1,0\.5,0\.9 or start:stop:count"
@@ -119,15 +110,9 @@ def test_what_is_no_list_is_refused(text: str) -> None:
 FLOW = "run --restitution 0.5 --packing-fraction 0.6"
 MISTAKES = {  # one for each kind of option, check and file
     "map --restitution ''": "--restitution must be a number or a list",
-    "map --grains 20.5": "--grains must be auto, a whole number or a list like 256,1000,4000, not '20.5'",
     "map -n 15": "--grains must be a whole number of at least 16, not 15",
     "map --grains auto": "--grains auto requires --error",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --timestep 0.01": "--timestep must be at most",
-    "map --restitution 0.5,0.9 --packing-fraction 0.6 --strain 0.1": "--strain must be at least 160 time steps",
-    "map --timestep abc": "--timestep must be auto, a number or a list",
     f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
-    f"{FLOW} --timestep -1": "--timestep must be auto or a positive number, not -1.0",
-    "map --tolerance 1e-3,1e-4": "--tolerance must be auto or a number, not '1e-3,1e-4'",
     "map --error 0.02 --strain 5": "--strain and --error exclude each other",
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
@@ -137,20 +122,13 @@ MISTAKES = {  # one for each kind of option, check and file
     f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
     f"{FLOW} --trajectory flow.gsd --frame-strain 0": "--frame-strain must be at least 5e-05, for",
     f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory, --movie or --page",
-    f"{FLOW} --force-strain 1": "--force-strain requires --trajectory, --movie or --page",
     f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most the strain between",
     f"{FLOW} --movie flow.gif --seeds 2": "--trajectory, --movie and --page show one seed: leave out --seeds",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
-    "run --restitution 0,5 --packing-fraction 0.7": "--restitution must be a number, not '0,5'",
     "explore text.nc --output page.nc": "output must be a file name that ends in .html",
-    "plot": "FILE must be given: see jaxgran plot --help",
     "plot none.nc": "there is no file",
-    "plot text.nc --dpi many": "--dpi must be a whole number, not 'many'",
-    "where --restitution 0.7": "--packing-fraction must be given",
-    "where --restitution 0.05 --packing-fraction 0.6": "--restitution must be between 0.1 and 0.98",
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.82",
-    "fit text.gsd": "'text.gsd' cannot be read",
     "fit text.gsd --pressure 3": "--pressure requires a map, and 'text.gsd' is none",
     "fit text.nc --frame-time 1": "--frame-time requires tracks of discs, and 'text.nc' is a map",
     "fit text.nc --pressure 3": "--packing-fraction must be given, too",
@@ -160,7 +138,6 @@ MISTAKES = {  # one for each kind of option, check and file
     "mpa": "there is no command 'mpa', perhaps map is meant",
     "run --alpha 0.5": "there is no option --alpha, perhaps --restitution is meant",
     "map --outptu map.nc": "there is no option --outptu, perhaps --output is meant",
-    "map -x 3": "there is no option -x: see jaxgran map --help",
     "map --restitution 0.1 0.5 0.9": "'0.5 0.9' belongs to no option",
     "map --seeds": "--seeds requires a value",
     "map --quiet=3": "--quiet takes no value",
@@ -288,24 +265,6 @@ def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatc
     assert (tmp_path / "small_curves.png").read_bytes() == (folder / "small_curves.png").read_bytes()
 
 
-def test_plot_makes_its_folder_and_writes_other_formats_without_caption(
-    small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder, _ = small_map
-    for name in FIGURES:
-        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=ratio_curves))
-    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
-    assert jaxgran(folder, *words).status == 0
-    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
-    assert files(folder) >= PICTURES
-
-
-@pytest.mark.parametrize("words", [("--dpi", "20"), ("--dpi", "3000"), ("--format", "gif")])
-def test_resolution_and_format_of_plot_are_judged_before_a_folder_is_made(small_map, tmp_path: Path, words) -> None:
-    assert_one_sentence(jaxgran(small_map[0], "plot", "small.nc", "--output", str(tmp_path / "new"), *words))
-    assert not files(tmp_path)
-
-
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     folder = tmp_path_factory.mktemp("run")
@@ -390,16 +349,6 @@ def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> N
     )
 
 
-def test_json_has_null_in_place_of_nan(capsys: pytest.CaptureFixture) -> None:
-    print_json(
-        {"x": Entry(np.array([1.0, np.nan]), "numbers", "m", np.inf), "n": Entry(np.bool_(True), "a flag", None)}
-    )
-    assert parsed(capsys.readouterr().out) == {
-        "x": {"value": [1.0, None], "stderr": None, "unit": "m", "meaning": "numbers"},
-        "n": {"value": True, "stderr": None, "unit": None, "meaning": "a flag"},
-    }
-
-
 @pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
 @pytest.mark.parametrize("words", ["--help", "--version", "info", "run --restitution 0.5"])
 def test_a_reader_that_has_gone_changes_no_exit_status(words: str, tmp_path: Path) -> None:
@@ -477,39 +426,6 @@ def rows_of(table: str) -> dict[str, str]:
     return dict(re.split(r"\s{2,}", line.strip()) for line in table.splitlines() if "  " in line.strip())
 
 
-def test_fit_of_a_trajectory_prints_what_is_found(small_run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded, given = read_trajectory(small_run[0] / "flow.gsd"), []
-    numbers = {
-        "stderr": 0.01,
-        "low": 0.69,
-        "high": 0.7331,
-        "position_noise": 1e-5,
-        "velocity_noise": math.nan,
-        "diameter_noise": 0.01,
-    }
-    found = SimpleNamespace(restitution=0.712, **numbers, collisions=123, rejected=4, misfit=1.0)
-    monkeypatch.setattr(restitution, "fit_restitution", lambda *x, **noise: given.append((*x, noise)) or found)
-    outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"), "--velocity-noise", "1e-3")
-    assert (outcome.status, outcome.err) == (0, "")
-    rows = rows_of(outcome.out)
-    assert rows["restitution ± standard error"] == "0.712 ± 0.010"
-    assert rows["95 % interval"] == "0.690 to 0.733"
-    assert rows["recorded restitution"] == "0.7"
-    assert rows["collisions, rejected"] == "123, 4"
-    assert rows["noise of the velocities"] == "none given"
-    as_json = parsed(jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"), "--json").out)
-    assert as_json["restitution"]["value"] == 0.712 and as_json["restitution"]["stderr"] == 0.01
-    assert as_json["recorded_restitution"]["value"] == 0.7 and as_json["velocity_noise"]["value"] is None
-    tracks, noise = given[0]
-    np.testing.assert_array_equal(tracks.time, recorded.strain)
-    np.testing.assert_array_equal(tracks.positions, recorded.state.positions)
-    assert noise == {"position_noise": None, "velocity_noise": 1e-3, "diameter_noise": None}
-    found.rejected = 123
-    outcome = jaxgran(tmp_path, "fit", str(small_run[0] / "flow.gsd"))
-    assert outcome.status == 0 and rows_of(outcome.out)["collisions, rejected"] == "123, 123"
-    assert outcome.err.startswith("caution: the interval may be too narrow, as 123 velocity changes were rejected")
-
-
 def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--frame-strain", "0.02")
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
@@ -563,35 +479,6 @@ def test_fit_of_a_map_prints_how_well_a_law_describes_it(known_map: Path, known_
     assert found["pressure_rms_error"]["value"] == pytest.approx(0.02) and len(found) == 9
 
 
-@pytest.mark.parametrize(
-    ("determined", "chi_squared", "words"),
-    [
-        (True, 1.0, ""),
-        (False, 1.0, ", poorly determined: the stresses depend little on it there"),
-        (True, 10.0, ", the nearest in the map: no restitution has these stresses"),
-    ],
-)
-def test_fit_of_a_map_finds_a_restitution_from_stresses_and_says_how_well(
-    determined: bool, chi_squared: float, words: str, known_map: Path, known_law, tmp_path: Path, monkeypatch
-) -> None:
-    given = []
-    found = SimpleNamespace(restitution=0.65, stderr=0.02, determined=determined, chi_squared=chi_squared)
-    name = "jaxgran.inference.stress_inversion.restitution_from_stresses"
-    monkeypatch.setattr(name, lambda _, *numbers: given.append(numbers) or found)
-    outcome = jaxgran(tmp_path, "fit", str(known_map), *STRESSES, "--relative-error", "0.1")
-    assert (outcome.status, outcome.err) == (0, "")
-    assert outcome.out.splitlines()[-1] == f"restitution 0.650 ± 0.020{words}"
-    as_json = parsed(jaxgran(tmp_path, "fit", str(known_map), *STRESSES, "--relative-error", "0.1", "--json").out)
-    assert as_json["restitution"] | {"meaning": ""} == {"value": 0.65, "stderr": 0.02, "unit": "1", "meaning": ""}
-    assert (as_json["determined"]["value"], as_json["chi_squared"]["value"]) == (determined, chi_squared)
-    assert given == [pytest.approx((0.7, 3.0, 1.0, 0.3, 0.1))] * 2
-
-
-def test_fit_of_a_map_without_such_a_flow_prints_no_table(known_map: Path, known_law, tmp_path: Path) -> None:
-    stresses = ("--packing-fraction", "7", "--pressure", "3", "--shear-stress", "1")
-    assert_one_sentence(jaxgran(tmp_path, "fit", str(known_map), *stresses))
-
-
 # Help, completion, colours
 
 
@@ -612,27 +499,6 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
         if "--help" not in words:
             context = group.commands[name].make_context(name, list(words))
             assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
-
-
-def test_no_command_at_all_is_the_help(tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path)
-    assert outcome.status == 0
-    assert all(command in outcome.out for command in ("map", "plot", "run", "info"))
-
-
-def test_version_is_printed(tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, "--version") == (0, f"jaxgran {version('jaxgran')}\n", "")
-
-
-@pytest.mark.parametrize("words", [["--show-completion", "bash"], ["--help"]])
-def test_completion_is_offered_and_its_script_calls_the_command(words: list[str], tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
-    monkeypatch.setattr("command_line.commands", typer.main.get_command)  # made anew, as they depend on this variable
-    outcome = jaxgran(tmp_path, *words)
-    assert outcome.status == 0
-    assert (
-        "complete -o default -F _jaxgran_completion jaxgran" if words[1:] else "--install-completion"
-    ) in outcome.out
 
 
 @pytest.mark.parametrize(
@@ -684,17 +550,6 @@ def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monke
     assert not files(tmp_path)
 
 
-def test_an_interruption_outside_a_map_is_told_in_a_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupts(*_, **__) -> NoReturn:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(map_module, "say_written", interrupts)
-    monkeypatch.setattr("jaxgran.maps.results.open_map", interrupts)
-    outcome = jaxgran(tmp_path, "plot", "map.nc")
-    assert (outcome.status, outcome.out) == (130, "")
-    assert outcome.err.strip() == "jaxgran: interrupted."
-
-
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     """Grains by point hold for the points of the file only, and either a strain or an error holds."""
     chosen = {"restitution": (0.5,), "grains": 512, "grains_by_point": (512,), "error": 0.1, "seeds": 1}
@@ -732,15 +587,6 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     assert jaxgran(tmp_path, *flow, *words.split()).status == 0
     (one,) = asked
     assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
-
-
-def test_quiet_has_no_progress(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_few_variables(monkeypatch)
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
-    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--quiet")
-    assert outcome.status == 0
-    assert "points" not in outcome.err
-    assert files(tmp_path) == {"jaxgran_map.nc"}
 
 
 def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

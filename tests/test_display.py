@@ -173,10 +173,6 @@ def test_value_takes_a_few_letters(value, text: str) -> None:
     assert value_text(value) == text
 
 
-def test_error_stands_beside_its_value() -> None:
-    assert value_text(np.float64(1.23456), np.float64(0.0123)) == "1.235 ± 0.012"
-
-
 @pytest.mark.parametrize(
     ("value", "error", "text"),
     [

@@ -28,7 +28,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 def test_a_map_that_is_killed_at_random_moments_loses_and_doubles_nothing(lab: Lab) -> None:
     rng, maps, kills, known = random.Random(1), 1, 0, 0
-    while kills < 4:
+    while kills < 3:
         output = f"killed{maps}.nc"
         process = lab.start(output, "--resume")
         if rng.random() < 0.6:  # in the middle of the work, else at any moment of the start

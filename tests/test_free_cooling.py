@@ -13,7 +13,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
-from jaxgran.sampling.free_cooling import Cooling, _cooling, cooling
+from jaxgran.sampling.free_cooling import Cooling, cooling
 from jaxgran.sampling.sample import sample
 from jaxgran.sampling.steady_state import heated, prepare
 from jaxgran.theory.enskog import collisional_transfer
@@ -108,12 +108,6 @@ def test_record_is_at_the_times_in_whole_steps_and_starts_at_the_start(gases) ->
     np.testing.assert_allclose(record.times, [0.010, 0.5, 0.6, *times[3:]], rtol=1e-12)
     np.testing.assert_array_equal(record.tally.steps, [10, 490, 100, 100, 100, 100, 100, 100])
     np.testing.assert_allclose(record.collisions, 2 * np.cumsum(record.tally.collisions) / GRAINS)
-
-
-def test_a_change_of_numbers_compiles_nothing_anew(gases, cooled) -> None:
-    before = _cooling._cache_size()
-    cooling(replace(FLOW, restitution=0.8, timestep=2e-3), gases[1], TIMES / 3)
-    assert _cooling._cache_size() == before
 
 
 @pytest.mark.parametrize(

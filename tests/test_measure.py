@@ -74,11 +74,6 @@ def test_blocks_add_up_to_the_whole(batch, measured) -> None:
     assert np.sum(tally.duration) == pytest.approx(STRAIN)
 
 
-def test_sample_of_a_batch_is_the_sample_of_each(batch, measured) -> None:
-    _, both = sample_batch(batch, STRAIN)
-    assert_agree(replica(both, 0), measured[1])
-
-
 def test_a_strain_that_its_blocks_do_not_divide_is_sampled_whole_alone_and_in_a_batch(batch, state) -> None:
     _, both = sample_batch(batch, 0.753)
     _, alone = sample(FLOWS[0], state, 0.753)
@@ -113,12 +108,6 @@ def test_averages_are_those_of_all_blocks_together() -> None:
     assert one.averages["max_overlap"] == tally.largest_overlap.max()
     for name in ("granular_temperature", "contact_stress", "binary_stress", "kinetic_stress", "stress_ratio"):
         np.testing.assert_array_equal(getattr(one, name), one.averages[name])
-
-
-def test_worst_status_of_the_blocks_wins() -> None:
-    tally = random_tally(np.random.default_rng(1), BLOCKS)
-    tally.status[3], tally.status[7] = Status.capacity, Status.iteration_limit
-    assert Sample(tally, np.float64(100.0), np.float64(1.0), GRAINS).status == Status.capacity
 
 
 def test_deep_overlaps_are_judged_by_their_share_of_all_contacts_of_a_sample() -> None:

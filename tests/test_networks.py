@@ -79,16 +79,6 @@ def operator_and_approach(network) -> tuple[np.ndarray, np.ndarray]:
     return matrix[np.ix_(used, used)], np.asarray(network.contacts.approach)[used]
 
 
-def test_networks_are_padded_and_consistent(networks):
-    for members in networks.values():
-        for contacts, _, masses, _ in members:
-            used = np.asarray(contacts.used)
-            assert np.any(used & (np.asarray(contacts.approach) < 0))
-            np.testing.assert_allclose(np.linalg.norm(contacts.normals, axis=1), used, atol=1e-12)
-            np.testing.assert_allclose(contacts.inverse_mass_i, np.where(used, 1 / masses[contacts.i], 0), rtol=1e-12)
-            np.testing.assert_allclose(contacts.inverse_mass_j, np.where(used, 1 / masses[contacts.j], 0), rtol=1e-12)
-
-
 def test_exact_solution_is_the_projection_of_the_velocities(networks, exact_of):
     """By its definition, for velocities of the grains that the approach follows from: v₀ after, from v before, is the
     projection on the cone of the velocities that let no contact approach where v₀ is in it and v − v₀ is orthogonal to
@@ -112,12 +102,6 @@ def test_exact_solution_is_the_projection_of_the_velocities(networks, exact_of):
 def test_exact_solution_satisfies_the_contact_law_to_rounding(feasible, exact_of):
     for network in feasible:
         assert exact_of(network).residual < 1e-11
-
-
-def test_exact_solution_tells_what_has_none(networks, exact_of):
-    for members in networks.values():
-        for network in members:
-            assert exact_of(network).feasible == network.feasible
 
 
 def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_of):
@@ -210,10 +194,3 @@ def test_infeasible_networks_are_flagged_and_finite(networks, solution_of, metho
         solution = solution_of(network, 1e-4, 5000, method)
         assert solution.status == Status.infeasible
         assert np.all(np.isfinite(solution.impulses)) and np.all(np.isfinite(solution.response))
-
-
-@pytest.mark.parametrize("method", [Nesterov, BarzilaiBorwein])
-@pytest.mark.parametrize("group", [SIZE_RATIO, MASS_RATIO])
-def test_fast_methods_converge_at_large_ratios_of_size_and_mass(networks, solution_of, method, group):
-    for network in networks[group]:
-        assert solution_of(network, 1e-4, 20_000, method).status == Status.ok

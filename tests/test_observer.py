@@ -147,16 +147,6 @@ def test_callback_is_told_of_every_block_and_may_end_the_sample(flowing) -> None
     np.testing.assert_allclose(told_end.velocities, end.velocities, atol=1e-9)
 
 
-def test_lax_map_applies(flowing) -> None:
-    states = jax.tree.map(lambda *x: jnp.stack(x), flowing(0.7), flowing(0.7, 1))
-
-    def shear(states):
-        return jax.lax.map(lambda state: sample(FLOW, state, STRAIN, observe=observe), states)
-
-    _, both = jax.eval_shape(shear, states)
-    assert both.observed_sums["stress"].shape == (2, BLOCKS, 2, 2)
-
-
 @pytest.mark.parametrize(
     ("changed", "words"),
     [

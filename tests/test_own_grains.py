@@ -173,13 +173,6 @@ def test_cell_lists_of_unlike_grains_are_complete_or_flagged():
             assert pairs_within(float(listed.skin) - 1e-12, positions, radii, side, 0.3) == listed_pairs(listed)
 
 
-def test_a_packing_of_grains_too_large_for_the_cell_is_not_found_where_they_are_traced(packed_own):
-    _, found = packed_own.compiled(
-        flow_of(0.8), jax.random.key(0), own_grains(np.where(np.arange(GRAINS) == 7, 5.0, 1.0))
-    )
-    assert not found
-
-
 @pytest.mark.parametrize("count", [256, 1000])
 def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_that_is_accepted(count):
     def with_one(diameter: float) -> Grains:

@@ -50,13 +50,12 @@ def test_error_of_the_diameters_is_measured(error: float) -> None:
     assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
 
 
-@pytest.mark.parametrize("shear_rate", [0.0, 1.0])
-def test_units_do_not_matter(shear_rate: float) -> None:
-    """Lengths in pixels and times in frames, of a free gas and of a sheared one."""
-    seen = noisy(tracks(shear_rate=shear_rate), 1e-4, 0.01)
+def test_units_do_not_matter() -> None:
+    """Lengths in pixels and times in frames."""
+    seen = noisy(tracks(), 1e-4, 0.01)
     during = np.diff(seen.time).mean()
     lengths = {name: 37 * getattr(seen, name) for name in ("diameters", "positions", "cell")}
-    times = {"time": seen.time / during, "shear_rate": shear_rate * during}
+    times = {"time": seen.time / during, "shear_rate": during}
     pixels = replace(seen, masses=5 * seen.masses, velocities=37 * during * seen.velocities, **lengths, **times)
     one, other = fit_restitution(seen), fit_restitution(pixels)
     assert other.restitution == pytest.approx(one.restitution, abs=1e-9)
@@ -95,14 +94,6 @@ def test_a_disc_flies_straight_on_through_the_sides_of_a_sheared_cell() -> None:
     seen = np.isfinite(places)
     np.testing.assert_allclose(flights.positions[seen], straight[seen], atol=1e-12)
     assert length == 1
-
-
-def test_frames_may_be_left_out() -> None:
-    seen = noisy(tracks(), 1e-4, 0.01)
-    kept = np.random.default_rng(0).random(FRAMES) < 0.7
-    parts = {name: getattr(seen, name)[kept] for name in ("time", "positions", "velocities", "cell")}
-    fit = fit_restitution(replace(seen, **parts))
-    assert abs(fit.restitution - RESTITUTION) < 4 * fit.stderr < 0.01
 
 
 def lasting_contacts(seen: Tracks, frames: int) -> Tracks:
@@ -182,11 +173,4 @@ NOTHING = {"no collisions": at_rest, "frames too far apart": elsewhere, "positio
 def test_where_nothing_is_to_be_learnt_a_sentence_says_so(why: str) -> None:
     with pytest.raises(InputError, match=r"^tracks must show .* take") as refused:
         fit_restitution(NOTHING[why](tracks()))
-    assert one_sentence(str(refused.value))
-
-
-@pytest.mark.parametrize("name", ["position_noise", "velocity_noise", "diameter_noise"])
-def test_noise_that_cannot_be_is_one_sentence(name: str) -> None:
-    with pytest.raises(InputError, match=f"^{name} must be a number of at least 0, not -1") as refused:
-        fit_restitution(tracks(), **{name: -1})
     assert one_sentence(str(refused.value))

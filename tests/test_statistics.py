@@ -208,12 +208,6 @@ def test_errors_scale_with_the_values_and_do_not_see_their_origin_order_or_direc
     assert error_of_mean(-values[::-1, ::-1]) == pytest.approx(error, rel=1e-6)
 
 
-def test_many_blocks_are_merged_to_thirty_two() -> None:
-    values = ar1(np.random.default_rng(12), (2, 64), 0.8)
-    pairs = values.reshape(2, 32, 2).mean(axis=2)
-    assert error_of_mean(values) == pytest.approx(error_of_mean(pairs), rel=1e-12)
-
-
 def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> None:
     rng = np.random.default_rng(13)
     samples = [standard_errors(ratio, correlated_blocks(rng, 4, 16)) for _ in range(TRIALS)]

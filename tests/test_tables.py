@@ -25,11 +25,6 @@ def printed(table: Table) -> str:
     return out.getvalue()
 
 
-def test_without_a_terminal_a_table_is_one_page() -> None:
-    rows = [line.split() for line in printed(MAP).splitlines() if line.split()[:1] == ["0.65"]]
-    assert [len(row) for row in rows] == [1 + 3 * len(RATIOS)]
-
-
 @pytest.mark.parametrize("width", [40, 80, 120])
 def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: int, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", str(width))

@@ -89,12 +89,6 @@ def test_every_average_is_an_attribute_with_its_meaning() -> None:
     np.testing.assert_allclose(SAMPLES.strain, SAMPLES.tally.duration.sum(axis=1))
 
 
-def test_shown_numbers_of_a_sample_are_attributes() -> None:
-    line = repr(SAMPLES[0]).removeprefix("Sample(")
-    shown = [part.split("=")[0] for part in line.split(", ")]
-    assert "macroscopic_friction" in shown and all(hasattr(SAMPLES, name) for name in shown)
-
-
 @pytest.mark.parametrize("one", [SAMPLES, SAMPLES[1]], ids=["batch", "one"])
 def test_dataset_of_a_sample_has_its_averages_errors_and_units(one: Sample) -> None:
     data, errors = one.to_dataset(), one.errors()
