@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import known_closure, ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
-from synthetic import one_sentence, snapshot_of
+from synthetic import one_sentence, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
@@ -299,18 +299,16 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_refusal_says_what_is_accepted(case: str) -> None:
     function, accepted = REFUSED[case]
-    with pytest.raises(InputError, match=accepted) as caught:
+    with refused(accepted):
         function()
-    assert one_sentence(str(caught.value))
 
 
 @pytest.mark.parametrize("stem", [None, "none/map", "file.txt/map", "é" * 120])
-def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file.txt").write_text("no folder")
-    with pytest.raises(InputError) as caught:
+    with refused():
         jg.save_figures(ratio_dataset(alphas=2, nus=1), stem)
-    assert one_sentence(str(caught.value))
     assert files(tmp_path) == {"file.txt"}
 
 
@@ -478,7 +476,7 @@ def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any,
 
 @pytest.mark.parametrize("name", ["-a'b\"c $d Strömung 流れ.x.nc", "\udcff.nc"])
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     write_few_variables(monkeypatch, *theory.SHARES)
@@ -535,9 +533,7 @@ def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_pa
     assert files(tmp_path) == {"map.nc"}
 
 
-def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
     def full(*_):
         raise OSError(28, "No space left on device")
 

@@ -72,7 +72,7 @@ SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
 
 
 @pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_figures(monkeypatch) -> None:
     """A map writes its dataset alone: drawing takes longer than all else that these tests do."""
     monkeypatch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
 
@@ -178,7 +178,7 @@ def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder
             assert option in outcome.err or parameter.name in of_files, outcome.err
 
 
-def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch) -> None:
     def denied(**_):
         raise PermissionError(13, "Permission denied")
 
@@ -241,7 +241,7 @@ def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> 
 
 @pytest.mark.filterwarnings("always:differs from")
 def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
-    small_data, no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_data, no_figures, tmp_path: Path, monkeypatch
 ) -> None:
     other, data = tmp_path / "other.nc", small_data.copy()
     write_few_variables(monkeypatch, "pressure")
@@ -254,7 +254,7 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
 
 
-def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch) -> None:
     """The first is compared; of the others, which take longer, that there is a file."""
     folder, _ = small_map
     for name in set(FIGURES) - {"curves"}:
@@ -392,7 +392,7 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     assert found["python"]["value"] == lines["python"]
 
 
-def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     info, refused = (in_a_process(tmp_path, command) for command in ("info", "map"))
     assert (info.status, info.err) == (0, "")
@@ -402,7 +402,7 @@ def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatc
 
 
 def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_not_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch
 ) -> None:
     def silent(*_) -> NoReturn:
         raise RuntimeError("Unable to initialize backend 'cuda':\n no driver.")
@@ -426,7 +426,7 @@ def rows_of(table: str) -> dict[str, str]:
     return dict(re.split(r"\s{2,}", line.strip()) for line in table.splitlines() if "  " in line.strip())
 
 
-def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch) -> None:
     jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--frame-strain", "0.02")
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.err) == (0, "")
@@ -460,7 +460,7 @@ def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp
 
 
 @pytest.fixture
-def known_law(monkeypatch: pytest.MonkeyPatch) -> None:
+def known_law(monkeypatch) -> None:
     """The law of the known map as it is, in place of a fit of it."""
     errors = {"error": -0.02, "noise": 0.01}
     names = ("pressure", "shear_stress", "force_ratio")
@@ -510,7 +510,7 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
         "jaxgran map --preset ": {"quick", "paper", "dense"},
     }.items(),
 )
-def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch) -> None:
     word = str(len(line.split(" ")) - 1)
     for name, value in (("_JAXGRAN_COMPLETE", "complete_bash"), ("COMP_WORDS", line), ("COMP_CWORD", word)):
         monkeypatch.setenv(name, value)
@@ -518,7 +518,7 @@ def test_completion_completes(line: str, expected: set[str], tmp_path: Path, mon
 
 
 def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colour_is_asked_for(
-    small_data, monkeypatch: pytest.MonkeyPatch
+    small_data, monkeypatch
 ) -> None:
     ratio, error = small_data.force_ratio, small_data.force_ratio_stderr
     table = map_module._ratio_table(small_data, "Force ratio", ratio, error)
@@ -541,7 +541,7 @@ def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colou
     assert not re.search(r"\x1b\[[\d;]*3\d", printed(Terminal()))  # no colour, whatever else is set off
 
 
-def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
     words = "run --restitution 0.5 --packing-fraction 0.6 --movie flow.mp4"
     outcome = jaxgran(tmp_path, *words.split())
@@ -572,7 +572,7 @@ def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
     }
 
 
-def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeypatch) -> None:
     asked = []
 
     def notes(settings, *_) -> Iterator:
@@ -589,7 +589,7 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
     assert (one.seeds, one.first_seed, one.solver, one.activation) == (2, 7, Jacobi(tolerance=1e-6), "touching")
 
 
-def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch) -> None:
     points = dict(enumerate(Status))
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda *_: None)
     monkeypatch.setattr(
@@ -609,7 +609,7 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
 
 
 def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_points_name_theirs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch
 ) -> None:
     write_without_drawing(monkeypatch)
     write_few_variables(monkeypatch, "large_system/pressure")
@@ -644,7 +644,7 @@ def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_poin
     assert (choices_of(data)["grains"], choices_of(data)["timestep"]) == ((64, 128), (1e-3, 1e-4))
 
 
-def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch) -> None:
     write_few_variables(monkeypatch)
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "half.nc")
@@ -658,7 +658,7 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
-def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch) -> None:
     """Python functions that C calls back end in a SystemError, whose cause is Ctrl-C."""
     write_without_drawing(monkeypatch)
 
@@ -676,9 +676,7 @@ def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch
         jaxgran(tmp_path, "plot", "half.nc")
 
 
-def test_map_interrupted_before_its_first_replica_keeps_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_map_interrupted_before_its_first_replica_keeps_the_old_file(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "old.nc").write_bytes(b"old")
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
     outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc", "--overwrite")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from made_up_maps import RELATIVE, SCATTER, TRUE, known_closure, made_up_map
-from synthetic import one_sentence
+from synthetic import refused
 
 from jaxgran.inference import closure_fit
 from jaxgran.inference.closure import LAWS, Closure, Law, predict
@@ -242,6 +242,5 @@ MISTAKES = {
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_end_with_one_sentence(mistake: str) -> None:
-    with pytest.raises(ValueError) as caught:
+    with refused():
         MISTAKES[mistake]()
-    assert one_sentence(str(caught.value))

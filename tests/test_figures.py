@@ -228,7 +228,7 @@ def test_other_formats_and_resolutions_are_refused_in_a_sentence(choice: dict, t
     assert not list(tmp_path.iterdir())
 
 
-def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "map_curves.png").write_text("old")
 
     def broken(self: Figure, name: Path, **_: object) -> None:

@@ -106,7 +106,7 @@ def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
         journal(None, None, small_state(), np.array([5, 5]))
 
 
-def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(time, "time", lambda: 0.0)
     path = tmp_path / "batch.nc"
     journal = Journal(path, KEYS, fake_drive, seconds=0.01)
@@ -116,9 +116,7 @@ def test_a_clock_that_jumps_does_not_hold_the_journal_back(tmp_path: Path, monke
     assert len(read_arrays(path)[0]["tallies"]) == 3
 
 
-def test_a_journal_that_takes_long_to_write_is_written_less_often(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_journal_that_takes_long_to_write_is_written_less_often(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(journal_module, "SECONDS", 0.0)
     monkeypatch.setattr(journal_module, "write_arrays", lambda *_: written.append(time.sleep(0.02)))
     written: list[None] = []

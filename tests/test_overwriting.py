@@ -32,7 +32,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def made_up(monkeypatch) -> None:
     made_up_maps(monkeypatch)
 
 
@@ -109,7 +109,7 @@ def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> N
     assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
 
 
-def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(
         ratio_map_module, "run_replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)})
     )
@@ -164,7 +164,7 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     assert files(tmp_path) == {file.name}
 
 
-def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
     first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
     outcome = jaxgran(tmp_path, *RUN)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from listed import build, listed_pairs, move, pairs_within
+from oracles import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact import near_pairs
 from jaxgran.contact.near_pairs import (

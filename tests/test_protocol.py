@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import assert_same_bits, replica
-from synthetic import one_sentence
+from synthetic import one_sentence, refused
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
@@ -96,7 +96,7 @@ def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
     assert not steady_state._is_level_noise(np.full(40, np.nan))
 
 
-def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
     def chunk(batch: Batch, strain: np.ndarray, advance):
@@ -128,7 +128,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     assert strain[0, 0] == 0.8  # a chunk is a quarter of the correlation strain
 
 
-def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch) -> None:
     record = []
 
     def sheared(batch: Batch, strain: np.ndarray, advance):
@@ -154,7 +154,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
 
 
 def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_others(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch,
 ) -> None:
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
     monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
@@ -167,7 +167,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
         assert (together.strain[k], together.status[k]) == (alone.strain[0], alone.status[0])
 
 
-def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> None:
     """A jump before the sixth chunk is out of them after fifteen chunks; twelve are the fewest."""
     series = iter([5.0] * 5 + [0.001, -0.001] * 30)
     monkeypatch.setattr(steady_state, "_chunk", lambda batch, *_: (batch, None))
@@ -238,12 +238,11 @@ def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
 )
 def test_keys_that_do_not_suit_the_flow_are_one_sentence(flow: ShearFlow, count, words: str) -> None:
     key = jax.random.key(0) if count is None else jax.random.split(jax.random.key(0), count)
-    with pytest.raises(InputError, match=f"^{words}") as refused:
+    with refused(f"^{words}"):
         prepare(flow, key)
-    assert one_sentence(str(refused.value))
 
 
-def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch) -> None:
     bad = batch._replace(status=np.array([Status.ok, Status.not_steady]))
     monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
     with pytest.raises(RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"):
@@ -303,7 +302,7 @@ def test_report_is_told_every_replica_step(batch) -> None:
     assert sum(told) == 2 * round(1.6 / TIMESTEP)
 
 
-def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch) -> None:
     monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
     monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))

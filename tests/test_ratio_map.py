@@ -127,7 +127,7 @@ def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> No
 
 @pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
 def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_steps(
-    settings, second: Status, monkeypatch: pytest.MonkeyPatch
+    settings, second: Status, monkeypatch
 ) -> None:
     """The others of its batch keep their numbers, and the worse of two failures is not taken. A jammed one is left."""
     rng, calls = np.random.default_rng(0), []
@@ -155,9 +155,7 @@ def test_refined_replica_has_half_the_time_step_and_another_start(settings, resu
     np.testing.assert_allclose(data["seeds/sample_timestep"].values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
 
 
-def test_a_batch_that_does_not_fit_into_the_memory_is_halved(
-    settings, results, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_that_does_not_fit_into_the_memory_is_halved(settings, results, tmp_path, monkeypatch) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
     measured, largest, sizes = run_replicas_module._measured, 1, []
 
@@ -183,7 +181,7 @@ def test_replicas_have_the_numbers_of_their_seed_whatever_the_first_one_is(setti
     assert_same_bits(second, {(point, 0): results[point, 1] for point in range(2)})
 
 
-def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_ratio_map_warns_of_points_and_shows_progress(monkeypatch, capsys) -> None:
     def found(settings, *_):
         yield (0, 0), random_replica(np.random.default_rng(0), settings, Status.deep_overlap)
         yield (1, 0), random_replica(np.random.default_rng(0), settings, Status.ok, 1)
@@ -220,7 +218,7 @@ def test_a_map_that_is_cut_off_is_continued_and_written_once(settings, results, 
         ratio_map(**SETTINGS, tolerance=1e-3, output=output)
 
 
-def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_map_raises_with_its_finished_part(tmp_path, monkeypatch) -> None:
     def some(settings, *_):
         yield (1, 0), random_replica(np.random.default_rng(0), settings)
         raise KeyboardInterrupt

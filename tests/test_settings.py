@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic import one_sentence
+from synthetic import one_sentence, refused
 
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
@@ -112,9 +112,8 @@ def test_each_point_has_its_own_automatic_time_step_which_is_that_of_its_own_map
 @pytest.mark.parametrize("wrong", [(1e-3,), 1e-3, (1e-3, -1.0), (1e-3, 5e-3)])
 def test_time_steps_by_point_are_one_for_each_and_short_enough(wrong: Any) -> None:
     assert [flow.timestep for flow in chosen(**GOOD, timestep_by_point=(1e-3, 1e-4))[0].flows()] == [1e-3, 1e-4]
-    with pytest.raises(InputError, match="timestep") as caught:
+    with refused("timestep"):
         chosen(**GOOD, timestep_by_point=wrong)
-    assert one_sentence(str(caught.value))
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
@@ -187,9 +186,8 @@ def test_the_command_and_the_function_start_alike() -> None:
         {"from_map": 3},
         {"from_map": "no.nc"},
     ):
-        with pytest.raises(InputError) as caught:
+        with refused():
             with_start(wrong)
-        assert one_sentence(str(caught.value))
 
 
 def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
@@ -204,8 +202,7 @@ def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
 
 def test_an_error_that_needs_too_many_grains_names_the_smallest_one() -> None:
     given = {"restitution": (0.2,), "packing_fraction": (0.6,), "grains": "auto"}
-    with pytest.raises(InputError, match="error must be at least") as caught:
+    with refused("error must be at least") as caught:
         chosen(**given, error=1e-3)
-    assert one_sentence(str(caught.value))
     least = float(str(caught.value).split("at least ")[1].split()[0])
     assert chosen(**given, error=least)[0].grains <= MAX_GRAINS

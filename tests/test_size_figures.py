@@ -71,7 +71,7 @@ def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
     assert set(finest(several, "grains").sizes) == {"timestep", "packing_fraction", "restitution"}
 
 
-def test_several_numbers_of_grains_have_a_file_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_numbers_of_grains_have_a_file_of_their_own(tmp_path: Path, monkeypatch) -> None:
     write_without_drawing(monkeypatch)
     written = save_figures(with_timesteps(with_grains(ratio_dataset(2, 2), 64, 256), 1e-3, 1e-4), tmp_path / "map")
     assert [path.name for path in written] == [f"map_{name}.png" for name in ("curves", "contours", "timestep", "size")]

@@ -36,7 +36,7 @@ def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: in
         assert all(any(cell in row for row in rows) for cell in cells)
 
 
-def test_long_names_of_rows_take_two_lines_where_that_saves_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_names_of_rows_take_two_lines_where_that_saves_a_page(monkeypatch) -> None:
     rows = [["Stresses"], ["granular temperature of small boxes", "1.00 ± 0.10", "m/t²"], ["pressure", "2", ""]]
     table = Table("", ["observable", "value", "unit"], rows, numbers=False)
     monkeypatch.setenv("COLUMNS", "48")
@@ -47,7 +47,7 @@ def test_long_names_of_rows_take_two_lines_where_that_saves_a_page(monkeypatch: 
     assert "granular temperature of small boxes" in printed(table)
 
 
-def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch) -> None:
     content = BytesIO()
     monkeypatch.setattr(sys, "stdout", TextIOWrapper(content, "ascii"))
     monkeypatch.setattr(sys, "stderr", StringIO())

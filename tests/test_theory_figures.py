@@ -314,7 +314,7 @@ def test_shortest_time_step_is_drawn(draw) -> None:
     ids=["all", "line", "no theory", "no factors", "dense", "few"],
 )
 def test_figures_are_written_where_the_map_has_their_data(
-    data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch
 ) -> None:
     write_without_drawing(monkeypatch)
     written = save_figures(data, tmp_path / "map")
