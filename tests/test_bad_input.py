@@ -44,7 +44,6 @@ FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep
 MAP = {"restitution": [0.5, 0.9], "packing_fraction": [0.6]}
 WOULD_RUN = 77  # exit status of a command whose input is accepted, in these tests
 SECONDS = 1.0  # of a processor, in which bad input is refused, whatever it is
-few = partial(settings, deadline=None, derandomize=True)
 
 
 class WouldRun(Exception):
@@ -265,7 +264,7 @@ def test_what_jax_cannot_trace_in_observe_is_refused_with_its_line(number: Calla
 
 
 @pytest.mark.parametrize("argument", NUMBERS)
-@few(max_examples=15)
+@settings(max_examples=15)
 @given(value=anything)
 def test_any_value_is_accepted_or_refused_in_one_sentence(argument: str, value: Any) -> None:
     verdict(NUMBERS[argument], value)
@@ -351,13 +350,13 @@ texts = st.one_of(
 @pytest.mark.parametrize(
     ("command", "option"), [*((("map",), x) for x in MAP_OPTIONS), *((RUN, x) for x in RUN_OPTIONS)]
 )
-@few(max_examples=12)
+@settings(max_examples=12)
 @given(texts)
 def test_any_text_in_an_option_is_accepted_or_refused_in_one_sentence(command, option: str, text: str) -> None:
     accepts_or_refuses(*command, f"{option}={text}")
 
 
-@few(max_examples=25)
+@settings(max_examples=25)
 @given(
     st.sampled_from(["map", "run", "plot", "explore", "info"]),
     st.lists(texts.filter(lambda x: x != "--help"), min_size=1),
@@ -428,7 +427,7 @@ def test_a_file_that_is_no_netcdf_is_refused_and_nothing_drawn(kind: str, tmp_pa
     assert files(tmp_path) == {"garbage.nc"}
 
 
-@few(max_examples=10)
+@settings(max_examples=10)
 @given(st.floats(0, 1, exclude_max=True))
 def test_a_truncated_map_is_refused_wherever_it_ends(share: float) -> None:
     with TemporaryDirectory() as name:

@@ -8,9 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import redirect_stdout
 from importlib.metadata import version
-from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn
 from unittest.mock import Mock
@@ -40,7 +38,6 @@ from synthetic import one_sentence, random_replica
 
 from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
-from jaxgran.cli.tables import print_table
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
 from jaxgran.inference import restitution
@@ -350,7 +347,7 @@ def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> N
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
-@pytest.mark.parametrize("words", ["--help", "--version", "info", "run --restitution 0.5"])
+@pytest.mark.parametrize("words", ["--version", "run --restitution 0.5"])
 def test_a_reader_that_has_gone_changes_no_exit_status(words: str, tmp_path: Path) -> None:
     """As in ``jaxgran info | head -2``: the command does its work, and ends as it would."""
     ends = []
@@ -433,6 +430,8 @@ def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch) 
     rows = rows_of(outcome.out)
     found, error = map(float, rows["restitution ± standard error"].split(" ± "))
     assert abs(found - 0.7) < max(0.02, 4 * error)
+    as_json = parsed(jaxgran(tmp_path, "fit", "flow.gsd", "--json").out)
+    assert as_json["recorded_restitution"]["value"] == 0.7 and as_json["velocity_noise"]["value"] is None
     monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
     outcome = jaxgran(tmp_path, "fit", "flow.gsd")
     assert (outcome.status, outcome.out) == (3, "")
@@ -450,13 +449,15 @@ def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
+def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, known_law, tmp_path: Path) -> None:
     point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
     stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")
     outcome = jaxgran(tmp_path, "fit", str(known_map), "--packing-fraction", "0.7", *stresses)
     assert outcome.status == 0
     found, error = outcome.out.splitlines()[-1].removeprefix("restitution ").split(",")[0].split(" ± ")
     assert abs(float(found) - 0.65) < max(0.05, 4 * float(error))
+    as_json = parsed(jaxgran(tmp_path, "fit", str(known_map), "--packing-fraction", "0.7", *stresses, "--json").out)
+    assert as_json["restitution"]["value"] == pytest.approx(float(found), abs=1e-3) and as_json["determined"]["value"]
 
 
 @pytest.fixture
@@ -505,7 +506,6 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
     ("line", "expected"),
     {
         "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "fit", "info"},
-        "jaxgran p": {"plot"},
         "jaxgran run --m": {"--movie"},
         "jaxgran map --preset ": {"quick", "paper", "dense"},
     }.items(),
@@ -515,30 +515,6 @@ def test_completion_completes(line: str, expected: set[str], tmp_path: Path, mon
     for name, value in (("_JAXGRAN_COMPLETE", "complete_bash"), ("COMP_WORDS", line), ("COMP_CWORD", word)):
         monkeypatch.setenv(name, value)
     assert set(jaxgran(tmp_path).out.split()) == expected
-
-
-def test_tables_have_colours_and_bars_on_a_terminal_alone_and_not_where_no_colour_is_asked_for(
-    small_data, monkeypatch
-) -> None:
-    ratio, error = small_data.force_ratio, small_data.force_ratio_stderr
-    table = map_module._ratio_table(small_data, "Force ratio", ratio, error)
-
-    class Terminal(StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    def printed(out: StringIO) -> str:
-        with redirect_stdout(out):
-            print_table(table)
-        return out.getvalue()
-
-    monkeypatch.setenv("TERM", "xterm-256color")
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    assert "\x1b[" not in printed(StringIO())
-    assert "\x1b[" in printed(Terminal())
-    monkeypatch.setenv("NO_COLOR", "1")
-    assert not re.search(r"\x1b\[[\d;]*3\d", printed(Terminal()))  # no colour, whatever else is set off
 
 
 def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
@@ -674,13 +650,3 @@ def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch
     monkeypatch.setattr("jaxgran.maps.results.open_map", Mock(side_effect=SystemError))
     with pytest.raises(SystemError):
         jaxgran(tmp_path, "plot", "half.nc")
-
-
-def test_map_interrupted_before_its_first_replica_keeps_the_old_file(tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "old.nc").write_bytes(b"old")
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
-    outcome = jaxgran(tmp_path, "map", *POINTS, "--seeds", "1", "--output", "old.nc", "--overwrite")
-    assert outcome.status == 130
-    assert (tmp_path / "old.nc").read_bytes() == b"old"
-    assert files(tmp_path) == {"old.nc"}
-    assert "saved" not in outcome.err and "wrote" not in outcome.err

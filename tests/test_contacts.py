@@ -13,7 +13,7 @@ from jaxgran.model.grains import Grains
 EPS = np.finfo(float).eps
 PAIRS, INSTANTS = 256, 1001
 seeds = given(st.integers(0, 2**32 - 1))
-modest = settings(max_examples=20, derandomize=True, deadline=None)
+modest = settings(max_examples=20)
 
 compiled_rule, compiled_time, compiled_network = map(jax.jit, (is_contact, first_contact_time, contact_network))
 

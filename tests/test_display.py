@@ -73,10 +73,9 @@ def cells(thing) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize("replicas", [None, 1, REPLICAS])
-@pytest.mark.parametrize("library", [np.asarray, jnp.asarray], ids=["numpy", "jax"])
-def test_line_and_table_are_short_whole_and_of_the_same_rows(name: str, replicas: int | None, library) -> None:
-    thing = jax.tree.map(library, MADE[name](replicas))
+@pytest.mark.parametrize("replicas", [None, REPLICAS])
+def test_line_and_table_are_short_whole_and_of_the_same_rows(name: str, replicas: int | None) -> None:
+    thing = jax.tree.map(jnp.asarray, MADE[name](replicas))
     line, rows = repr(thing), cells(thing)
     assert line.startswith(f"{name}(") and line.endswith(")")
     assert "\n" not in line and len(line) < 700
@@ -137,11 +136,7 @@ def test_what_values_hold_is_escaped() -> None:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize(
-    "leaf",
-    [None, object(), jax.ShapeDtypeStruct((3,), float), 3, "x"],
-    ids=["None", "object", "shape", "number", "text"],
-)
+@pytest.mark.parametrize("leaf", [None, jax.ShapeDtypeStruct((3,), float)], ids=["None", "shape"])
 def test_whatever_stands_in_the_place_of_a_number_is_shown(name: str, leaf) -> None:
     """JAX fills its trees with axes, shapes and placeholders."""
     odd = jax.tree.map(lambda _: leaf, MADE[name]())

@@ -72,7 +72,6 @@ def test_one_bad_replica_refuses_the_batch(array):
     assert re.match("packing_fraction must be", refusal(packing_fraction=array([0.5, np.nan])))
 
 
-@settings(derandomize=True, deadline=None)
 @given(
     st.integers(MIN_GRAINS, 10**6),
     st.floats(0, 1),

@@ -55,9 +55,15 @@ def assert_same(ours, plain, atol: float) -> None:
     assert np.sum(tally.residual_counts) == tally.solves
 
 
-@pytest.mark.parametrize("shear_rate", [1.0, 0.0])
-@pytest.mark.parametrize("activation", ["midpoint", "touching"])
-@pytest.mark.parametrize(("packing_fraction", "steps"), [(0.4, 400), (0.6, 100), (0.78, 100)])
+@pytest.mark.parametrize(
+    ("packing_fraction", "steps", "activation", "shear_rate"),
+    [
+        (0.4, 400, "midpoint", 1.0),
+        (0.6, 100, "touching", 0.0),
+        (0.78, 100, "midpoint", 0.0),
+        (0.78, 100, "touching", 1.0),
+    ],
+)
 def test_trajectory_and_sums_are_those_of_the_plain_advance(
     flowing, run, native_run, packing_fraction, steps, activation, shear_rate
 ) -> None:
@@ -68,7 +74,7 @@ def test_trajectory_and_sums_are_those_of_the_plain_advance(
     assert_same(ours, plain, 1e-6)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(
     packing_fraction=st.sampled_from([0.1, 0.4, 0.7, 0.8]),
     restitution=st.floats(0, 1),
@@ -337,7 +343,7 @@ def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) 
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(
     place=st.floats(-300, 308).map(lambda x: 10**x),
     speed=st.floats(-300, 308).map(lambda x: 10**x),
@@ -361,7 +367,7 @@ def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass,
         assert tally.status == Status.nonfinite
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(
     fastest=st.floats(0.1, 10),
     distance=st.floats(0.8, 3),
@@ -388,7 +394,7 @@ def near_pairs_found():
         return numba.njit(cache=True)(find_near_pairs.py_func)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(
     count=st.integers(16, 300),
     packing_fraction=st.floats(0.05, 0.8),

@@ -32,7 +32,7 @@ def velocities_after(network: Contacts, masses: np.ndarray, velocities: np.ndarr
     return velocities + np.asarray(compiled_impulses(network, impulses, MAX_DISCS)) / masses[:, None]
 
 
-@settings(max_examples=30, derandomize=True, deadline=None)
+@settings(max_examples=30)
 @given(networks, st.sampled_from([1.0, 100.0, 1e6]))
 def test_delassus_operator_never_exceeds_its_bounds(network_of, heaviest):
     network, masses, _ = random_network(*network_of, heaviest)
@@ -44,7 +44,7 @@ def test_delassus_operator_never_exceeds_its_bounds(network_of, heaviest):
     assert np.all(spectral <= count * (1 + 8 * EPS))
 
 
-@settings(max_examples=20, derandomize=True, deadline=None)
+@settings(max_examples=20)
 @given(networks)
 def test_delassus_product_equals_the_dense_matrix(network_of):
     network, masses, _ = random_network(*network_of)
@@ -55,7 +55,7 @@ def test_delassus_product_equals_the_dense_matrix(network_of):
 
 
 @pytest.mark.parametrize("method", PRECISE)
-@settings(max_examples=20, derandomize=True, deadline=None)
+@settings(max_examples=20)
 @given(networks, st.sampled_from([1.0, 4.0, 100.0]))
 def test_velocities_equal_the_exact_solution(solved, method, network_of, heaviest):
     network, masses, velocities = random_network(*network_of, heaviest)
@@ -66,7 +66,7 @@ def test_velocities_equal_the_exact_solution(solved, method, network_of, heavies
 
 
 @pytest.mark.parametrize("method", METHODS)
-@settings(max_examples=20, derandomize=True, deadline=None)
+@settings(max_examples=20)
 @given(networks, st.sampled_from([1e-3, 1e-6, 1e-10]))
 def test_impulses_push_and_are_complementary_to_the_velocities_after(solved, method, network_of, tolerance):
     network, masses, _ = random_network(*network_of)
