@@ -149,8 +149,3 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     for name in ("normals", "approach", "inverse_mass_i", "inverse_mass_j"):
         assert np.all(getattr(network, name)[3:] == 0)
     assert np.all(np.isfinite(network.distances))
-
-
-def test_empty_slot_of_the_pair_list_is_no_contact():
-    contact, _ = is_contact(motion([[1e6, 0.0]], [[-1e9, 0.0]]), np.array([0.0]), jnp.asarray(0.1))
-    assert not np.any(contact)

@@ -244,11 +244,3 @@ def test_control_flow_of_a_batch_stays_control_flow(traced_batch):
             else:  # a batched predicate would be reduced over the replicas outside pmax
                 inside = [each.primitive.name for each in equations_of(equation.params["cond_jaxpr"].jaxpr)]
                 assert "reduce_or" not in inside
-
-
-def test_single_precision_stays_single(flowing):
-    flow, state = (jax.tree.map(jnp.float32, tree) for tree in (flow_of(), flowing(0.6)))
-    solver = BarzilaiBorwein(jnp.float32(1e-4), jnp.int32(99))
-    state, tally = jax.eval_shape(advance_by_jax, flow, solver, state, jnp.int32(3))
-    numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    assert set(numbers) == {jnp.dtype("float32")}

@@ -26,7 +26,6 @@ from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
 EVEN = np.arange(GRAINS) % 2 == 0
 LAWS = {
-    "1 to 1.4": np.where(EVEN, 1.0, 1.4),
     "1 to 3": np.where(EVEN, 1.0, 3.0),
     "1 to 5": np.where(EVEN, 1.0, 5.0),
     "one of 2.5": np.where(np.arange(GRAINS) == 7, 2.5, 1.0),
@@ -63,7 +62,7 @@ def test_packing_has_the_grains_no_overlap_and_the_packing_fraction(packed_own, 
     assert np.sum(np.pi * radii**2) / side**2 == pytest.approx(packing_fraction, rel=1e-13)
 
 
-@pytest.mark.parametrize("law", ["1 to 3", "1 to 5", "one of 2.5", "lognormal"])
+@pytest.mark.parametrize("law", ["1 to 5", "lognormal"])
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.8])
 def test_valid_list_misses_no_touching_pair(packed_own, law, packing_fraction):
     """Under random motion and shear over several remaps of the tilt, against brute force over all pairs and images."""
@@ -80,7 +79,7 @@ def test_valid_list_misses_no_touching_pair(packed_own, law, packing_fraction):
     assert touching > 20 and rebuilds >= 2
 
 
-@pytest.mark.parametrize("law", ["1 to 3", "1 to 5", "lognormal"])
+@pytest.mark.parametrize("law", ["1 to 5", "lognormal"])
 def test_a_flow_stays_apart_conserves_momentum_and_balances_its_energy(packed_own, run, law):
     state, rng = packed_own(law, 0.8), np.random.default_rng(0)
     masses = np.where(EVEN, 3.0, 0.05)  # small and heavy, large and hollow

@@ -47,7 +47,7 @@ def both_separations(hood: PairLists, side):
     return separations_now(listed, hood.frame), direct
 
 
-@pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0), (0.02, -0.02)])
+@pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0)])
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, packing_fraction, motion, shear):
     """Random motion of every grain and shear over several remaps of the tilt, with the pairs of brute force."""

@@ -202,11 +202,6 @@ def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple
     check_timestep(replace(flow, timestep=jnp.full(2, longest)), theory)
 
 
-def test_prepare_refuses_a_time_step_too_long_for_its_flow() -> None:
-    with pytest.raises(ValueError, match="timestep must be at most"):
-        prepare(replace(FLOWS[1], timestep=0.08), jax.random.key(0))
-
-
 def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
     """Whether numbers of the flow are single or of the batch, and with grains of all or of each."""
     flows = replace(FLOWS[0], restitution=jnp.asarray([0.5, 0.9]))
