@@ -168,18 +168,6 @@ def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) ->
     assert list(output.parent.iterdir()) == []
 
 
-def test_the_folder_of_another_run_is_not_removed(output: Path) -> None:
-    run = Checkpoint(output, SETTINGS, resume=False)
-    shutil.rmtree(run.folder)
-    other = Checkpoint(output, SETTINGS, resume=False)
-    other.add(batches()[0])
-    run.close(finished=True)
-    other.close(finished=False)
-    resumed = Checkpoint(output, SETTINGS, resume=True)
-    assert set(resumed.done) == set(batches()[0])
-    resumed.close(finished=True)
-
-
 def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(output: Path) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")

@@ -6,14 +6,12 @@ import re
 import shlex
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 from unittest.mock import Mock
 
-import jax
 import numpy as np
 import pytest
 import typer
@@ -175,16 +173,6 @@ def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder
             assert option in outcome.err or parameter.name in of_files, outcome.err
 
 
-def test_output_that_cannot_be_written_is_one_sentence(folder: Path, monkeypatch) -> None:
-    def denied(**_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(tempfile, "TemporaryFile", denied)
-    outcome = jaxgran(folder, "map")
-    assert_one_sentence(outcome)
-    assert "Permission denied" in outcome.err
-
-
 def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> None:
     outcome = in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09")
     assert_one_sentence(outcome)
@@ -260,6 +248,16 @@ def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatc
     assert (outcome.status, outcome.out) == (0, "")
     assert files(tmp_path) == PICTURES
     assert (tmp_path / "small_curves.png").read_bytes() == (folder / "small_curves.png").read_bytes()
+
+
+def test_plot_makes_its_folder_and_writes_other_formats_without_caption(small_map, tmp_path: Path, monkeypatch) -> None:
+    folder, _ = small_map
+    for name in FIGURES:
+        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
+    words = ("plot", "small.nc", "--output", str(tmp_path / "new" / "figures"), "--format", "svg", "--no-caption")
+    assert jaxgran(folder, *words).status == 0
+    assert files(tmp_path / "new" / "figures") == {name.replace(".png", ".svg") for name in PICTURES}
+    assert files(folder) >= PICTURES
 
 
 @pytest.fixture(scope="module")
@@ -387,23 +385,6 @@ def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatc
     assert "cuda" in next(line for line in info.out.splitlines() if line.startswith("devices"))
     assert_one_sentence(refused)
     assert "cuda" in refused.err
-
-
-def test_info_names_the_commit_of_a_checkout_and_no_device_where_a_driver_does_not_answer(
-    tmp_path: Path, monkeypatch
-) -> None:
-    def silent(*_) -> NoReturn:
-        raise RuntimeError("Unable to initialize backend 'cuda':\n no driver.")
-
-    monkeypatch.setattr(jax, "devices", silent)
-    monkeypatch.setenv("JAX_PLATFORMS", "cpu,made-up")
-    outcome = jaxgran(tmp_path, "info")
-    assert outcome.status == 0
-    assert "none: Unable to initialize backend 'cuda': no driver\n" in outcome.out
-    assert re.search(r"^engine +none$", outcome.out, re.MULTILINE)
-    assert "JAX_PLATFORMS=cpu,made-up" in outcome.out
-    checkout = (Path(app.__file__).resolve().parents[2] / ".git").exists()
-    assert (", commit " in outcome.out.splitlines()[0]) == checkout
 
 
 # Trajectories and maps that are fitted

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from made_up_maps import RELATIVE, SCATTER, TRUE, known_closure, made_up_map
+from made_up_maps import ALPHA, NU, RELATIVE, SCATTER, TRUE, known_closure, made_up_map
 from synthetic import refused
 
 from jaxgran.inference import closure_fit
@@ -132,6 +132,13 @@ def test_stresses_tend_to_kinetic_theory_in_elastic_and_in_dilute_flow(alpha: fl
     seen, theory = predict(known_closure(), alpha, nu), kinetic_theory([alpha], [nu])
     np.testing.assert_allclose(seen.pressure, theory.pressure, rtol=2e-5)
     np.testing.assert_allclose(seen.shear_stress, theory.shear_stress, rtol=2e-5)
+
+
+def test_force_ratio_is_one_in_elastic_flow_and_grows_with_density_and_dissipation() -> None:
+    np.testing.assert_allclose(predict(known_closure(), 1 - 1e-6, 0.8).force_ratio, 1, atol=1e-6)
+    ratio = predict(known_closure(), np.array(ALPHA), np.array(NU)[:, None]).force_ratio
+    assert np.all(ratio > 1)
+    assert np.all(np.diff(ratio, axis=0) > 0) and np.all(np.diff(ratio, axis=1) < 0)
 
 
 def test_a_point_left_out_does_not_enter_its_own_prediction() -> None:

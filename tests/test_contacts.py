@@ -68,20 +68,6 @@ def test_touching_rule_reads_the_gap_alone(seed):
 
 @modest
 @seeds
-def test_looking_ahead_keeps_the_approaching_contacts_and_drops_those_that_part(seed):
-    separations, velocities, reach = flights(seed)
-    contact, approaching = (np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 0.0))
-    ahead, approaching_ahead = (
-        np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 1e-2)
-    )
-    assert np.all(approaching_ahead[approaching])
-    receding = np.sum(separations * velocities, axis=1) >= 0
-    assert np.all(contact[ahead & receding])
-    assert np.sum(approaching_ahead) > np.sum(approaching) and np.sum(ahead & receding) < np.sum(contact & receding)
-
-
-@modest
-@seeds
 def test_time_of_first_contact_is_exact(seed):
     separations, velocities, reach = flights(seed)
     time, closest = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from synthetic import refused
 
-from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import snapshot_series
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -79,14 +78,6 @@ def test_energy_never_grows_and_is_what_the_contacts_have_left(gases) -> None:
         np.testing.assert_allclose(-steps * GRAINS, record.tally.dissipation, rtol=1e-9)
         assert record.temperature[-1] == pytest.approx(temperature(end))
         assert record.status <= Status.iteration_limit
-
-
-def test_elastic_grains_keep_energy_and_all_grains_keep_momentum(gases) -> None:
-    _, elastic = cooling(replace(FLOW, restitution=1.0), gases[0], TIMES, solver=BarzilaiBorwein(1e-12))
-    assert np.all(np.asarray(elastic.collisions) > 0)
-    np.testing.assert_allclose(elastic.temperature, temperature(gases[0]), rtol=1e-11)
-    for record in (elastic, cooling(FLOW, gases[0], TIMES)[1]):
-        assert np.max(record.tally.momentum_drift) < 1e-13
 
 
 def test_there_is_no_time_scale(gases) -> None:

@@ -81,16 +81,6 @@ def test_a_strain_that_its_blocks_do_not_divide_is_sampled_whole_alone_and_in_a_
     np.testing.assert_allclose(np.sum(both.tally.duration, axis=1), 0.75)  # 75 steps in 32 blocks
 
 
-def test_lax_map_applies_with_a_traced_strain(batch, measured) -> None:
-    # What a map computes is in the test of the batch, which runs it; here it need only be traced.
-    def shear(flow, state, strain):
-        return jax.lax.map(lambda one: sample(*one, strain), (flow, state))
-
-    _, both = jax.eval_shape(shear, batch.flow, batch.state, jnp.asarray(STRAIN))
-    expected = jax.tree.map(lambda x: (2, *x.shape), measured[1])
-    assert jax.tree.map(lambda x: x.shape, both) == expected
-
-
 def test_a_change_of_numbers_compiles_nothing_anew(state, measured) -> None:
     compiled = _sample._cache_size()
     solver = BarzilaiBorwein(tolerance=1e-5, max_steps=70)

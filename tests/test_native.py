@@ -312,19 +312,6 @@ def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run,
     np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
 
 
-def test_transformations_apply(flowing) -> None:
-    """To the bit; waves to the rounding of a cosine, which is that of a vector or that of a number."""
-    flow, states = flow_of(0.6), [flowing(0.6, seed) for seed in (0, 1)]
-    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    one = jax.jit(lambda state: advance_module.advance(flow, state, jnp.int32(50), solver=EXACT))
-    for many in (jax.vmap(one), lambda batch: jax.lax.map(one, batch)):
-        for k, found in enumerate(states):
-            (after, tally), (alone, sums) = jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found)
-            np.testing.assert_allclose(tally.wave_kinetic, sums.wave_kinetic, rtol=4 * np.finfo(float).eps)
-            tally = replace(tally, wave_kinetic=sums.wave_kinetic)
-            jax.tree.map(np.testing.assert_array_equal, (after, tally), (alone, sums))
-
-
 @pytest.mark.parametrize("engine", [None, Numba()])
 def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) -> None:
     state = flowing(0.6)

@@ -42,11 +42,6 @@ def observe(seen) -> dict:
 
 
 @pytest.fixture(scope="module")
-def plain() -> xr.DataTree:
-    return ratio_map(**MAP)
-
-
-@pytest.fixture(scope="module")
 def observed() -> xr.DataTree:
     return ratio_map(**MAP, observe=observe)
 
@@ -59,10 +54,6 @@ def assert_same_variables(data: xr.DataTree, other: xr.DataTree) -> None:
             if name == "tally":  # the sums of the user's observables are behind the others
                 there = there.isel(quantity=slice(variable.sizes["quantity"]))
             np.testing.assert_array_equal(there, variable, err_msg=f"{node.path} {name}")
-
-
-def test_observing_changes_no_bit_of_a_map(observed, plain) -> None:
-    assert_same_variables(observed, plain)
 
 
 def test_what_repeats_a_built_in_average_has_its_values_and_errors(observed) -> None:

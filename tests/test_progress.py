@@ -1,12 +1,10 @@
 """Progress of a map: the share of its work that is done, and the time that the rest takes."""
 
-import re
 from typing import Any
 
 import numpy as np
 import pytest
 
-from jaxgran.cli.terminal import counted
 from jaxgran.maps.batches import predicted_cost
 from jaxgran.maps.parameters import MapParameters
 from jaxgran.maps.progress import Meter, progress
@@ -64,10 +62,3 @@ def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch, capsys) -> 
             meter.advanced(Advance([(0, 0)], [1e-3], [100]))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4 and lines[0] == "0/2 points, compiling"
-
-
-def test_items_on_a_terminal_are_counted_in_whole_numbers(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes this stream for a terminal
-    assert list(counted([7, 8, 9], "frames")) == [7, 8, 9]
-    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err)
-    assert " 3/3 " in shown and ".0" not in shown

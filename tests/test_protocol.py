@@ -16,7 +16,7 @@ from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.sampling import steady_state
+from jaxgran.sampling import steady_state, timestep
 from jaxgran.sampling.batch import advance_batch, reporting, stack
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import relative_error
@@ -184,6 +184,13 @@ def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> Non
     )
     assert end.status[0] == Status.ok
     assert end.strain[0] == pytest.approx(15 * 1.0)
+
+
+def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
+    flow = with_timesteps(1e-4, 2e-2)
+    coarse = np.asarray(timestep.bounded_coarse_timestep(flow, predicted(flow)))
+    assert coarse[0] == timestep.COARSE_TIMESTEP
+    assert coarse[1] == 2e-2
 
 
 @pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.85, 0.4)])

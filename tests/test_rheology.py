@@ -90,6 +90,12 @@ def test_only_dense_points_of_good_status_with_errors_count() -> None:
     assert law.friction.span == (float(used.inertial_number.min()), float(used.inertial_number.max()))
 
 
+def test_hot_dilute_flows_are_not_dense() -> None:
+    data = dense_map()
+    hot = data.assign_coords(packing_fraction=data.packing_fraction - 0.5)
+    assert dense_points(hot).sizes["point"] == 0
+
+
 @pytest.mark.parametrize(("alphas", "nus"), [((0.2,), 3), ((0.1, 0.2, 0.3, 0.4, 0.5), 2)])
 def test_too_few_points_are_refused(alphas: tuple[float, ...], nus: int) -> None:
     with refused(rf"at least 4 points .* has {len(alphas) * nus} at {nus}\.$"):

@@ -133,6 +133,14 @@ def test_errors_lie_on_their_isolines_with_their_labels() -> None:
     assert labelled >= 24
 
 
+def test_percentages_and_factors_name_quotients() -> None:
+    for label, level in ERROR_LEVELS.items():
+        number = float(label.strip("÷×%−+ \u2009"))
+        quotient = {"÷": 1.0 / number, "×": number, "−": 1.0 - number / 100.0, "+": 1.0 + number / 100.0}[label[0]]
+        assert np.exp(level) == pytest.approx(quotient)
+    assert list(ERROR_LEVELS.values()) == sorted(ERROR_LEVELS.values())
+
+
 def test_contours_of_the_excess_lie_on_top_of_every_panel() -> None:
     figure = theory_errors(theory_dataset(10, 12))
     for axes in figure.axes:

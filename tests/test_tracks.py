@@ -152,10 +152,16 @@ def same_tracks(path: Path, rows: pd.DataFrame, **options) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(plain, name))
 
 
-def test_a_spreadsheet_with_decimal_commas_and_units_behind_the_names_is_read(tmp_path: Path) -> None:
+SPREADSHEETS = {
+    "decimal commas": lambda rows, path: rows.to_csv(path, index=False, sep=";", decimal=","),
+    "units": lambda rows, path: rows.rename(columns={"x": "x [mm]", "y": "Y (mm)"}).to_csv(path, index=False),
+}
+
+
+@pytest.mark.parametrize("kind", SPREADSHEETS)
+def test_spreadsheets_with_decimal_commas_or_units_behind_the_names_are_read(kind: str, tmp_path: Path) -> None:
     rows = rows_of(tracks()).drop(columns=["vx", "vy"])
-    named = rows.rename(columns={"x": "x [mm]", "y": "Y (mm)"})
-    named.to_csv(tmp_path / "discs.csv", index=False, sep=";", decimal=",")
+    SPREADSHEETS[kind](rows, tmp_path / "discs.csv")
     same_tracks(tmp_path / "discs.csv", rows)
 
 
@@ -168,6 +174,15 @@ def test_the_brightness_that_trackpy_calls_mass_is_no_mass(tmp_path: Path) -> No
     same_tracks(tmp_path / "discs.csv", rows.rename(columns={"particle": "id"}))
     rows.assign(mass=rows.diameter**2).to_csv(tmp_path / "weighed.csv")
     np.testing.assert_allclose(read_tracks(tmp_path / "weighed.csv").masses, tracks().diameters ** 2)
+
+
+def test_frames_are_left_out(tmp_path: Path) -> None:
+    write_dump(tmp_path / "flow.dump", tracks())
+    every, third = read_tracks(tmp_path / "flow.dump"), read_tracks(tmp_path / "flow.dump", stride=3)
+    np.testing.assert_array_equal(third.positions, every.positions[::3])
+    np.testing.assert_array_equal(third.time, every.time[::3])
+    with pytest.raises(InputError, match=r"stride must be less than .*, 60 in 'flow\.dump', not 60"):
+        read_tracks(tmp_path / "flow.dump", stride=60)
 
 
 def test_time_between_frames_is_that_of_the_displacements(tmp_path: Path) -> None:
@@ -288,12 +303,18 @@ def dump(old: str, new: str) -> Callable[[Path], None]:
     return make
 
 
+ONE_FRAME = "frame,id,x,y,d\n1,1,0,0,1\n1,2,2,2,1\n"
+
+
 HEIGHTS = "frame,id,x,y,z,d\n1,1,0,0,0,1\n1,2,2,2,1,1\n2,1,0,0,0,1\n"
 
 BROKEN: dict[str, Callable[[Path], object]] = {
+    "no_rows.csv": text("frame,id,x,y,diameter\n"),
     "no_frames.csv": text(lambda: without("frame")),
     "words.csv": text(lambda: changed("x", "left")),
+    "one_frame.csv": text(ONE_FRAME),
     "an_id_twice.csv": doubled_rows,
+    "no_size.csv": text(lambda: changed("diameter", 0)),
     "three_dimensions.csv": text(HEIGHTS),
     "other_units.csv": text(lambda: changed("vx", lambda x: 1e3 * x)),
     "cut.h5": cut(write_fields, 3000),
@@ -302,6 +323,7 @@ BROKEN: dict[str, Callable[[Path], object]] = {
     "discs_come_and_go.gsd": other_numbers_of_discs,
     "diameters_in_metres.csv": text(lambda: changed("diameter", lambda x: 1e-3 * x)),
     "pandas.h5": table_of_pandas,
+    "no_box.dump": dump("ITEM: BOX BOUNDS xy xz yz pp pp pp\n", ""),
     "another_ending.xyz": text("2\n\nA 0 0 0\n"),
 }
 

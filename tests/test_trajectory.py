@@ -177,6 +177,14 @@ def test_a_replica_that_is_not_finite_has_no_frames(flow, flowing, drive, tmp_pa
     assert recorder.frames == 0 and not path.exists()
 
 
+def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
+    path = tmp_path / "flow.gsd"
+    recorder = Recorder(0.01, partial(write_frame, path))
+    for steps in (30, 20):
+        driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (steps,))
+        assert len(read_trajectory(path).step) == recorder.frames == 1 + steps // 10
+
+
 def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive) -> None:
     steps: list[int] = []
     recorder = Recorder(0.01037, lambda _, step: steps.append(step))
@@ -288,6 +296,18 @@ def test_force_and_cluster_of_a_grain_are_those_of_its_bonds(seen, tmp_path: Pat
 # Files of other programs
 
 
+def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
+    lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
+    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
+    write_frame(tmp_path / "flow.gsd", lost, 1)
+    write_frame(tmp_path / "flow.gsd", seen[0.0], 2)
+    with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
+        counts = [frame.bonds.N for frame in file]
+        assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
+        assert not file[1].log["particles/contact_force"].any() and (file[1].log["particles/cluster_size"] == 1).all()
+    assert counts[1] == 0 < min(counts[0], counts[2])
+
+
 def foreign(path: Path, frames: int = 2, **changes) -> Path:
     """A file as another program writes it: single precision, and a cell tilted by more than a half."""
     rng = np.random.default_rng(0)
@@ -325,6 +345,12 @@ def test_a_file_of_another_program_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.step, [0, 100])
     assert np.isnan([*read.strain, read.timestep, read.shear_rate, read.restitution]).all()
     assert read.packing_fraction == pytest.approx(20 * np.pi * 0.75**2 / 64)
+
+
+def test_diameters_and_masses_that_are_not_told_are_one(tmp_path: Path) -> None:
+    state = read_trajectory(foreign(tmp_path / "x.gsd", particles_diameter=None, particles_mass=None)).state
+    np.testing.assert_array_equal(state.grains.radii, 0.5)
+    np.testing.assert_array_equal(state.grains.masses, 1)
 
 
 def test_a_flow_may_start_at_rest(tmp_path: Path) -> None:
