@@ -204,9 +204,9 @@ def test_restitution_of_exact_stresses_is_found() -> None:
         assert np.all(found.determined) and np.all(found.chi_squared < 1e-9)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.95])
-def test_restitutions_scatter_by_their_standard_error(correlation: float) -> None:
-    count, random, errors = 100, np.random.default_rng(4), np.array([0.03, 0.03])
+def test_restitutions_scatter_by_their_standard_error() -> None:
+    """Of stresses whose errors are correlated."""
+    count, correlation, random, errors = 100, 0.95, np.random.default_rng(4), np.array([0.03, 0.03])
     closure, alpha, nu = known_closure(1e-3), 0.55, 0.65
     covariance = np.outer(errors, errors) * np.array([[1, correlation], [correlation, 1]])
     shifts = np.exp(random.multivariate_normal([0, 0], covariance + 1e-6 * np.array([[1, 1], [1, 2]]), count))
