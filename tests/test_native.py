@@ -61,7 +61,7 @@ def assert_same(ours, plain, atol: float) -> None:
         (0.4, 400, "midpoint", 1.0),
         (0.6, 100, "touching", 0.0),
         (0.78, 100, "midpoint", 1.0),
-        (0.78, 0.0, "touching", 1.0),
+        (0.78, 100, "touching", 0.0),
     ],
 )
 def test_trajectory_and_sums_are_those_of_the_plain_advance(
