@@ -1,4 +1,4 @@
-"""Free cooling: Haff's law in collisions and in time, no gain of energy, none lost by elastic grains, no time scale."""
+"""Free cooling: Haff's law in collisions and in time, no gain of energy, no time scale."""
 
 from dataclasses import replace
 

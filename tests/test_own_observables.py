@@ -1,4 +1,4 @@
-"""A user's observables in a map are averaged like the built-in ones, survive an interruption, and change nothing."""
+"""A user's observables in a map are averaged like the built-in ones and survive an interruption."""
 
 from typing import Any
 
