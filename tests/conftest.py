@@ -20,7 +20,7 @@ import jax  # noqa: E402
 
 from jaxgran.cache.folder import use_cache  # noqa: E402
 
-pytest_plugins = ["shared_flows"]
+pytest_plugins = ["flows"]
 
 use_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)

@@ -1,10 +1,13 @@
 """Independent answers: brute force over images and pairs, dense matrices, exact solutions of small contact problems."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.exact_contacts import certified_impulses, incidence
+from jaxgran.contact.near_pairs import Frame, PairLists, consumed_skin, pair_lists, present, refresh
 from jaxgran.contact.network import Contacts
+from jaxgran.model.grains import Grains
 
 MAX_DISCS, MAX_CONTACTS = 60, 192
 
@@ -100,3 +103,31 @@ def random_network(seed: int, discs: int, heaviest: float = 100.0) -> tuple[Cont
     order = rng.permutation(len(i))
     network = padded_network(i[order], j[order], normals[order], approach[order], masses)
     return network, masses, velocities
+
+
+# Pair lists that move with a flow
+
+build = jax.jit(pair_lists)
+
+
+@jax.jit
+def move(hood: PairLists, grains: Grains, side, displacements, strain):
+    """The pair_lists after a motion, with new lists where the old ones would no longer be valid."""
+    moved = Frame(hood.frame.displacements + displacements, hood.frame.strain + strain)
+    valid = consumed_skin(moved, hood.near_frame, 2 * jnp.max(grains.radii)) <= hood.near.skin
+    now = PairLists(hood.outer, hood.near, moved, hood.near_frame, hood.positions, hood.tilt)
+    now = jax.lax.cond(valid, lambda: now, lambda: refresh(now, grains, side, jnp.asarray(True)))
+    return now, ~valid, *present(now, side)
+
+
+def listed_pairs(listed) -> set:
+    """The pairs of a list, each once."""
+    i, j, reach = (np.asarray(x) for x in (listed.i, listed.j, listed.reach))
+    found = [tuple(sorted(pair)) for pair in zip(i[reach > 0].tolist(), j[reach > 0].tolist(), strict=True)]
+    assert len(found) == len(set(found))
+    assert all(i != j for i, j in found)
+    return set(found)
+
+
+def pairs_within(gap: float, positions, radii, side, tilt) -> set:
+    return set(zip(*(axis.tolist() for axis in np.nonzero(gaps_of(positions, radii, side, tilt) <= gap)), strict=True))

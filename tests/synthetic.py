@@ -1,6 +1,10 @@
 """Made-up tallies, replicas and snapshots, for tests of what happens to the numbers after the flow."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
+import pytest
 
 from jaxgran.analysis.instant import Instant
 from jaxgran.contact.network import Contacts
@@ -9,6 +13,7 @@ from jaxgran.dynamics.tally import TABLE, Tally
 from jaxgran.maps.replica import Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.cell import minimum_image
+from jaxgran.model.checks import InputError
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
@@ -55,6 +60,14 @@ def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
 def one_sentence(message: str) -> bool:
     """Whether a message is one line that starts with a word and ends with a full stop."""
     return message.count("\n") == 0 and message.endswith(".") and not message.endswith("..")
+
+
+@contextmanager
+def refused(words: str = ".") -> Iterator[pytest.ExceptionInfo]:
+    """What a user gives is refused by an ``InputError`` of one sentence, in which the words are found."""
+    with pytest.raises(InputError, match=words) as caught:
+        yield caught
+    assert one_sentence(str(caught.value))
 
 
 def snapshot_of(positions, contacts=None, velocities=None, radii=0.5, side=40.0, tilt=0.0, shear_rate=1.0) -> Snapshot:

@@ -3,13 +3,10 @@
 import json
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.speed_vs_accuracy import on_front
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.status import DEEP_OVERLAP
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.timestep import (
@@ -58,15 +55,7 @@ def test_time_steps_shorten_with_heat_with_density_and_with_the_error_asked_for(
     np.testing.assert_allclose(longest_timestep(4.0, nu, activation), longest_timestep(1.0, nu, activation) / 2)
     assert np.all(automatic_timestep(1.0, nu, activation, 1e-3) < automatic_timestep(1.0, nu, activation, 1e-2))
     assert np.all(automatic_timestep(1.0, nu, activation, 0.1) <= longest_timestep(1.0, nu, activation))
-
-
-def test_touching_needs_the_shorter_time_step() -> None:
-    nu = np.linspace(0.1, 0.83, 20)
     assert np.all(longest_timestep(1.0, nu, "touching") < longest_timestep(1.0, nu, "midpoint"))
-
-
-def test_numbers_of_jax_are_accepted() -> None:
-    assert longest_timestep(jnp.asarray([1.0]), jnp.asarray([0.5]), "midpoint").shape == (1,)
 
 
 def test_errors_of_the_committed_chart_of_whole_runs_are_within_the_bound_and_its_noise() -> None:
@@ -96,21 +85,3 @@ def test_stress_of_the_worst_solve_in_the_committed_chart_is_within_the_target()
         assert len(found) >= 3
         for target_error in (0.1, 0.02, 1e-3, 1e-4):
             assert max(found) * automatic_tolerance(target_error) <= target_error
-
-
-def test_nothing_cheaper_than_the_default_has_a_better_pressure_in_the_committed_chart() -> None:
-    """Deep overlaps left aside: at ν = 0.8 the default meets one now and then, in a strain of hundreds."""
-    chart = json.loads((RESULTS / "speed_vs_accuracy.json").read_text())
-    for flow in chart["flows"]:
-        rows = [r for r in flow["rows"] if (r["timestep"], r["tolerance"], r["activation"]) == (1e-3, 1e-4, "midpoint")]
-        assert len(rows) == 1 and on_front(rows[0] | {"status": "ok"}, flow["rows"], "pressure"), flow[
-            "packing_fraction"
-        ]
-        assert rows[0]["status"] == "ok" or flow["packing_fraction"] >= 0.8
-
-
-def test_no_accepted_flow_of_the_committed_stability_chart_overlaps_deeply() -> None:
-    cells = json.loads((RESULTS / "stability.json").read_text())["cells"]
-    accepted = [c for c in cells if c["accepted"] and c["variant"] == "default"]
-    assert len(accepted) > 100
-    assert all(c["largest_overlap"] <= DEEP_OVERLAP and c["outcome"] == "ok" for c in accepted)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import GRAINS, flow_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -90,15 +91,13 @@ def measured(flow: jg.ShearFlow, state: jg.State, strain: float) -> tuple[jg.Sam
     return sample, *standard_errors(found, sums_of([sample]))
 
 
-def test_collisions_and_dissipation_are_those_of_the_running_sums() -> None:
+def test_collisions_and_dissipation_are_those_of_the_running_sums(flowing) -> None:
     """The sums exactly, the histogram within the width of its bins."""
-    flow = jg.ShearFlow(64, restitution=0.5, packing_fraction=0.6, timestep=1e-3)
-    state = jg.prepare(flow, jax.random.key(0), equilibrate=4.0)
-    sample, value, _ = measured(flow, state, 4.0)
+    sample, value, _ = measured(flow_of(0.6), flowing(0.6), 4.0)
     histogram = np.asarray(sample.observed_sums["histogram"])
     assert histogram.sum() == sample.tally.collisions.sum() > 0
     np.testing.assert_allclose(value["dissipation_rate"], sample.binary_dissipation_rate, rtol=1e-9)
-    np.testing.assert_allclose(2 * value["collisions"] * sample.area / 64, sample.collision_rate, rtol=1e-9)
+    np.testing.assert_allclose(2 * value["collisions"] * sample.area / GRAINS, sample.collision_rate, rtol=1e-9)
     widest = (EDGES[1] / EDGES[0]) - 1
     assert abs(value["binned_over_summed_energy"] - 1) < widest
     assert np.sum(value["density"] * np.diff(EDGES)) == pytest.approx(1)

@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_maps import known_closure, ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
-from synthetic import one_sentence, snapshot_of
+from synthetic import one_sentence, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
@@ -44,7 +44,6 @@ FLOW = {"grains": GRAINS, "restitution": 0.5, "packing_fraction": 0.6, "timestep
 MAP = {"restitution": [0.5, 0.9], "packing_fraction": [0.6]}
 WOULD_RUN = 77  # exit status of a command whose input is accepted, in these tests
 SECONDS = 1.0  # of a processor, in which bad input is refused, whatever it is
-few = partial(settings, deadline=None, derandomize=True)
 
 
 class WouldRun(Exception):
@@ -265,7 +264,7 @@ def test_what_jax_cannot_trace_in_observe_is_refused_with_its_line(number: Calla
 
 
 @pytest.mark.parametrize("argument", NUMBERS)
-@few(max_examples=25)
+@settings(max_examples=15)
 @given(value=anything)
 def test_any_value_is_accepted_or_refused_in_one_sentence(argument: str, value: Any) -> None:
     verdict(NUMBERS[argument], value)
@@ -278,29 +277,18 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         "arrays of one shape",
     ),
     "flow of too many grains": (partial(make_flow, "grains", 10**12), "at most 10000000, as memory is limited"),
-    "too many seeds": (partial(make_map, "seeds", 10**9), "at most 1000000, the most replicas of a map"),
     "too many replicas": (partial(make_map, "seeds", 600_000), "at most 1000000 replicas, points times seeds"),
-    "too long a strain": (partial(make_map, "strain", 1e30), "at most 2147483647 time steps"),
     "too long an equilibration": (partial(make_map, "equilibrate", 1e30), r"at least 0 and at most 1e\+06"),
     "too short a time step": (partial(make_map, "timestep", 1e-300), "at least 1e-08 / shear rate"),
-    "too many blocks": (lambda: jg.sample(flow(), SEEN.state, 1.0, 10**9), "blocks must be at most 1000000"),
     "too many snapshots": (lambda: jg.snapshot_series(flow(), SEEN.state, 1.0, 10**9), "count must be at most"),
     "too long a sample": (lambda: jg.sample(flow(), SEEN.state, 1e30), "at most 2147483647 time steps"),
     "too many steps": (lambda: jg.advance(flow(), SEEN.state, 2**31), "a whole number of 0 to 2147483647"),
-    "half a step": (lambda: jg.advance(flow(), SEEN.state, 0.5), "a whole number of 0 to 2147483647"),
-    "steps of a batch": (lambda: jg.advance(flow(), SEEN.state, np.array([1, 2])), "a whole number"),
-    "one block": (lambda: jg.sample(flow(), SEEN.state, 1.0, 0), "blocks must be a whole number of at least 1"),
     "pack of a batch": (
         lambda: jg.pack(make_flow("restitution", np.array([0.5, 0.9])), KEY),
         "one ShearFlow, and this is a batch",
     ),
-    "prepare of a batch with one key": (
-        lambda: jg.prepare(make_flow("restitution", np.array([0.5, 0.9])), KEY),
-        r"single ones or arrays \(1,\), one for each key",
-    ),
     "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
     "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "is the last one of a series"),
-    "fields at a point": (lambda: jg.fields_at(SEEN, np.zeros(2), jg.lucy(1.0)), r"\(points, 2\) of finite numbers"),
     "width beyond the cell": (lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)), "positive and at most 3.25"),
     "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),
     "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory/pressure"),
@@ -310,20 +298,16 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_a_refusal_says_what_is_accepted(case: str) -> None:
     function, accepted = REFUSED[case]
-    with pytest.raises(InputError, match=accepted) as caught:
+    with refused(accepted):
         function()
-    assert one_sentence(str(caught.value))
 
 
-@pytest.mark.parametrize(
-    "stem", [None, 3, b"map", "none/map", "file.txt/map", f"{'n' * 300}/map", "n" * 300, "é" * 120]
-)
-def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("stem", [None, "none/map", "file.txt/map", "é" * 120])
+def test_figures_that_cannot_be_written_are_refused(stem: Any, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file.txt").write_text("no folder")
-    with pytest.raises(InputError) as caught:
+    with refused():
         jg.save_figures(ratio_dataset(alphas=2, nus=1), stem)
-    assert one_sentence(str(caught.value))
     assert files(tmp_path) == {"file.txt"}
 
 
@@ -366,27 +350,19 @@ texts = st.one_of(
 @pytest.mark.parametrize(
     ("command", "option"), [*((("map",), x) for x in MAP_OPTIONS), *((RUN, x) for x in RUN_OPTIONS)]
 )
-@few(max_examples=12)
+@settings(max_examples=12)
 @given(texts)
 def test_any_text_in_an_option_is_accepted_or_refused_in_one_sentence(command, option: str, text: str) -> None:
     accepts_or_refuses(*command, f"{option}={text}")
 
 
-@few(max_examples=40)
+@settings(max_examples=25)
 @given(
     st.sampled_from(["map", "run", "plot", "explore", "info"]),
     st.lists(texts.filter(lambda x: x != "--help"), min_size=1),
 )
 def test_any_words_after_a_command_are_refused_in_one_sentence(command: str, words: list[str]) -> None:
     assert accepts_or_refuses(command, *words).status == 2
-
-
-@pytest.mark.parametrize("option", MAP_OPTIONS)
-def test_enormous_text_is_accepted_or_refused_at_once_in_one_sentence(option: str) -> None:
-    start = time.process_time()
-    for text in ENORMOUS:
-        accepts_or_refuses("map", f"{option}={text}")
-    assert time.process_time() - start < SECONDS * len(ENORMOUS)
 
 
 # Files
@@ -400,9 +376,6 @@ NO_MAPS: dict[str, xr.Dataset] = {
     "another dimension": ratio_dataset().expand_dims("seed"),
     "empty": ratio_dataset().isel(restitution=slice(0)),
     "text": ratio_dataset().assign(force_ratio=ratio_dataset().force_ratio.astype(str)),
-    "times on an axis": ratio_dataset(alphas=2).assign_coords(
-        restitution=np.array(["2020-01-01", "2021-01-01"], "datetime64[ns]")
-    ),
     "repetition on an axis": ratio_dataset(alphas=2).assign_coords(restitution=[0.5, 0.5]),
     "repeated time steps": with_timesteps(ratio_dataset(), 1e-3, 1e-3),
     "status without meanings": ratio_dataset().assign(status=ratio_dataset().status.drop_attrs()),
@@ -410,18 +383,13 @@ NO_MAPS: dict[str, xr.Dataset] = {
 
 
 @pytest.mark.parametrize("kind", NO_MAPS)
-def test_a_dataset_that_is_no_map_is_refused_by_every_figure(kind: str, tmp_path: Path) -> None:
+def test_what_is_no_map_is_refused_by_every_figure_and_as_a_file(kind: str, tmp_path: Path) -> None:
     data = NO_MAPS[kind]
     for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
         assert "must be a ratio map" in verdict(draw, data)
     assert "must be a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
     assert "must be a ratio map" in verdict(jg.friction_law, data)
-    assert not files(tmp_path)
-
-
-@pytest.mark.parametrize("kind", NO_MAPS)
-def test_a_file_that_is_no_map_is_refused_and_nothing_drawn(kind: str, tmp_path: Path) -> None:
-    NO_MAPS[kind].to_netcdf(tmp_path / "no.nc", engine="netcdf4")
+    data.to_netcdf(tmp_path / "no.nc", engine="netcdf4")
     for words in (["plot", "no.nc"], ["map", "--from-map", "no.nc"]):
         outcome = jaxgran(tmp_path, *words)
         assert_one_sentence(outcome)
@@ -459,7 +427,7 @@ def test_a_file_that_is_no_netcdf_is_refused_and_nothing_drawn(kind: str, tmp_pa
     assert files(tmp_path) == {"garbage.nc"}
 
 
-@few(max_examples=30)
+@settings(max_examples=10)
 @given(st.floats(0, 1, exclude_max=True))
 def test_a_truncated_map_is_refused_wherever_it_ends(share: float) -> None:
     with TemporaryDirectory() as name:
@@ -483,35 +451,22 @@ ALIKE = {
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *[("grains", value) for value in ("many", 3, [64, 64])],
-        ("seeds", 10**9),
-        ("timestep", 0.0),
+        ("grains", "many"),
         ("strain", [1.0, 2.0]),
         *[(name, value) for name in ("solver_requested", "activation", "engine_requested") for value in (3, "other")],
         *[("solver_parameters", value) for value in (2.0, "{", '{"damping": 1.0}')],
         *[("equilibrate", value) for value in ("soon", -1.0)],
-        ("error", 7.0),
+        *[(name, None) for name in ("grains", "solver_parameters", "first_seed")],  # it is missing
     ],
 )
 def test_a_map_with_impossible_choices_cannot_be_repeated(name: str, value: Any, tmp_path: Path) -> None:
     data = ratio_dataset(alphas=2, nus=2)
-    attrs = {"restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE}
-    data.assign_attrs({**data.attrs, **attrs, name: value}).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
+    attrs = {**data.attrs, "restitution": [0.1, 0.9], "packing_fraction": [0.3, 0.8], **ALIKE, name: value}
+    told = {key: one for key, one in attrs.items() if one is not None}
+    data.drop_attrs(deep=False).assign_attrs(told).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
     outcome = jaxgran(tmp_path, "map", "--from-map", "old.nc", "--output", "new.nc")
     assert_one_sentence(outcome)
     assert name.partition("_")[0] in outcome.err
-    assert files(tmp_path) == {"old.nc"}
-
-
-@pytest.mark.parametrize("missing", [*ALIKE, "grains", "seeds", "timestep"])
-def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, tmp_path: Path) -> None:
-    data = ratio_dataset(alphas=2, nus=2)
-    attrs = {**data.attrs, **ALIKE}
-    del attrs[missing]
-    data.drop_attrs(deep=False).assign_attrs(attrs).to_netcdf(tmp_path / "old.nc", engine="netcdf4")
-    outcome = jaxgran(tmp_path, "map", "--from-map", "old.nc", "--output", "new.nc")
-    assert_one_sentence(outcome)
-    assert missing in outcome.err
     assert files(tmp_path) == {"old.nc"}
 
 
@@ -520,7 +475,7 @@ def test_a_map_that_does_not_tell_its_choices_cannot_be_repeated(missing: str, t
 
 @pytest.mark.parametrize("name", ["-a'b\"c $d Strömung 流れ.x.nc", "\udcff.nc"])
 def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok, (1, 0): Status.ok}))
     write_few_variables(monkeypatch, *theory.SHARES)
@@ -539,14 +494,11 @@ def test_an_output_of_any_name_is_written_with_its_figures_and_read_again(
 
 
 OUTPUTS = {
-    "map.NC": "ends in .nc",
     ".nc": "ends in .nc",
     "folder.nc": "is a folder",
-    "folder.nc/": "is a folder",
     "file.txt/map.nc": "a folder that exists",
     "taken.nc": "a file has this name",
     "流" * 90 + ".nc": "at most 200 bytes",
-    "n" * 300 + "/map.nc": "a folder that exists",
 }
 
 
@@ -565,23 +517,6 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_runs(
     assert files(tmp_path) == before
 
 
-@pytest.mark.parametrize("folder", ["file.txt", "file.txt/new", "n" * 300])
-def test_figures_need_a_folder(folder: str, tmp_path: Path) -> None:
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
-    (tmp_path / "file.txt").write_text("no folder")
-    outcome = jaxgran(tmp_path, "plot", "map.nc", f"--output={folder}")
-    assert_one_sentence(outcome)
-    assert "a folder that can be made and written to" in outcome.err
-    assert files(tmp_path) == {"map.nc", "file.txt"}
-
-
-def test_a_picture_that_is_a_folder_stops_plot_in_one_sentence(tmp_path: Path) -> None:
-    ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
-    (tmp_path / "map_curves.png").mkdir()
-    assert_one_sentence(jaxgran(tmp_path, "plot", "map.nc"))
-    assert files(tmp_path) == {"map.nc", "map_curves.png"}
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_path: Path) -> None:
     ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
@@ -597,9 +532,7 @@ def test_a_folder_that_is_read_only_and_a_file_that_is_secret_are_refused(tmp_pa
     assert files(tmp_path) == {"map.nc"}
 
 
-def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
     def full(*_):
         raise OSError(28, "No space left on device")
 

@@ -280,9 +280,7 @@ def test_grains_have_black_lines_in_clusters_and_red_ones_in_binary_collisions(m
     assert colours["255,255,255"] > 1000 and len(colours) > 100
 
 
-def test_copied_are_the_table_and_a_command_that_runs(
-    map_page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_copied_are_the_table_and_a_command_that_runs(map_page, tmp_path: Path, monkeypatch) -> None:
     map_page.execute_script("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
     for button in ("copy-numbers", "copy-command"):
         map_page.find_element("id", button).click()

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="folders have 
 
 
 @pytest.fixture
-def nothing_for_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def nothing_for_the_user(tmp_path: Path, monkeypatch) -> Path:
     """The user's cache folder cannot be made; the folder of temporary files is the result."""
     (tmp_path / "file").touch()
     (tmp_path / "temporary").mkdir()
@@ -23,7 +23,7 @@ def nothing_for_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     return tmp_path / "temporary"
 
 
-def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_users_folder_is_taken_if_it_can_be_written(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert cache.cache_folder() == cache.users_folder() == tmp_path / "cache" / "jaxgran"
     assert not list(cache.users_folder().iterdir())

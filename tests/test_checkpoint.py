@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flows import assert_same_bits
-from synthetic import one_sentence, random_replica
+from synthetic import one_sentence, random_replica, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Jax
@@ -58,43 +58,21 @@ def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
     assert list(output.parent.iterdir()) == []
 
 
-def test_replicas_of_every_number_of_grains_come_back(output: Path) -> None:
-    settings, rng = replace(SETTINGS, grains=(64, 128)), np.random.default_rng(0)
-    run = Checkpoint(output, settings, resume=False)
-    run.add({(point, 0): random_replica(rng, settings, Status.ok, point) for point in (0, 5)})
-    run.close(finished=False)
-    resumed = Checkpoint(output, settings, resume=True)
-    assert_same_bits(resumed.done, run.done)
-    assert [resumed.done[point, 0].sample.grains for point in (0, 5)] == [64, 128]
-    resumed.close(finished=False)
-
-
 def test_an_unfinished_map_is_never_overwritten(output: Path) -> None:
     cut_off(output)
-    with pytest.raises(InputError, match="to continue it") as refused:
+    with refused("to continue it"):
         Checkpoint(output, SETTINGS, resume=False)
-    assert one_sentence(str(refused.value))
     Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
-@pytest.mark.parametrize(
-    "change", [{"solver": LOOSE}, {"seeds": 3}, {"restitution": (0.4, 0.9)}, {"error": 0.1}, {"engine": Jax()}]
-)
+@pytest.mark.parametrize("change", [{"solver": LOOSE}, {"restitution": (0.4, 0.9)}, {"engine": Jax()}])
 def test_another_map_is_refused_and_the_difference_named(output: Path, change: dict) -> None:
     cut_off(output)
-    with pytest.raises(InputError, match=f"has {next(iter(change))} ") as refused:
+    with refused(f"has {next(iter(change))} "):
         Checkpoint(output, replace(SETTINGS, **change), resume=True)
-    assert one_sentence(str(refused.value))
 
 
-def test_another_version_is_refused_and_named(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cut_off(output)
-    monkeypatch.setattr(checkpoint, "version", lambda name: "0.0.1")
-    with pytest.raises(InputError, match=r"version of jaxgran .*, not '0.0.1'"):
-        Checkpoint(output, SETTINGS, resume=True)
-
-
-def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
     there = sorted(folder.iterdir())
@@ -154,41 +132,20 @@ def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> N
     assert list(output.parent.iterdir()) == []
 
 
-def test_a_folder_that_is_removed_is_made_again_with_all_that_was_known(output: Path) -> None:
-    run = Checkpoint(output, SETTINGS, resume=False)
-    first, second, third = batches()
-    run.add(first)
-    run.add(second)
-    for path in run.folder.iterdir():
-        path.unlink()
-    run.folder.rmdir()
-    run.add(third)
-    run.close(finished=False)
-    resumed = Checkpoint(output, SETTINGS, resume=True)
-    assert_same_bits(resumed.done, first | second | third)
-    resumed.close(finished=True)
-
-
 def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) -> None:
+    """And all that was known."""
     run = Checkpoint(output, SETTINGS, resume=False)
+    first, second, _ = batches()
+    run.add(first)
     shutil.rmtree(run.folder)
-    run.add(batches()[0])
+    run.add(second)
     with pytest.raises(InputError, match="another process is writing"):
         Checkpoint(output, SETTINGS, resume=True)
-    run.close(finished=True)
-    assert list(output.parent.iterdir()) == []
-
-
-def test_the_folder_of_another_run_is_not_removed(output: Path) -> None:
-    run = Checkpoint(output, SETTINGS, resume=False)
-    shutil.rmtree(run.folder)
-    other = Checkpoint(output, SETTINGS, resume=False)
-    other.add(batches()[0])
-    run.close(finished=True)
-    other.close(finished=False)
+    run.close(finished=False)
     resumed = Checkpoint(output, SETTINGS, resume=True)
-    assert set(resumed.done) == set(batches()[0])
+    assert_same_bits(resumed.done, first | second)
     resumed.close(finished=True)
+    assert list(output.parent.iterdir()) == []
 
 
 def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_up(output: Path) -> None:
@@ -205,12 +162,11 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
 
 def test_a_file_in_place_of_the_folder_is_one_sentence(output: Path) -> None:
     output.with_name("map.nc.unfinished").write_text("mine")
-    with pytest.raises(InputError, match="a file has this name") as refused:
+    with refused("a file has this name"):
         Checkpoint(output, SETTINGS, resume=False)
-    assert one_sentence(str(refused.value))
 
 
-def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch) -> None:
     def no_locks(*_) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
@@ -220,11 +176,6 @@ def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch: p
     resumed = Checkpoint(output, SETTINGS, resume=True)
     assert_same_bits(resumed.done, kept)
     resumed.close(finished=True)
-    assert list(output.parent.iterdir()) == []
-
-
-def test_a_map_that_had_hardly_begun_leaves_nothing(output: Path) -> None:
-    Checkpoint(output, SETTINGS, resume=False).close(finished=False)
     assert list(output.parent.iterdir()) == []
 
 
@@ -243,9 +194,8 @@ time.sleep(60)
 """
     first = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
     assert first.stdout is not None and first.stdout.readline() == "locked\n"
-    with pytest.raises(InputError, match="another process is writing") as refused:
+    with refused("another process is writing"):
         Checkpoint(output, SETTINGS, resume=True)
-    assert one_sentence(str(refused.value))
     first.send_signal(signal.SIGKILL)
     first.wait()
     first.stdout.close()

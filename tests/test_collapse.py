@@ -48,18 +48,6 @@ def test_below_the_threshold_steps_grow_and_the_excess_falls_by_the_roots(engine
         assert abs(values.mean() - expected) < 4 * error
 
 
-@pytest.mark.parametrize("discs", [3, 4])
-def test_growth_begins_at_the_threshold(steps_and_excess, discs) -> None:
-    """Ten percent above it a finer dt adds no step for any start; ten percent below it adds some at every decade."""
-    states = [row(discs, gap) for gap in GAPS[::4]]
-    above, below = (
-        [steps_and_excess(share * THRESHOLDS[discs], dt, states)[0] for dt in (1e-5, 1e-6, 1e-7)]
-        for share in (1.1, 0.9)
-    )
-    np.testing.assert_array_equal(above[1], above[2])
-    assert np.all(np.diff(np.mean(below, axis=1)) > 2)
-
-
 @pytest.mark.parametrize(("share", "collapses"), [(0.95, True), (1.05, False)])
 def test_three_discs_collapse_where_the_third_leaves_more_slowly_than_the_larger_root(
     steps_and_excess, share, collapses

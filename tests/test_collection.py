@@ -114,12 +114,6 @@ def test_weights_prove_in_exact_fractions_that_there_is_no_solution(network):
     assert max(abs(float(x)) for x in total.ravel()) < 1e-30
 
 
-def test_a_problem_with_a_solution_has_no_such_proof():
-    problem = problem_of(FEASIBLE["chain"])
-    assert obstacle(problem, np.ones(15), np.zeros(15)) > 0.1
-    assert obstacle(problem, -np.ones(15), np.zeros(15)) == np.inf
-
-
 def test_file_returns_what_was_written_and_is_the_same_twice(entries, tmp_path):
     for name in ("one.h5", "two.h5"):
         write(tmp_path / name, entries)
@@ -132,13 +126,6 @@ def test_file_returns_what_was_written_and_is_the_same_twice(entries, tmp_path):
         for a, b in zip((*one.problem, *one.solution[1:4]), (*other.problem, *other.solution[1:4]), strict=True):
             np.testing.assert_array_equal(a, b)
     assert len(load(tmp_path / "one.h5", most_contacts=15)) == sum(len(x.problem.approach) <= 15 for x in entries)
-
-
-def test_another_file_is_refused(tmp_path):
-    with h5py.File(tmp_path / "other.h5", "w"):
-        pass
-    with pytest.raises(ValueError, match="python -m benchmarks collection"):
-        load(tmp_path / "other.h5")
 
 
 def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold():

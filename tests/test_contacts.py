@@ -13,7 +13,7 @@ from jaxgran.model.grains import Grains
 EPS = np.finfo(float).eps
 PAIRS, INSTANTS = 256, 1001
 seeds = given(st.integers(0, 2**32 - 1))
-modest = settings(max_examples=20, derandomize=True, deadline=None)
+modest = settings(max_examples=20)
 
 compiled_rule, compiled_time, compiled_network = map(jax.jit, (is_contact, first_contact_time, contact_network))
 
@@ -64,20 +64,6 @@ def test_touching_rule_reads_the_gap_alone(seed):
     contact, _ = compiled_rule(motion(separations, velocities), reach, 0.0)
     gap = np.linalg.norm(separations, axis=1) - reach
     np.testing.assert_array_equal(contact, gap <= 0)
-
-
-@modest
-@seeds
-def test_looking_ahead_keeps_the_approaching_contacts_and_drops_those_that_part(seed):
-    separations, velocities, reach = flights(seed)
-    contact, approaching = (np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 0.0))
-    ahead, approaching_ahead = (
-        np.asarray(found) for found in compiled_rule(motion(separations, velocities), reach, 1e-2)
-    )
-    assert np.all(approaching_ahead[approaching])
-    receding = np.sum(separations * velocities, axis=1) >= 0
-    assert np.all(contact[ahead & receding])
-    assert np.sum(approaching_ahead) > np.sum(approaching) and np.sum(ahead & receding) < np.sum(contact & receding)
 
 
 @modest
@@ -149,8 +135,3 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     for name in ("normals", "approach", "inverse_mass_i", "inverse_mass_j"):
         assert np.all(getattr(network, name)[3:] == 0)
     assert np.all(np.isfinite(network.distances))
-
-
-def test_empty_slot_of_the_pair_list_is_no_contact():
-    contact, _ = is_contact(motion([[1e6, 0.0]], [[-1e9, 0.0]]), np.array([0.0]), jnp.asarray(0.1))
-    assert not np.any(contact)

@@ -107,11 +107,6 @@ def test_units_are_those_of_pure_numbers_and_links_lead_to_variables(kind: str, 
         assert whole["cell_methods"] == "realization: " + by_seed["cell_methods"]
 
 
-def test_estimates_for_a_large_system_are_linked_to_their_errors_and_convergence(several) -> None:
-    linked = several["large_system"].pressure.attrs["ancillary_variables"].split()
-    assert linked == ["pressure_ci95", "pressure_converged"]
-
-
 def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(several, single, tmp_path: Path) -> None:
     assert {"point_grains", "timestep"} <= set(single.coords) and "grains" not in single.coords
     assert single.force_ratio.timestep.item() == 5e-4

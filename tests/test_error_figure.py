@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from drawn import caption, legend_texts
 from made_up_maps import ratio_dataset
 
 from jaxgran.maps.schema import ERROR_SOURCES
@@ -37,9 +36,6 @@ def test_each_point_has_the_mark_of_its_largest_part_and_its_whole_error(largest
         places = np.concatenate([marks.get_offsets() for marks in axes.collections])
         assert set(places[:, 0]) == set(1 - with_budget(largest).restitution.values)
         assert {text.get_text() for text in axes.texts} == {"20"}
-        assert "20 % (median), 20 % (largest)" in axes.get_title()
-    assert legend_texts(figure) == ["sampling", "time step", "number of grains", "tolerance"]
-    assert "N=256" in caption(figure)
 
 
 def test_a_point_without_a_value_has_no_mark() -> None:

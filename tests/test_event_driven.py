@@ -80,15 +80,6 @@ def test_flow_is_the_same_everywhere(move) -> None:
         np.testing.assert_allclose(moved[name], values, rtol=1e-6, atol=1e-6, err_msg=name)
 
 
-def test_flow_does_not_depend_on_the_list_of_near_pairs(monkeypatch) -> None:
-    law, before = Law(0.9), lattice(12, 0.3)
-    one, sums = sheared(before, law, 1.0)
-    monkeypatch.setattr(event_driven, "MOST_SKIN", 0.1)
-    other, again = sheared(before, law, 1.0)
-    assert sums["collisions"] == again["collisions"] > 100
-    np.testing.assert_allclose(other.velocities, one.velocities, atol=1e-6)
-
-
 def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
     """ω = 2 n σ χ √(πT/m), p = nT (1 + 2νχ), with Henderson's χ, which is exact to 0.3 % at this packing fraction."""
     fraction, count = 0.3, 400

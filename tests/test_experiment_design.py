@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from observed import FRAMES, STRAIN, noisy, tracks
-from synthetic import one_sentence
+from synthetic import refused
 
 import jaxgran as jg
 
@@ -86,11 +86,8 @@ NOISE = jg.TrackNoise(1e-3)
 MISTAKES = {
     "flow must be a ShearFlow": {"flow": 3},
     "shear_rate must be above 0": {"flow": jg.ShearFlow(64, 0.6, 0.5, 1e-3, shear_rate=0.0)},
-    "frames must be a whole number of at least 2": {"frames": 1},
     "noise must be a TrackNoise": {"noise": 1e-3},
-    "frame_strain must be a positive number": {"frame_strain": 0.0},
     "missing must be at least 0 and below 1": {"missing": 1.0},
-    "key must be a random key": {"key": 3},
     "nothing will be learnt at a frame_strain of 1, .* take about 0.0": {"frame_strain": 1.0},
     "nothing will be learnt from 0 collisions, .* more frames, or less noise": {"frames": 2},
 }
@@ -99,13 +96,5 @@ MISTAKES = {
 @pytest.mark.parametrize("words", MISTAKES)
 def test_mistakes_and_where_nothing_will_be_learnt(words: str) -> None:
     given = {"flow": FLOW, "frames": 24, "noise": NOISE} | MISTAKES[words]
-    with pytest.raises(jg.InputError, match=f"^{words}") as refused:
+    with refused(f"^{words}"):
         jg.fisher_information(**given)
-    assert one_sentence(str(refused.value))
-
-
-@pytest.mark.parametrize("name", ["position", "velocity", "diameter"])
-def test_noise_that_cannot_be_is_one_sentence(name: str) -> None:
-    with pytest.raises(jg.InputError, match=f"^{name} must be a number of at least 0") as refused:
-        jg.TrackNoise(**{"position": 1e-3, name: -1.0})
-    assert one_sentence(str(refused.value))

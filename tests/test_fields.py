@@ -20,13 +20,11 @@ from scipy.integrate import quad
 from jaxgran.analysis.coarse_graining import CoarseGraining, gaussian, heaviside, lucy
 from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
-from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
-from jaxgran.sampling.averages import averages
 
 KERNELS = {"gaussian": gaussian, "lucy": lucy, "heaviside": heaviside}
 SMOOTH = {"gaussian": gaussian(0.25), "lucy": lucy(1.9)}  # e^-39 of the Gaussian is beyond half the side
@@ -189,7 +187,7 @@ coordinates = st.floats(-3, 3).map(lambda x: round(x, 6))
 
 
 @every_kernel
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     middle=st.tuples(coordinates, coordinates),
     angle=st.floats(0, 6.3),
@@ -392,55 +390,7 @@ def test_momentum_through_planes_of_all_heights_is_the_virial_stress(seen) -> No
     np.testing.assert_allclose(mean, virial_stress(seen), rtol=0, atol=1e-10 * np.max(np.abs(mean)))
 
 
-@pytest.fixture(scope="module")
-def planes_in_time(flowing, run):
-    """Flux through eight planes at every step, and y-momentum above each plane, beside blocks of ``advance``."""
-    flow, solver, blocks, steps = FLOW, BarzilaiBorwein(1e-8), 10, 300
-    state = flowing(0.78)
-    heights = (jnp.arange(8.0) + 0.5) / 8 * state.side
-
-    @jax.jit
-    def block(flow, state):
-        def step(now, _):
-            seen = snapshot(flow, now, solver)
-            above = (now.positions[:, 1][:, None] >= heights[None, :]).astype(heights.dtype)
-            held = (now.grains.masses * now.velocities[:, 1]) @ above
-            return flown(collided(seen), flow.shear_rate, flow.timestep), (plane_flux(seen, heights), held)
-
-        return lax.scan(step, state, None, length=steps)
-
-    flux, held, stress = [], [], []
-    for _ in range(blocks):
-        _, tally = run(flow, state, steps, solver=solver)
-        state, (through, inside) = block(flow, state)
-        found = averages(jax.tree.map(np.asarray, tally), float(state.side) ** 2, GRAINS, 1.0)
-        flux.append(through)
-        held.append(inside)
-        stress.append(found["contact_stress"] + found["kinetic_stress"])
-    return state, np.concatenate(flux), np.concatenate(held), np.asarray(stress)
-
-
-def test_momentum_that_enters_a_slab_and_does_not_leave_it_stays(planes_in_time) -> None:
-    """Between two planes the y-momentum changes, step by step, by the fluxes through them and by nothing else."""
-    state, flux, held, _ = planes_in_time
-    stays = np.diff(held[:, :-1] - held[:, 1:], axis=0)
-    entered = float(state.side) * 1e-3 * (flux[:-1, :-1, 1] - flux[:-1, 1:, 1])
-    assert np.max(np.abs(stays)) > 0.1
-    np.testing.assert_allclose(stays, entered, rtol=0, atol=1e-10 * np.max(np.abs(held)))
-
-
-def test_momentum_through_planes_over_time_is_the_stress_of_the_tally(planes_in_time) -> None:
-    """At every height, within four standard errors of the differences between blocks."""
-    _, flux, _, stress = planes_in_time
-    blocks = len(stress)
-    through = flux.reshape(blocks, -1, *flux.shape[1:]).mean(axis=1)
-    apart = through - stress[:, 1][:, None]
-    error = np.std(apart, axis=0, ddof=1) / np.sqrt(blocks)
-    assert np.all(error < 0.1 * np.mean(stress[:, 1, 1]))
-    assert np.all(np.abs(np.mean(apart, axis=0)) < 4 * error)
-
-
-@pytest.mark.parametrize("width", [0.0, -1.0, float("nan"), 3.0])
+@pytest.mark.parametrize("width", [-1.0, float("nan"), 3.0])
 def test_a_width_that_does_not_fit_the_cell_is_refused(seen, points, width: float) -> None:
     for fields in (
         partial(fields_at, seen),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jax import lax
 from oracles import MAX_DISCS, delassus, padded_network, random_network
 
-from jaxgran.contact.delassus import delassus_product, grain_impulses, spectral_bound
+from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
 from jaxgran.contact.solver import solve
@@ -64,7 +64,7 @@ def strictness(network: Contacts, masses: np.ndarray) -> float:
     return float(np.min(margin[np.asarray(network.used)]))
 
 
-@settings(max_examples=25, derandomize=True, deadline=None, phases=[Phase.generate])
+@settings(max_examples=25, phases=[Phase.generate])
 @given(networks, st.sampled_from([1.0, 100.0]))
 def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest):
     """With respect to velocities, geometry and masses, wherever no contact is about to press or to part."""
@@ -89,26 +89,6 @@ def test_gradient_of_a_solve_is_that_of_finite_differences(network_of, heaviest)
         scale = float(jnp.sqrt(jnp.sum(derivative[k] ** 2))) + 1
         assert abs(numerical - exact) < 1e-6 * scale
         assert abs(tangent(at, along, network, weights) - exact) < 1e-8 * scale
-
-
-def test_implicit_derivative_is_that_of_the_unrolled_iteration():
-    """Ten thousand projected Jacobi steps, differentiated one by one, have the derivative of the one linear solve."""
-
-    def unrolled(approach, network, weights):
-        bound = spectral_bound(network, MAX_DISCS)
-
-        def step(impulses, _):
-            return jnp.maximum(0, impulses - (delassus_product(network, impulses, MAX_DISCS) + approach) / bound), None
-
-        return jnp.sum(weights * lax.scan(step, jnp.zeros_like(approach), length=10_000)[0])
-
-    derivative = jax.jit(jax.grad(unrolled))
-    for seed in range(3):
-        network, masses, _ = random_network(seed, 12)
-        weights = jnp.where(network.used, np.random.default_rng(seed).normal(size=network.used.size), 0)
-        own = gradient(*inputs(network, masses), network, weights)[0]
-        theirs = derivative(network.approach, network, weights)
-        np.testing.assert_allclose(own, theirs, rtol=0, atol=1e-7 * float(jnp.max(jnp.abs(theirs))))
 
 
 def test_velocities_are_differentiable_where_impulses_are_not_unique():

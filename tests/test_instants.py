@@ -127,13 +127,13 @@ def test_map_of_120_points_of_a_thousand_grains_has_less_than_three_megabytes(tm
     assert 4 * (tmp_path / "map.nc").stat().st_size < 2.4e6
 
 
-def test_window_has_at_least_one_time_step_and_at_most_a_thousand(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_window_has_at_least_one_time_step_and_at_most_a_thousand(monkeypatch) -> None:
     monkeypatch.setattr(instants, "WINDOW", 0.002)
     assert [instants._steps(ShearFlow(32, 0.5, 0.6, dt)) for dt in (0.01, 1e-3, 1e-5, 1e-8)] == [1, 2, 200, 1000]
 
 
 def test_instant_of_a_batch_that_continues_from_its_journal_is_the_same(
-    with_instants, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    with_instants, tmp_path: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr("jaxgran.maps.journal.SECONDS", 0.0)
     for journal_there in (False, True):

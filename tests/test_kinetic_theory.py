@@ -131,11 +131,6 @@ def test_one_size_is_the_limit_of_many():
     np.testing.assert_allclose(numbers(moments(0.7, 0.5, polydispersity=0.0)), numbers(one_size), rtol=1e-12)
 
 
-def test_the_default_number_of_size_classes_suffices():
-    finer = gaussian_moments(0.7, 0.5, size_classes=6)
-    np.testing.assert_allclose(numbers(moments(0.7, 0.5)), numbers(finer), rtol=1e-6)
-
-
 def test_contact_value_starts_from_the_second_virial_coefficient():
     assert contact_value(0.0) == 1
     np.testing.assert_allclose(jax.grad(contact_value)(0.0), 25 / 16)
@@ -230,12 +225,6 @@ def test_derivatives_of_the_moments_equal_finite_differences(point):
 
 
 jacobian_of_moments = jax.jit(jax.jacrev(lambda point: jnp.stack(jax.tree.leaves(moments(*point)))))
-
-
-def test_elastic_grains_have_no_steady_state():
-    assert np.isinf(jenkins_richman(1.0, 0.5).granular_temperature)
-    assert np.isinf(garzo_dufty(1.0, 0.5).granular_temperature)
-    assert not np.isfinite(moments(1.0, 0.5).granular_temperature)
 
 
 def test_one_elastic_replica_leaves_the_others_alone():

@@ -13,7 +13,6 @@ from jaxgran.model.flow import ShearFlow
 from jaxgran.sampling.averages import averages
 from jaxgran.theory.gaussian_moments import gaussian_moments
 from jaxgran.theory.mixture import mixture_contact_value
-from jaxgran.theory.steady_shear import contact_value
 
 STRAIN = 40.0
 
@@ -61,11 +60,6 @@ def test_temperatures_of_size_classes_are_those_of_their_grains() -> None:
     found = velocity_distribution(moving(velocities, radii))
     np.testing.assert_allclose(found.size_classes, [0.8, 1.0, 1.2])
     assert_within_errors(found.size_temperatures, [1.0, 2.0, 4.0])
-
-
-def test_contact_value_of_one_size_is_henderson() -> None:
-    for nu in (0.1, 0.6):
-        np.testing.assert_allclose(mixture_contact_value(1.0, 1.0, nu, 1.0, 1.0), float(contact_value(nu)))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numba
 import numpy as np
 import pytest
-from flows import EXACT, GRAINS
+from flows import COUNTS, EXACT, GRAINS, assert_same_state, flow_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -34,7 +34,6 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 LOOSE = BarzilaiBorwein(1e-6, 10**6)
-COUNTS = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "unconverged")
 
 
 @pytest.fixture(scope="module", params=["numba", "pallas"])
@@ -42,43 +41,40 @@ def native_run(request, engines):
     return engines[request.param]
 
 
-def of(packing_fraction, restitution=0.5, timestep=1e-3, **others) -> ShearFlow:
-    return ShearFlow(GRAINS, restitution, packing_fraction, timestep, **others)
-
-
-def assert_same(ours, plain, side: float, atol: float) -> None:
+def assert_same(ours, plain, atol: float) -> None:
     (state, tally), (expected, sums) = ours, plain
-    np.testing.assert_allclose(state.velocities, expected.velocities, atol=atol)
-    apart = np.array(state.positions - expected.positions)
-    rows = np.round(apart[:, 1] / side)
-    apart -= np.stack([rows * float(expected.tilt) * side, rows * side], axis=-1)
-    apart[:, 0] -= np.round(apart[:, 0] / side) * side
-    np.testing.assert_allclose(apart, 0, atol=atol)
     strain = float(state.tilt - expected.tilt)
     assert abs(strain - round(strain)) < 1e-9
-    for name in COUNTS:
+    assert_same_state(replace(state, tilt=expected.tilt), expected, atol)
+    for name in (*COUNTS, "unconverged"):
         assert getattr(tally, name) == getattr(sums, name), name
     for name in TABLE:
-        if name not in (*COUNTS, "iterations", "residual_counts", "worst_residual", "momentum_drift"):
+        if name not in (*COUNTS, "unconverged", "iterations", "residual_counts", "worst_residual", "momentum_drift"):
             expected_value = np.asarray(getattr(sums, name))
             np.testing.assert_allclose(getattr(tally, name), expected_value, rtol=1e-6, atol=1e-9 + atol, err_msg=name)
     assert np.sum(tally.residual_counts) == tally.solves
 
 
-@pytest.mark.parametrize("shear_rate", [1.0, 0.0])
-@pytest.mark.parametrize("activation", ["midpoint", "touching"])
-@pytest.mark.parametrize(("packing_fraction", "steps"), [(0.4, 400), (0.6, 100), (0.78, 100)])
+@pytest.mark.parametrize(
+    ("packing_fraction", "steps", "activation", "shear_rate"),
+    [
+        (0.4, 400, "midpoint", 1.0),
+        (0.6, 100, "touching", 0.0),
+        (0.78, 100, "midpoint", 1.0),
+        (0.78, 100, "touching", 0.0),
+    ],
+)
 def test_trajectory_and_sums_are_those_of_the_plain_advance(
     flowing, run, native_run, packing_fraction, steps, activation, shear_rate
 ) -> None:
     state = flowing(packing_fraction)
-    flow = of(packing_fraction, activation=activation, shear_rate=shear_rate)
+    flow = flow_of(packing_fraction, activation=activation, shear_rate=shear_rate)
     ours, plain = native_run(flow, state, steps), run(flow, state, steps)
     assert ours[1].solves > 5
-    assert_same(ours, plain, float(state.side), 1e-6)
+    assert_same(ours, plain, 1e-6)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(
     packing_fraction=st.sampled_from([0.1, 0.4, 0.7, 0.8]),
     restitution=st.floats(0, 1),
@@ -96,12 +92,12 @@ def test_any_flow_takes_its_first_events_as_in_the_plain_advance(
     state = replace(still, velocities=jnp.asarray(velocities))
     if tilt:  # a packing in another cell overlaps here and there: overlaps are contacts like others
         state = replace(state, tilt=jnp.asarray(tilt, float))
-    flow = of(packing_fraction, restitution, timestep)
+    flow = flow_of(packing_fraction, restitution=restitution, timestep=timestep)
     ours, plain = native_run(flow, state, 5), run(flow, state, 5)
     assume(plain[1].status < Status.capacity)  # its lists are narrower: the numba engine may still hold such a flow
     assert ours[1].status == plain[1].status
     if plain[1].status < Status.infeasible:
-        assert_same(ours, plain, float(state.side), 1e-6 * max(1, speed))
+        assert_same(ours, plain, 1e-6 * max(1, speed))
 
 
 @pytest.mark.parametrize("rows", [10, 50])  # 100 grains, and more than the numba engine takes as they come
@@ -133,7 +129,7 @@ def test_a_row_around_the_cell_comes_to_rest(native_run) -> None:
     velocities[:, 0] = -0.1 * np.sin(2 * np.pi * np.arange(GRAINS) / GRAINS)
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5 * (1 + 1e-3))), jnp.ones(GRAINS))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, GRAINS, 0.0)))
-    after, tally = native_run(of(0.7, 0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6))
+    after, tally = native_run(flow_of(0.7, restitution=0.0, shear_rate=0.0), state, 1, BarzilaiBorwein(1e-6))
     assert tally.status == Status.ok and tally.loaded_contacts >= GRAINS / 2
     np.testing.assert_allclose(after.velocities, 0, atol=1e-5)
 
@@ -148,7 +144,7 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     masses = np.where(np.arange(GRAINS) % 2, heaviest, 1.0)
     grains = Grains(jnp.asarray(np.full(GRAINS, 0.5)), jnp.asarray(masses))
     state = State(grains, *(jnp.asarray(x, float) for x in (places, velocities, 60.0, 0.0)))
-    flow, solver = of(0.01, 0.0, shear_rate=0.0), BarzilaiBorwein(1e-9, 10**6)
+    flow, solver = flow_of(0.01, restitution=0.0, shear_rate=0.0), BarzilaiBorwein(1e-9, 10**6)
     ours, plain = native_run(flow, state, 1, solver), run(flow, state, 1, solver=solver)
     assert ours[1].status == plain[1].status == Status.ok
     assert ours[1].iterations > cluster_solver.SWEEPS
@@ -186,7 +182,7 @@ def _forget() -> None:
 
 def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
     """And says that the engine is experimental."""
-    flow, state = of(0.6), flowing(0.6)
+    flow, state = flow_of(0.6), flowing(0.6)
     with pytest.warns(UserWarning, match="pallas, which is experimental"):
         assert select_engine(flow, Numerics(engine=Pallas()), state) == Pallas()
     assert select_engine(flow, Numerics(), state) == Pallas()
@@ -222,7 +218,7 @@ def late(advance, flow, solver, state, steps):
 )
 def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, failure, said) -> None:
     gpu.setattr(kernel, "advance_by_pallas", partial(failure, kernel.advance_by_pallas))
-    flow, state = of(0.6), flowing(0.6)
+    flow, state = flow_of(0.6), flowing(0.6)
     with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
         assert select_engine(flow, Numerics(), state) == Jax()
     assert select_engine(flow, Numerics(), state) == Jax()  # and says so once
@@ -276,7 +272,7 @@ def grid_run():
 
 
 def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing, grid_run) -> None:
-    flow, state = of(0.78), flowing(0.78)
+    flow, state = flow_of(0.78), flowing(0.78)
     lost, steps = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan)), [40, 40, 0]
     after, tally = grid_run(flow, (state, lost, state), steps)
     assert tally.status.tolist() == [Status.ok, Status.nonfinite, Status.ok]
@@ -302,31 +298,18 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
         normal = np.array([np.cos(angle), np.sin(angle)])
         places[1], speeds[0] = places[0] + (1 - 1e-9) * normal, normal[::-1] * [-1, 1]
         state = State(grains, *(jnp.asarray(x, float) for x in (places, speeds, 40.0, 0.0)))
-        _, tally = native_run(of(0.03, shear_rate=0.0), state, 2)
+        _, tally = native_run(flow_of(0.03, shear_rate=0.0), state, 2)
         assert np.isfinite(tally.worst_residual)
         assert np.sum(tally.residual_counts) == tally.solves
 
 
 def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run, engines) -> None:
-    flow, state = of(0.7), flowing(0.7)
+    flow, state = flow_of(0.7), flowing(0.7)
     after, tally = jax.tree.map(lambda x: x[0], grid_run(flow, (state, state, state), [100, 0, 0]))
     expected, sums = engines["pallas"](flow, state, 100, LOOSE)
     assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
     np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
     np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
-
-
-def test_transformations_apply(flowing) -> None:
-    """To the bit; waves to the rounding of a cosine, which is that of a vector or that of a number."""
-    flow, states = of(0.6), [flowing(0.6, seed) for seed in (0, 1)]
-    batch = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    one = jax.jit(lambda state: advance_module.advance(flow, state, jnp.int32(50), solver=EXACT))
-    for many in (jax.vmap(one), lambda batch: jax.lax.map(one, batch)):
-        for k, found in enumerate(states):
-            (after, tally), (alone, sums) = jax.tree.map(lambda x, k=k: x[k], many(batch)), one(found)
-            np.testing.assert_allclose(tally.wave_kinetic, sums.wave_kinetic, rtol=4 * np.finfo(float).eps)
-            tally = replace(tally, wave_kinetic=sums.wave_kinetic)
-            jax.tree.map(np.testing.assert_array_equal, (after, tally), (alone, sums))
 
 
 @pytest.mark.parametrize("engine", [None, Numba()])
@@ -340,14 +323,14 @@ def test_derivatives_go_through_the_plain_advance(engine, flowing, monkeypatch) 
 
     @jax.jit
     def velocities(alpha):
-        flow = replace(of(0.6), restitution=alpha)
+        flow = replace(flow_of(0.6), restitution=alpha)
         return advance_module.advance(flow, state, jnp.int32(30), engine=engine)[0].velocities
 
     np.testing.assert_array_equal(jax.jvp(velocities, (0.5,), (1.0,))[1], state.velocities)
     assert not np.array_equal(velocities(0.5), 0.5 * state.velocities)
 
 
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(
     place=st.floats(-300, 308).map(lambda x: 10**x),
     speed=st.floats(-300, 308).map(lambda x: 10**x),
@@ -366,12 +349,12 @@ def test_senseless_states_come_to_an_end(native_run, place, speed, radius, mass,
         Grains(jnp.asarray(np.full(GRAINS, radius)), jnp.asarray(np.full(GRAINS, mass))),
         *(jnp.asarray(x, float) for x in arrays),
     )
-    after, tally = native_run(of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100))
+    after, tally = native_run(flow_of(0.6, shear_rate=shear_rate), state, 20, BarzilaiBorwein(1e-12, 100))
     if not np.all(np.isfinite(after.velocities)):
         assert tally.status == Status.nonfinite
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(
     fastest=st.floats(0.1, 10),
     distance=st.floats(0.8, 3),
@@ -398,7 +381,7 @@ def near_pairs_found():
         return numba.njit(cache=True)(find_near_pairs.py_func)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(
     count=st.integers(16, 300),
     packing_fraction=st.floats(0.05, 0.8),

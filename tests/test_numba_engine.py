@@ -25,7 +25,7 @@ def copy(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def of_copy(copy: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def of_copy(copy: Path, monkeypatch) -> Path:
     """The same folder, where the numba engine now finds its sources."""
     monkeypatch.setattr(ffi, "__file__", str(copy / Path(ffi.__file__).relative_to(PACKAGE.parent)))
     return copy
@@ -44,7 +44,7 @@ def test_any_change_of_any_source_gives_the_machine_code_another_file(of_copy: P
     assert compiled_here and compiled_here | imported <= set(sources)
 
 
-def test_another_compiler_or_processor_has_another_file(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_compiler_or_processor_has_another_file(monkeypatch) -> None:
     kept = {ffi.object_file()}
     for module, name, value in (
         (ffi, "version", lambda _: "0.0.1"),
@@ -103,7 +103,7 @@ def test_the_handler_reads_the_call_frame_where_this_jaxlib_has_it() -> None:
     )
 
 
-def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monkeypatch) -> None:
     def refuse(name: str, *_: object, **__: object) -> None:
         raise jax.errors.JaxRuntimeError(f"handler registration for {name} failed")
 

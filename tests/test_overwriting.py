@@ -33,7 +33,7 @@ def made_up_maps(patch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(autouse=True)
-def made_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def made_up(monkeypatch) -> None:
     made_up_maps(monkeypatch)
 
 
@@ -59,7 +59,6 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     outcome = jaxgran(tmp_path, *MAP, "--strain", "9", "--grains", "64")
     assert_one_sentence(outcome)
     assert "--output 'jaxgran_map.nc' already exists and has a map with grains 256" in outcome.err
-    assert "'jaxgran_map.nc' already exists and has a map with grains 256 and not 64" in outcome.err
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
@@ -111,7 +110,7 @@ def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> N
     assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
 
 
-def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(
         ratio_map_module, "run_replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)})
     )
@@ -166,7 +165,7 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     assert files(tmp_path) == {file.name}
 
 
-def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
     first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
     outcome = jaxgran(tmp_path, *RUN)

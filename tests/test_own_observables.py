@@ -1,4 +1,4 @@
-"""A user's observables in a map are averaged like the built-in ones, survive an interruption, and change nothing."""
+"""A user's observables in a map are averaged like the built-in ones and survive an interruption."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import one_sentence
+from synthetic import refused
 
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba, Pallas
@@ -43,11 +43,6 @@ def observe(seen) -> dict:
 
 
 @pytest.fixture(scope="module")
-def plain() -> xr.DataTree:
-    return ratio_map(**MAP)
-
-
-@pytest.fixture(scope="module")
 def observed() -> xr.DataTree:
     return ratio_map(**MAP, observe=observe)
 
@@ -60,10 +55,6 @@ def assert_same_variables(data: xr.DataTree, other: xr.DataTree) -> None:
             if name == "tally":  # the sums of the user's observables are behind the others
                 there = there.isel(quantity=slice(variable.sizes["quantity"]))
             np.testing.assert_array_equal(there, variable, err_msg=f"{node.path} {name}")
-
-
-def test_observing_changes_no_bit_of_a_map(observed, plain) -> None:
-    assert_same_variables(observed, plain)
 
 
 def test_what_repeats_a_built_in_average_has_its_values_and_errors(observed) -> None:
@@ -87,7 +78,7 @@ def test_variables_have_the_dimensions_of_what_is_returned(observed) -> None:
 
 
 def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
-    observed, tmp_path, monkeypatch: pytest.MonkeyPatch
+    observed, tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr(journal, "SECONDS", 0.0)
     monkeypatch.setattr(checkpoint, "WRITING_SHARE", 1e9)
@@ -105,9 +96,8 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
         ratio_map(**MAP, observe=observe, output=output, progress=cut_off, workers=1)
     assert len(read_arrays(folder / "map.nc")[0]["keys"]) and list(folder.glob("journal-*"))
     for other in (None, lambda seen: {**observe(seen), "contacts_per_grain": jnp.sum(seen.impulses > 0) / GRAINS}):
-        with pytest.raises(InputError, match=r"has observe 'contacts_per_grain, own_stress: \w{16}', not ") as caught:
+        with refused(r"has observe 'contacts_per_grain, own_stress: \w{16}', not "):
             ratio_map(**MAP, observe=other, output=output, resume=True)
-        assert one_sentence(str(caught.value))
     steps: list[float] = []
     data = ratio_map(**MAP, observe=lambda seen: observe(seen), output=output, resume=True, progress=steps.append)
     sample_and_before = 2 * 4 * (3.2 + 0.5) / 1e-3
@@ -117,9 +107,8 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
     assert_same_variables(ratio_map(**MAP, observe=observe, output=output, resume=True), observed)
     with pytest.raises(InputError, match=r"has a map with observe 'contacts_per_grain, own_stress: .*' and not None"):
         ratio_map(**MAP, output=output, resume=True)
-    with pytest.raises(InputError, match="must be a function that is passed to `ratio_map`") as caught:
+    with refused("must be a function that is passed to `ratio_map`"):
         MapSettings(**choices_of(data))
-    assert one_sentence(str(caught.value))
 
 
 UNITS = {"own_stress": "m / t^2", "contacts_per_grain": "1"}
@@ -155,9 +144,8 @@ def test_units_are_labels_in_the_file_and_no_part_of_what_is_resumed(observed, t
     ],
 )
 def test_units_of_what_is_not_observed_are_refused_before_the_map_runs(units: Any, words: str) -> None:
-    with pytest.raises(InputError, match=words) as caught:
+    with refused(words):
         ratio_map(**MAP, observe=observe, observe_units=units)
-    assert one_sentence(str(caught.value))
     with pytest.raises(InputError, match="and there are none, not 'a'"):
         ratio_map(**MAP, observe_units={"a": "1"})
 
@@ -178,13 +166,9 @@ REFUSED = {
     for function, words in [
         (3, "must be a function that is passed to `ratio_map`, or None, not 3"),
         (lambda seen: seen.state.side, "must return a dictionary of numbers or arrays by name"),
-        (lambda _: {}, "a dictionary of numbers"),
-        (lambda _: {"a": {"b": 1.0}}, "must return a dictionary"),
-        (lambda _: {"a": "much"}, "must return real numbers, not 'much'"),
         (lambda seen: {"a": seen.impulses}, "must return sums over the contacts"),
         (lambda _: {"of all": 1.0}, "names without spaces and signs, not .'of all'."),
         (lambda _: {"pressure": 1.0}, "names that a map does not have, not 'pressure'"),
-        (lambda _: {"a": 1.0, "a_stderr": 1.0}, "names that a map does not have, not 'a_stderr'"),
         (lambda _: {"a": np.ones(2), "a_dim_0": 1.0}, "names that a map does not have, not 'a_dim_0'"),
     ]
 }
@@ -192,9 +176,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("words", REFUSED)
 def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None:
-    with pytest.raises(InputError, match=words) as caught:
+    with refused(words):
         ratio_map(**MAP, observe=REFUSED[words])
-    assert one_sentence(str(caught.value))
 
 
 def test_an_engine_that_cannot_observe_is_refused() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from listed import build, listed_pairs, move, pairs_within
+from oracles import build, listed_pairs, move, pairs_within
 
 from jaxgran.contact import near_pairs
 from jaxgran.contact.near_pairs import (
@@ -30,7 +30,7 @@ compiled_first = jax.jit(first_true, static_argnums=1)
 
 
 @pytest.mark.parametrize(("length", "size"), [(1, 3), (31, 8), (32, 40), (33, 5), (496, 96), (5000, 64)])
-@settings(max_examples=25, derandomize=True, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.01, 0.1, 0.5, 0.99, 1.0]))
 def test_first_true_entries(length, size, seed, density):
     mask = np.random.default_rng(seed).random(length) < density
@@ -47,7 +47,7 @@ def both_separations(hood: PairLists, side):
     return separations_now(listed, hood.frame), direct
 
 
-@pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0), (0.02, -0.02)])
+@pytest.mark.parametrize(("motion", "shear"), [(0.03, 0.02), (0.0, 0.05), (0.05, 0.0)])
 @pytest.mark.parametrize("packing_fraction", [0.2, 0.75])
 def test_valid_list_holds_every_touching_pair_under_motion_and_shear(packed, packing_fraction, motion, shear):
     """Random motion of every grain and shear over several remaps of the tilt, with the pairs of brute force."""

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from flows import GRAINS, flow_of
 
 import jaxgran as jg
 from benchmarks.paper_claims import deviation, impulses, quotient, ratios, snapshot, spread
@@ -12,7 +13,7 @@ from jaxgran.analysis.order import hexatic_order
 def test_half_of_the_mean_mass_is_the_reduced_mass_of_equal_grains_only() -> None:
     found = []
     for width in (0.0, 0.26):
-        flow = jg.ShearFlow(64, restitution=0.5, packing_fraction=0.6, timestep=1e-3, polydispersity=width)
+        flow = jg.ShearFlow(GRAINS, restitution=0.5, packing_fraction=0.6, timestep=1e-3, polydispersity=width)
         state = jg.prepare(flow, jax.random.key(0), equilibrate=4.0)
         _, sample = jg.sample(flow, state, 4.0, observe=impulses)
         value, _ = sample.observed(ratios)
@@ -22,10 +23,8 @@ def test_half_of_the_mean_mass_is_the_reduced_mass_of_equal_grains_only() -> Non
     assert abs(found[1] - 1) > 0.01
 
 
-def test_windows_of_a_sample_have_its_force_ratio_if_weighted_by_their_force() -> None:
-    flow = jg.ShearFlow(64, restitution=0.1, packing_fraction=0.75, timestep=1e-3)
-    state = jg.prepare(flow, jax.random.key(0), equilibrate=4.0)
-    _, sample = jg.sample(flow, state, 1.0, blocks=20)
+def test_windows_of_a_sample_have_its_force_ratio_if_weighted_by_their_force(flowing) -> None:
+    _, sample = jg.sample(flow_of(0.75, restitution=0.1), flowing(0.75), 1.0, blocks=20)
     found = spread(sample)
     ratio = np.asarray(sample.tally.impulse / sample.tally.binary_impulse)
     assert found["windows"] == 20

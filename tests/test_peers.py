@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.peers import front, jaxgran_itself, numba_rival
-from benchmarks.peers.problem import Discs, Flow, damping_ratio, overlaps
+from benchmarks.peers.problem import Discs, Flow, overlaps
 from jaxgran.model.state import State
 
 TIMESTEP = 1e-3
@@ -57,13 +57,6 @@ def test_momentum_is_conserved_while_the_cell_tilts_over(sheared: Discs) -> None
     assert (now.tilt - sheared.tilt - 2.25 + 0.5) % 1 == pytest.approx(0.5, abs=1e-9)
     assert 0 < stress.shear_stress < stress.pressure
     assert overlaps(now)[1] < 0.1
-
-
-def test_damping_of_a_spring_gives_the_restitution() -> None:
-    for restitution in (0.1, 0.5, 0.9):
-        zeta = damping_ratio(restitution)
-        assert math.exp(-math.pi * zeta / math.sqrt(1 - zeta**2)) == pytest.approx(restitution)
-    assert damping_ratio(1.0) == 0
 
 
 def test_overlaps_are_seen_across_the_sheared_boundary() -> None:

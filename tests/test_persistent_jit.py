@@ -14,7 +14,7 @@ from jaxgran.cache import persistent_jit
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch) -> Path:
     monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "programs")
     return tmp_path / "programs"
 
@@ -133,7 +133,7 @@ def test_threads_compile_a_program_once(folder: Path) -> None:
     assert len(traces) == 1
 
 
-def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(persistent_jit, "_folder", lambda: tmp_path / "file")
     with pytest.warns(UserWarning, match="compiled programs are not cached"):

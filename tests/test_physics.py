@@ -38,7 +38,7 @@ def energy(state: State) -> float:
     return kinetic_energy(state.grains.masses, state.velocities)
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.7, 1.0])
+@pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 def test_two_discs_rebound_with_the_coefficient_of_restitution(engine, engine_run, scene, restitution):
     """At random phases of the step, speeds, angles, sizes and offsets; the normal is that of the change itself."""
     rng = np.random.default_rng(int(10 * restitution))
@@ -80,7 +80,7 @@ POINTS = [(0.75, 1e-2), (0.6, 1e-3)]
 
 
 @pytest.mark.parametrize(("packing_fraction", "timestep"), POINTS)
-@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.9, 1.0])
+@pytest.mark.parametrize("restitution", [0.0, 0.9, 1.0])
 def test_no_step_gains_energy_and_elastic_steps_keep_it(engine_run, flowing, packing_fraction, timestep, restitution):
     """In the frame of the contacts: the fall of the peculiar energy and the work of the shear on the impulses."""
     state, flow = flowing(packing_fraction), flow_of(packing_fraction, restitution=restitution, timestep=timestep)

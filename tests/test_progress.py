@@ -1,12 +1,10 @@
 """Progress of a map: the share of its work that is done, and the time that the rest takes."""
 
-import re
 from typing import Any
 
 import numpy as np
 import pytest
 
-from jaxgran.cli.terminal import counted
 from jaxgran.maps.batches import predicted_cost
 from jaxgran.maps.parameters import MapParameters
 from jaxgran.maps.progress import Meter, progress
@@ -46,7 +44,7 @@ def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> N
     assert shares(meter) == ("1/2 points", f"{200 * cost:.0f} % done")
 
 
-def test_time_left_is_that_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_left_is_that_of_this_run(monkeypatch) -> None:
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     meter = Meter(SETTINGS, quiet=True)
@@ -56,7 +54,7 @@ def test_time_left_is_that_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert meter._line().endswith("0:01:00 left")
 
 
-def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch, capsys) -> None:
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
     with progress(SETTINGS, quiet=False) as meter:
@@ -64,12 +62,3 @@ def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch: pytest.Monk
             meter.advanced(Advance([(0, 0)], [1e-3], [100]))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4 and lines[0] == "0/2 points, compiling"
-
-
-def test_items_on_a_terminal_are_counted_in_whole_numbers(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes this stream for a terminal
-    assert list(counted([7, 8, 9], "frames")) == [7, 8, 9]
-    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err)
-    assert " 3/3 " in shown and ".0" not in shown

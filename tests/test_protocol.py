@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import assert_same_bits, replica
-from synthetic import one_sentence
+from synthetic import one_sentence, refused
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
 from jaxgran.sampling import steady_state, timestep
-from jaxgran.sampling.batch import advance_batch, for_replicas, reporting, stack
+from jaxgran.sampling.batch import advance_batch, reporting, stack
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import relative_error
 from jaxgran.sampling.steady_state import Batch, prepare, prepare_batch, sample_batch
@@ -60,14 +60,6 @@ def test_start_has_the_temperature_asked_for_and_no_momentum(keys) -> None:
     assert np.all(state.tilt == 0)
 
 
-def test_whole_numbers_become_real_ones_in_a_batch_of_flows() -> None:
-    flow = stack([ShearFlow(GRAINS, alpha, 0.6, TIMESTEP) for alpha in (0, 1)])
-    assert flow.restitution.dtype == flow.shear_rate.dtype == jnp.float64
-    numerics = for_replicas(Numerics(), 2)
-    assert (numerics.solver.tolerance.dtype, numerics.solver.max_steps.dtype) == (jnp.float64, jnp.int32)
-    np.testing.assert_array_equal(flow.restitution, [0.0, 1.0])
-
-
 def test_momentum_stays_zero_through_the_preparation(batch) -> None:
     masses, velocities = np.asarray(batch.state.grains.masses), np.asarray(batch.state.velocities)
     np.testing.assert_allclose(np.sum(masses[..., None] * velocities, axis=1), 0, atol=1e-10)
@@ -104,7 +96,7 @@ def test_after_the_last_chunk_noise_is_accepted_and_drift_is_not() -> None:
     assert not steady_state._is_level_noise(np.full(40, np.nan))
 
 
-def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch) -> None:
     rng, sheared = np.random.default_rng(3), []
 
     def chunk(batch: Batch, strain: np.ndarray, advance):
@@ -136,7 +128,7 @@ def test_shearing_ends_for_each_replica_when_it_is_steady(monkeypatch: pytest.Mo
     assert strain[0, 0] == 0.8  # a chunk is a quarter of the correlation strain
 
 
-def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch) -> None:
     record = []
 
     def sheared(batch: Batch, strain: np.ndarray, advance):
@@ -162,7 +154,7 @@ def test_time_steps_are_shortened_geometrically_to_the_one_asked_for(monkeypatch
 
 
 def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_others(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch,
 ) -> None:
     monkeypatch.setattr(steady_state, "RELAXATION_STRAIN", 0.02)
     monkeypatch.setattr(steady_state, "_SHORTENING_STRAIN", 0.02)
@@ -175,7 +167,7 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
         assert (together.strain[k], together.status[k]) == (alone.strain[0], alone.status[0])
 
 
-def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> None:
     """A jump before the sixth chunk is out of them after fifteen chunks; twelve are the fewest."""
     series = iter([5.0] * 5 + [0.001, -0.001] * 30)
     monkeypatch.setattr(steady_state, "_chunk", lambda batch, *_: (batch, None))
@@ -201,7 +193,7 @@ def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     assert coarse[1] == 2e-2
 
 
-@pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.3, 0.95), (0.85, 0.4), (0.7, 0.8)])
+@pytest.mark.parametrize("alphas", [(0.5, 0.9), (0.85, 0.4)])
 def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple[float, float]) -> None:
     flow = replace(with_timesteps(0.1, 0.1), restitution=jnp.asarray(alphas), packing_fraction=jnp.full(2, 0.4))
     theory = predicted(flow)
@@ -215,18 +207,6 @@ def test_a_time_step_too_long_is_a_sentence_that_names_the_longest(alphas: tuple
     crossed = longest * np.sqrt(2 * np.max(np.asarray(theory.granular_temperature)))  # at thermal speed
     assert 0.09 < crossed <= 0.1
     check_timestep(replace(flow, timestep=jnp.full(2, longest)), theory)
-
-
-def test_prepare_refuses_a_time_step_too_long_for_its_flow() -> None:
-    with pytest.raises(ValueError, match="timestep must be at most"):
-        prepare(replace(FLOWS[1], timestep=0.08), jax.random.key(0))
-
-
-def test_prepare_raises_on_a_bad_status(batch, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = batch._replace(status=np.array([Status.not_steady]))
-    monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
-    with pytest.raises(RuntimeError, match="not_steady"):
-        prepare(FLOWS[0], jax.random.key(0))
 
 
 def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
@@ -260,12 +240,11 @@ def test_prepare_of_many_keys_gives_the_state_of_each(batch, keys) -> None:
 )
 def test_keys_that_do_not_suit_the_flow_are_one_sentence(flow: ShearFlow, count, words: str) -> None:
     key = jax.random.key(0) if count is None else jax.random.split(jax.random.key(0), count)
-    with pytest.raises(InputError, match=f"^{words}") as refused:
+    with refused(f"^{words}"):
         prepare(flow, key)
-    assert one_sentence(str(refused.value))
 
 
-def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prepare_names_the_replicas_that_failed(batch, keys, monkeypatch) -> None:
     bad = batch._replace(status=np.array([Status.ok, Status.not_steady]))
     monkeypatch.setattr(steady_state, "prepare_batch", lambda *_, **__: bad)
     with pytest.raises(RuntimeError, match=r"^not all replicas could be prepared: 1 \(not_steady\)\.$"):
@@ -325,7 +304,7 @@ def test_report_is_told_every_replica_step(batch) -> None:
     assert sum(told) == 2 * round(1.6 / TIMESTEP)
 
 
-def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, monkeypatch) -> None:
     monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.5)
     monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
     ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.array([0.2, 0.4]))

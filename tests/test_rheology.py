@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from made_up_maps import FRACTION, FRICTION, dense_map, power
-from synthetic import one_sentence
+from synthetic import refused
 
 from jaxgran.inference import friction_law as module
 from jaxgran.inference.friction_law import FrictionLaw, dense_points, friction_law
@@ -25,9 +25,7 @@ def test_law_without_noise_is_found() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.9, -0.9])
-def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(
-    correlation: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parameters_lie_within_a_standard_error_as_often_as_gaussian_ones(correlation: float, monkeypatch) -> None:
     """Of all points; laws of each restitution are left out, as they take three times as long."""
     monkeypatch.setattr(module, "enough", lambda points: len(np.unique(points.restitution)) > 1)
     seeds = 40
@@ -54,12 +52,6 @@ def test_variance_of_a_point_is_that_of_friction_and_of_inertial_number_times_sq
     power_of = number ** FRICTION[2]
     slopes = np.stack([np.ones_like(number), power_of, FRICTION[1] * power_of * np.log(number)]) / deviation
     np.testing.assert_allclose(law.covariance, np.linalg.inv(slopes @ slopes.T), rtol=1e-3)
-
-
-def test_a_map_that_does_not_know_the_correlation_of_its_errors_is_fitted_without_it() -> None:
-    data = dense_map()
-    old = fit(data.drop_vars("diagnostics/friction_error_correlation"))
-    np.testing.assert_array_equal(old.friction.parameters, fit(data).friction.parameters)
 
 
 def test_each_restitution_has_its_own_law() -> None:
@@ -106,9 +98,8 @@ def test_hot_dilute_flows_are_not_dense() -> None:
 
 @pytest.mark.parametrize(("alphas", "nus"), [((0.2,), 3), ((0.1, 0.2, 0.3, 0.4, 0.5), 2)])
 def test_too_few_points_are_refused(alphas: tuple[float, ...], nus: int) -> None:
-    with pytest.raises(ValueError, match=rf"at least 4 points .* has {len(alphas) * nus} at {nus}\.$") as caught:
+    with refused(rf"at least 4 points .* has {len(alphas) * nus} at {nus}\.$"):
         fit(dense_map(alphas=alphas, nus=nus))
-    assert one_sentence(str(caught.value))
 
 
 def test_falling_friction_does_not_determine_a_law() -> None:
@@ -118,7 +109,7 @@ def test_falling_friction_does_not_determine_a_law() -> None:
     assert np.isinf(law.standard_errors).all()
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(0, 8, 2))
 def test_points_without_a_law_are_fitted_without_complaint(seed: int) -> None:
     random = np.random.default_rng(seed)
     data = dense_map(alphas=(0.5,), nus=5)

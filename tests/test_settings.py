@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic import one_sentence
+from synthetic import one_sentence, refused
 
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
@@ -29,30 +29,18 @@ GOOD: dict[str, Any] = {
 
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"restitution": (-0.1, 0.5)}, "between 0 and 1"),
-    ({"restitution": (float("nan"),)}, "between 0 and 1"),
     ({"restitution": (0.5, 0.9, 0.5)}, r"must be a list without repetition, in any order, not \[0.5, 0.9, 0.5\]"),
     ({"restitution": ((0.1, 0.5), (0.7, 0.9))}, "a list of numbers"),
-    ({"packing_fraction": (0.0, 0.5)}, "above 0 and at most 0.83"),
     ({"grains": 15}, "at least 16"),
-    ({"grains": 64.0}, "a whole number"),
     ({"grains": (64, 64)}, "without repetition"),
-    ({"grains": ("many",)}, "a list of numbers"),
-    ({"grains": (64, 10**8)}, "at most 10000000"),
     ({"grains": [64, 256]}, "a whole number"),  # a list is for ratio_map; settings are tuples
     ({"seeds": 0}, "at least 1"),
     ({"first_seed": -1}, "at least 0"),
-    ({"seeds": True}, "a whole number"),
-    ({"timestep": 0.0}, "a positive number"),
-    ({"timestep": 0.2}, "at most 0.1"),
     ({"timestep": 5e-3}, "at most .* at restitution 0.9 and packing fraction 0.6"),
-    ({"timestep": (1e-3, 5e-3)}, "at most"),
-    ({"strain": float("inf")}, "a positive number"),
-    ({"strain": 0.1}, "at least 160 time steps"),
     ({"strain": 0.1, "timestep": (1e-4, 1e-3)}, "at least 160 time steps, that is 0.16"),
     ({"error": 0.0}, "between 1e-3 and 0.5"),
     ({"equilibrate": -1.0}, "at least 0"),
     ({"solver": "gauss"}, "a ProjectedMethod, such as"),
-    ({"activation": "always"}, "midpoint or touching"),
     ({"snapshots": 1}, "True or False"),
     ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\), jg.Pallas\(\) or None"),
     ({"engine": Pallas()}, "on a CPU, not pallas: it is made for NVIDIA GPUs"),
@@ -87,10 +75,6 @@ def test_flows_are_the_points_packing_fraction_first() -> None:
     assert points == [(0.5, 0.7), (0.6, 0.7)]
     for flow in settings.flows():
         assert (flow.grains, flow.timestep, flow.activation) == (64, 1e-3, "touching")
-
-
-def test_numbers_of_numpy_are_accepted() -> None:
-    MapSettings(**{**GOOD, "grains": np.int64(64), "seeds": np.int32(1), "timestep": np.float64(1e-3)})
 
 
 def test_grains_and_time_step_are_axes_where_they_are_lists_and_then_the_slowest() -> None:
@@ -128,9 +112,8 @@ def test_each_point_has_its_own_automatic_time_step_which_is_that_of_its_own_map
 @pytest.mark.parametrize("wrong", [(1e-3,), 1e-3, (1e-3, -1.0), (1e-3, 5e-3)])
 def test_time_steps_by_point_are_one_for_each_and_short_enough(wrong: Any) -> None:
     assert [flow.timestep for flow in chosen(**GOOD, timestep_by_point=(1e-3, 1e-4))[0].flows()] == [1e-3, 1e-4]
-    with pytest.raises(InputError, match="timestep") as caught:
+    with refused("timestep"):
         chosen(**GOOD, timestep_by_point=wrong)
-    assert one_sentence(str(caught.value))
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
@@ -203,9 +186,8 @@ def test_the_command_and_the_function_start_alike() -> None:
         {"from_map": 3},
         {"from_map": "no.nc"},
     ):
-        with pytest.raises(InputError) as caught:
+        with refused():
             with_start(wrong)
-        assert one_sentence(str(caught.value))
 
 
 def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
@@ -218,15 +200,9 @@ def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
     assert settings.timestep_by_point is None  # so that the force ratios of its points compare
 
 
-def test_automatic_grains_require_an_error() -> None:
-    with pytest.raises(InputError, match="`grains='auto'` requires `error`"):
-        chosen(restitution=(0.5,), packing_fraction=(0.6,), grains="auto")
-
-
 def test_an_error_that_needs_too_many_grains_names_the_smallest_one() -> None:
     given = {"restitution": (0.2,), "packing_fraction": (0.6,), "grains": "auto"}
-    with pytest.raises(InputError, match="error must be at least") as caught:
+    with refused("error must be at least") as caught:
         chosen(**given, error=1e-3)
-    assert one_sentence(str(caught.value))
     least = float(str(caught.value).split("at least ")[1].split()[0])
     assert chosen(**given, error=least)[0].grains <= MAX_GRAINS

@@ -1,34 +1,18 @@
 """Contact solvers side by side: problems as others pose them, what is judged and counted, and the figure."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
+from test_collection import entry_of
 
 from benchmarks import networks
 from benchmarks.collection import Entry
-from benchmarks.collection.certificates import delassus, obstructed, solved
+from benchmarks.collection.certificates import delassus
 from benchmarks.collection.compare import Answer
 from benchmarks.collection.problems import compact
-from benchmarks.exact_contacts import certified_impulses
-from benchmarks.exact_contacts import incidence as dense_incidence
-from benchmarks.networks import Network
 from benchmarks.solvers import measure
 from benchmarks.solvers.forms import program_of, weighted
 from benchmarks.solvers.measure import TARGETS, run_solvers
-from benchmarks.solvers.roster import Solver, our_solvers
-
-RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
-
-
-def entry_of(name: str, network: Network) -> Entry:
-    problem, used = compact(network.contacts, network.masses), np.asarray(network.contacts.used)
-    g = dense_incidence(network.contacts, network.grains)[used] / np.repeat(np.sqrt(network.masses), 2)
-    guess = certified_impulses(g, np.asarray(network.contacts.approach)[used])
-    solution = obstructed(problem) if guess is None else solved(problem, guess)
-    assert solution is not None and solution.feasible == network.feasible
-    return Entry(name, name, name, problem, solution)
+from benchmarks.solvers.roster import Solver
 
 
 @pytest.fixture(scope="module")
@@ -89,19 +73,3 @@ def test_failures_are_missed_slow_or_skipped(entries, monkeypatch):
 def networks_problem(discs: int):
     network = networks.chain(discs)
     return compact(network.contacts, network.masses)
-
-
-def test_committed_solutions_of_ours_agree_with_those_of_package_solvers():
-    results = json.loads((RESULTS / "solvers.json").read_text())
-    packages = set(results["settings"]) - set(our_solvers())
-    assert len(packages) == 7 and {"pin", "proxsuite", "osqp", "clarabel", "piqp", "scipy"} <= set(results["packages"])
-    for ours in ("numba engine", "barzilai-borwein"):
-        pairs = {
-            name: pair
-            for pair in results["agreement"]
-            for name in pair["solvers"]
-            if ours in pair["solvers"] and name in packages
-        }
-        assert len(pairs) >= 5
-        assert sum(pair["problems"] >= 150 for pair in pairs.values()) >= 3
-        assert all(pair["largest_difference"] <= 1e-6 for pair in pairs.values())

@@ -37,7 +37,7 @@ def ar1(rng: np.random.Generator, shape: tuple[int, int], correlation: float) ->
     return series
 
 
-def test_error_of_a_mean_is_the_textbook_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_mean_is_the_textbook_one(monkeypatch) -> None:
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (1,))
     over = np.random.default_rng(0).normal(size=(3, 8))
     value, error = jackknife(ratio, {"over": over, "under": np.ones((3, 8))})
@@ -46,7 +46,7 @@ def test_error_of_a_mean_is_the_textbook_one(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("merge", statistics.BLOCK_MERGES)
-def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkeypatch) -> None:
     # Var R = Var(x − R y) / (n ⟨y⟩²); here x − R y has the standard deviation 2, and ⟨y⟩ = 10.
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
     rng, seeds, blocks = np.random.default_rng(1), 4, 32
@@ -56,7 +56,7 @@ def test_error_of_a_ratio_of_sums_is_that_of_the_delta_method(merge: int, monkey
 
 
 def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlation_asks(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch,
 ) -> None:
     # A mean of four values of an AR(1) process with ρ = ½ has (4 + 6ρ + 4ρ² + 2ρ³)/4 times the variance of white noise.
     rng = np.random.default_rng(3)
@@ -70,7 +70,7 @@ def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlati
     assert mean_variance[4] / mean_variance[1] == pytest.approx(expected, rel=0.1)  # 4 % standard error
 
 
-def test_largest_error_of_all_merges_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
     sums = correlated_blocks(np.random.default_rng(4), 1, 16)
     all_merges = error_of_ratio(sums)
     single = []
@@ -80,7 +80,7 @@ def test_largest_error_of_all_merges_is_taken(monkeypatch: pytest.MonkeyPatch) -
     assert all_merges == max(single)
 
 
-def test_merged_blocks_never_span_two_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_merged_blocks_never_span_two_seeds(monkeypatch) -> None:
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (2,))
     over = np.random.default_rng(5).normal(size=(2, 5))
     error = error_of_ratio({"over": over, "under": np.ones_like(over)})
@@ -206,12 +206,6 @@ def test_errors_scale_with_the_values_and_do_not_see_their_origin_order_or_direc
     error = error_of_mean(values)
     assert error_of_mean(scale * (values + shift)) == pytest.approx(scale * error, rel=1e-6)
     assert error_of_mean(-values[::-1, ::-1]) == pytest.approx(error, rel=1e-6)
-
-
-def test_many_blocks_are_merged_to_thirty_two() -> None:
-    values = ar1(np.random.default_rng(12), (2, 64), 0.8)
-    pairs = values.reshape(2, 32, 2).mean(axis=2)
-    assert error_of_mean(values) == pytest.approx(error_of_mean(pairs), rel=1e-12)
 
 
 def test_standard_error_of_a_ratio_of_sums_is_the_spread_of_many_samples() -> None:

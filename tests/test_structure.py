@@ -21,7 +21,6 @@ from jaxgran.analysis.series import series
 from jaxgran.analysis.velocity_correlations import near_contact
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_series
-from jaxgran.model.cell import displacement, minimum_image
 from jaxgran.model.flow import ShearFlow
 
 
@@ -136,13 +135,6 @@ def test_a_crystal_has_full_hexatic_order_and_six_neighbours() -> None:
     found, left = coordination(snapshot_of(positions, side=side, radii=radii), tolerance=0.02), 6 * rows * columns - 12
     np.testing.assert_allclose(found.touching.value, left / (rows * columns))
     np.testing.assert_allclose(found.touching_without_rattlers.value, left / (rows * columns - 1))
-
-
-def test_minimum_image_is_that_of_the_cell() -> None:
-    to, origin = np.random.default_rng(4).uniform(-20, 20, (2, 500, 2))
-    for tilt in (-0.5, 0.2):
-        expected = displacement(to, origin, np.float64(7.0), np.float64(tilt))
-        np.testing.assert_allclose(minimum_image(to - origin, 7.0, tilt), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("change", ["wrapped", "moved", "tilted"])

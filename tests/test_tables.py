@@ -25,11 +25,6 @@ def printed(table: Table) -> str:
     return out.getvalue()
 
 
-def test_without_a_terminal_a_table_is_one_page() -> None:
-    rows = [line.split() for line in printed(MAP).splitlines() if line.split()[:1] == ["0.65"]]
-    assert [len(row) for row in rows] == [1 + 3 * len(RATIOS)]
-
-
 @pytest.mark.parametrize("width", [40, 80, 120])
 def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: int, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
@@ -41,18 +36,7 @@ def test_every_page_fits_the_terminal_names_its_rows_and_loses_nothing(width: in
         assert all(any(cell in row for row in rows) for cell in cells)
 
 
-def test_long_names_of_rows_take_two_lines_where_that_saves_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = [["Stresses"], ["granular temperature of small boxes", "1.00 ± 0.10", "m/t²"], ["pressure", "2", ""]]
-    table = Table("", ["observable", "value", "unit"], rows, numbers=False)
-    monkeypatch.setenv("COLUMNS", "48")
-    narrow = [line.strip() for line in printed(table).splitlines()]
-    assert any(line.startswith("granular temperature ") for line in narrow) and "of small boxes" in narrow
-    assert "Stresses" in narrow
-    monkeypatch.setenv("COLUMNS", "80")
-    assert "granular temperature of small boxes" in printed(table)
-
-
-def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_letters_that_a_terminal_lacks_are_written_in_others(monkeypatch) -> None:
     content = BytesIO()
     monkeypatch.setattr(sys, "stdout", TextIOWrapper(content, "ascii"))
     monkeypatch.setattr(sys, "stderr", StringIO())

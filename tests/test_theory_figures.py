@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from drawn import caption, contour_lines, legend_texts, write_without_drawing
+from drawn import caption, contour_lines, write_without_drawing
 from made_up_maps import dense_map, excess_of, ratio_dataset, with_timesteps
 from matplotlib.axes import Axes
 from matplotlib.contour import QuadContourSet
@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
 from jaxgran.plotting.enskog_factors import LENGTH_PANEL, PANELS, enskog_factors
-from jaxgran.plotting.friction import friction_figure, parameters_text
+from jaxgran.plotting.friction import friction_figure
 from jaxgran.plotting.map_figures import save_figures
+from jaxgran.plotting.ratio import ratio_contours, ratio_curves
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
 from jaxgran.sampling.enskog_factors import RATES
 
@@ -149,13 +150,6 @@ def test_contours_of_the_excess_lie_on_top_of_every_panel() -> None:
         for level, line in zip(EXCESS_LEVELS, lines, strict=True):
             x, nu = line.vertices.T
             np.testing.assert_allclose(excess_of(1.0 - x, nu), level, rtol=0.15)
-    assert [text for text in legend_texts(figure) if text[-4:].replace(".", "").isdigit()] == [
-        "excess 0.05",
-        "0.10",
-        "0.25",
-        "0.50",
-        "1.00",
-    ]
 
 
 def test_error_within_its_noise_is_dotted() -> None:
@@ -164,11 +158,8 @@ def test_error_within_its_noise_is_dotted() -> None:
     (dotted,) = noise(figure.axes[2])
     error = np.abs(closure_of(*dotted.T))
     assert error.max() == pytest.approx(STDERR)  # kinetic and binary stress vary together
-    assert "within ± std. error" in legend_texts(figure)
     exact = data.assign({name: 0.0 * data[name] for name in data if str(name).endswith("_stderr")})
-    figure = theory_errors(exact)
-    assert not any(noise(axes) for axes in figure.axes)
-    assert "within ± std. error" not in legend_texts(figure)
+    assert not any(noise(axes) for axes in theory_errors(exact).axes)
 
 
 def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> None:
@@ -181,8 +172,6 @@ def test_points_without_a_prediction_are_hatched_but_keep_the_collisions() -> No
         lines = [line.vertices for line in contour_lines(axes, "black").values() if len(line.vertices)]
         least = min(vertices[:, 0].min() for vertices in lines)
         assert (least >= edge - 1e-9) == bounded
-    assert "6 of 30 points without a value (hatched)" in caption(figure)
-    assert "no value" in legend_texts(figure)
 
 
 @pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
@@ -193,8 +182,6 @@ def test_bad_status_is_ringed_in_every_plane(draw) -> None:
     planes = [panel(figure, "m")] if draw is cluster_shares else figure.axes
     for axes in planes:
         np.testing.assert_allclose(rings(axes), [[1.0 - data.restitution[3], data.packing_fraction[2]]])
-    assert "status not ok" in legend_texts(figure)
-    assert "Status not ok: not steady (1)" in caption(figure)
 
 
 # ---------------------------------------------------------------------------------------------- factors
@@ -214,8 +201,7 @@ def test_factors_lie_on_their_isolines_and_are_dotted_within_their_error(rate) -
         assert len(contour_lines(axes, "#00803c")) == len(EXCESS_LEVELS)
         for dotted in noise(axes):
             assert abs(factor_of(k, *dotted.T)).max() < 1.001 * STDERR
-    assert noise(figure.axes[0]) and "within ± std. error" in legend_texts(figure)
-    assert RATES[rate].capitalize() in caption(figure)
+    assert noise(figure.axes[0])
 
 
 # -------------------------------------------------------------------------------------------- clusters
@@ -251,24 +237,6 @@ def test_share_of_the_pressure_lies_on_its_isolines() -> None:
     assert len(contour_lines(panel(figure, "m"), "#00803c")) == len(EXCESS_LEVELS)
 
 
-def test_excess_too_small_for_the_axis_is_counted() -> None:
-    data = theory_dataset()
-    data.force_ratio[0, :2] = [1.0, 0.999]
-    assert "2 of 30 points have an excess too small" in caption(cluster_shares(data))
-    assert "too small" not in caption(cluster_shares(theory_dataset()))
-    without = theory_dataset()
-    assert "30 of 30 points" in caption(cluster_shares(without.assign(force_ratio=without.force_ratio * 0 + 1)))
-
-
-@pytest.mark.parametrize(("alphas", "nus"), [(1, 6), (5, 1), (1, 1)])
-def test_line_of_points_has_shares_without_a_plane(alphas: int, nus: int) -> None:
-    data = theory_dataset(alphas, nus)
-    data.status[0, 0] = 1
-    figure = cluster_shares(data)
-    assert len(figure.axes) == 2
-    assert "status not ok" in legend_texts(figure)
-
-
 # -------------------------------------------------------------------------------------------- rheology
 
 
@@ -294,8 +262,6 @@ def test_laws_are_drawn_over_the_points_they_are_fitted_to() -> None:
             number = np.asarray(curve.get_xdata())
             np.testing.assert_allclose((number[0], number[-1]), part.span)
             np.testing.assert_allclose(curve.get_ydata(), part(number))
-        texts = [text.get_text() for text in axes.get_legend().get_texts()]
-        assert [text.split(":")[0] for text in texts] == ["0.2", "0.5", "all"]
 
 
 def test_points_that_no_law_is_fitted_to_are_open() -> None:
@@ -311,48 +277,30 @@ def test_points_that_no_law_is_fitted_to_are_open() -> None:
         for drawn, wanted in zip(shown, chosen, strict=True):
             np.testing.assert_allclose(drawn, wanted)
         np.testing.assert_allclose(rings(axes), [[float(v[-1, 0]) for v in expected]])
-    assert "status not ok" in legend_texts(figure)
-
-
-def test_legend_gives_parameters_with_their_errors() -> None:
-    law = friction_law(dense_dataset()).packing_fraction
-    offset, coefficient, exponent = law.parameters
-    text, chi_squared = parameters_text(law).rstrip(")").split(" (")
-    assert float(chi_squared) == pytest.approx(law.chi_squared, rel=0.05)
-    numbers = [part.split(" ± ") for part in text.split(", ")]
-    expected = zip((offset, -coefficient, exponent), law.standard_errors, strict=True)
-    for (value, error), (true, stderr) in zip(numbers, expected, strict=True):
-        assert float(value) == pytest.approx(true, abs=stderr / 2.0)
-        assert float(error) == pytest.approx(stderr, rel=0.35)
-
-
-def test_restitution_with_too_few_points_says_so() -> None:
-    data = dense_dataset(alphas=(0.2, 0.5, 0.8))
-    data.macroscopic_friction[2:, 1] = np.nan
-    texts = [text.get_text() for text in friction_figure(data).axes[0].get_legend().get_texts()]
-    assert [text.endswith("too few points") for text in texts] == [False, True, False, False]
 
 
 # --------------------------------------------------------------------------------------------- together
 
 
-@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares])
+@pytest.mark.parametrize("draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares])
 def test_map_without_any_value_is_drawn(draw) -> None:
     data = theory_dataset()
     empty = data.assign({name: np.nan * data[name] for name in data if name != "status"})
     figure = draw(empty)
     figure.canvas.draw()
-    assert all("no measured values" in [text.get_text() for text in axes.texts] for axes in figure.axes)
+    assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
 
 
-@pytest.mark.parametrize("draw", [theory_errors, enskog_factors, cluster_shares, friction_figure])
+@pytest.mark.parametrize(
+    "draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares, friction_figure]
+)
 def test_shortest_time_step_is_drawn(draw) -> None:
     data = dense_dataset() if draw is friction_figure else theory_dataset()
     several = with_timesteps(data, 3e-4, 1e-2)
     if draw is theory_errors:  # what a theory predicts has no time step
         several = several.assign({name: data[name] for name in ("theory/pressure", "theory/shear_stress")})
     figure, expected = draw(several), draw(data)
-    assert caption(figure) == caption(expected) and r"3\times 10^{-4}" in caption(figure)
+    assert caption(figure) == caption(expected)
     for axes, other in zip(figure.axes, expected.axes, strict=True):
         for line, same in zip(axes.lines, other.lines, strict=True):
             np.testing.assert_array_equal(line.get_xydata(), same.get_xydata())
@@ -374,7 +322,7 @@ def test_shortest_time_step_is_drawn(draw) -> None:
     ids=["all", "line", "no theory", "no factors", "dense", "few"],
 )
 def test_figures_are_written_where_the_map_has_their_data(
-    data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch
 ) -> None:
     write_without_drawing(monkeypatch)
     written = save_figures(data, tmp_path / "map")

@@ -45,10 +45,6 @@ def test_every_task_is_done_and_every_message_heard_by_the_caller(threads: int) 
     assert sorted(heard) == [(k, threading.current_thread()) for k in range(20)]
 
 
-def test_no_tasks_need_no_threads() -> None:
-    assert list(in_threads(print, [], 2, print)) == []
-
-
 def test_as_many_tasks_run_at_a_time_as_there_are_threads() -> None:
     meeting = threading.Barrier(3, timeout=10)
     assert len(list(in_threads(lambda _: meeting.wait(), [()] * 6, 3, print))) == 6

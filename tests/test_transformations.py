@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from flows import GRAINS, flow_of
 from made_up_maps import known_closure
-from synthetic import one_sentence, snapshot_of
+from synthetic import refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.checks import InputError
@@ -139,9 +139,8 @@ WAYS = {
 def test_reverse_mode_without_a_length_is_refused_at_once(name: str, way: str, state: State) -> None:
     """Tracing the loop with its tangents takes ten times as long."""
     began = time.process_time()
-    with pytest.raises(InputError, match=r"in reverse mode \(jax.grad, jax.vjp\)") as refused:
+    with refused(r"in reverse mode \(jax.grad, jax.vjp\)"):
         WAYS[way](lambda x: total(TRANSFORMED[name](x, state)))(X)
-    assert one_sentence(str(refused.value))
     assert time.process_time() - began < 5
 
 
@@ -153,9 +152,8 @@ def test_reverse_mode_without_a_length_is_refused_at_once(name: str, way: str, s
     ],
 )
 def test_what_computes_in_python_says_so(name: str, transformed: Callable, state: State) -> None:
-    with pytest.raises(InputError) as refused:
+    with refused():
         transformed(lambda x: REFUSED[name](x, state))(X)
-    assert one_sentence(str(refused.value))
 
 
 def test_prepare_within_jit_says_so_whatever_it_is_given() -> None:
