@@ -21,7 +21,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.plotting.drawing import LABEL_SIZE, empty_figure
+from jaxgran.plotting.drawing import LABEL_SIZE, TWO_COLUMNS, empty_figure
 from jaxgran.plotting.flow import Colour, Scene, common_scale, draw_picture, scene_of
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
@@ -48,7 +48,7 @@ def run(output: Output, colour: Colour = "speed") -> None:
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
-    output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow", dpi=200)
+    output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow")
     film = str(output.path("flow", ".gif"))
     subprocess.run([sys.executable, "-m", "jaxgran", *FILM.split(), film, "--overwrite"], check=True)
 
@@ -78,7 +78,7 @@ def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
 
 def draw(scenes: list[Scene], colour: Colour):
     """The flows beside each other, each in its own scale."""
-    figure = empty_figure(11.0, 5.2)
+    figure = empty_figure(TWO_COLUMNS, 3.6)
     for axes, scene, letter in zip(figure.subplots(1, len(scenes)), scenes, "ab", strict=True):
         draw_picture(axes, scene, colour, common_scale([scene], colour))
         axes.text(0.0, 1.02, f"({letter})", transform=axes.transAxes, fontsize=LABEL_SIZE, weight="bold")
