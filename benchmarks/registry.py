@@ -138,13 +138,21 @@ BENCHMARKS = (
         "fields_picture",
         "What do the coarse-grained fields of a dense flow look like?",
         (1.5, 0.5),
-        ("fields.png",),
+        ("fields.json", "fields.png"),
+        one_core=True,
     ),
     Benchmark(
         "collapse",
         "What does a time step do to an inelastic collapse of three and four discs?",
         (1, 0.4),
         ("collapse.json", "collapse.png"),
+        one_core=True,
+    ),
+    Benchmark(
+        "pulse",
+        "What does a loose contact solve do to a packing that is pushed at one side?",
+        (2, 0.3),
+        ("pulse.json", "pulse.png"),
         one_core=True,
     ),
     Benchmark(

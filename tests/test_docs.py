@@ -133,9 +133,11 @@ def test_examples_of_docstrings_hold(module: str) -> None:
     assert outcome.failed == 0
 
 
-def test_readme_is_that_of_the_results() -> None:
-    """``python -m benchmarks.pages`` makes it anew."""
-    assert (ROOT / "README.md").read_text(encoding="utf-8") == pages.filled(pages.README.read_text(encoding="utf-8"))
+@pytest.mark.parametrize("page", pages.TEMPLATES)
+def test_readme_and_paper_are_those_of_the_results(page: str) -> None:
+    """``python -m benchmarks.pages`` makes them anew."""
+    written, template = ((ROOT / name).read_text(encoding="utf-8") for name in (page, pages.TEMPLATES[page]))
+    assert written == pages.filled(template)
 
 
 def test_readme_is_short_and_its_links_lead_somewhere() -> None:

@@ -60,7 +60,7 @@ def dominating_errors(data: MapData) -> Figure:
     data = require_map(data, *RATIO, *_NEEDED)
     data = finest(ordered(data, *_NEEDED))
     x, y = np.meshgrid(1 - data.restitution.values, data.packing_fraction.values)
-    figure = empty_figure(TWO_COLUMNS, height=3.7)
+    figure = empty_figure(TWO_COLUMNS, height=4.4)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)
     for axes, (name, title) in zip(panels, _PANELS.items(), strict=True):
         parts = relative_ci95(data, name)
