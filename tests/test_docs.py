@@ -104,6 +104,8 @@ def test_measured_numbers_of_a_page_come_from_files(page: str) -> None:
     assert "{%" not in filled and "{{" not in filled
     written = re.sub(r"{{.*?}}|{%.*?%}", "", text)  # what remains was typed
     assert not re.search(r"\d ± \d|[−+]\d[\d.]* %", written)
+    if page.startswith("benchmarks/") or page == "comparison.md":
+        assert not re.findall(r"\S*\d (?:%|ns|µs|ms|s|KiB|MiB|MB|GiB|times)(?!\w)", written)
 
 
 def test_a_changed_result_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
