@@ -10,7 +10,7 @@ by a power of its time.
 First the event-driven program itself, at t_c = 0 and N = 1000, is compared with the values of another one that
 ``validation`` has.
 
-    python -m benchmarks contact_duration           # 10 minutes on two cores
+    python -m benchmarks contact_duration           # 19 minutes on two cores
     python -m benchmarks contact_duration --quick   # one flow of 64 grains, under a minute
 """
 

@@ -158,7 +158,7 @@ BENCHMARKS = (
     Benchmark(
         "contact_duration",
         "Is a time step a duration of contact of event-driven discs?",
-        (10, 1),
+        (19, 1),
         ("contact_duration.json", "contact_duration.png"),
     ),
     Benchmark(
@@ -199,7 +199,7 @@ BENCHMARKS = (
     Benchmark(
         "speed_vs_accuracy",
         "What does accuracy cost in a whole run?",
-        (20, 1),
+        (11, 1),
         ("speed_vs_accuracy.json", "speed_vs_accuracy.png"),
         one_core=True,
     ),
@@ -215,7 +215,7 @@ BENCHMARKS = (
     Benchmark(
         "solvers",
         "Which contact solver is best where, this program's or one of another package?",
-        (10, 2),
+        (8.5, 2),
         ("solvers.json",),
         one_core=True,
         module="solvers.run",
@@ -229,7 +229,7 @@ BENCHMARKS = (
     Benchmark(
         "timestep_study",
         "What becomes of the force ratio as the time step vanishes?",
-        (25, 1),
+        (23, 1),
         ("timestep_study.json", "timestep_study.png"),
         one_core=True,
     ),

@@ -6,7 +6,7 @@ run longest. A force ratio belongs to its time step and rule, so its reference i
 time step and rule: its error is that of the solver alone. The figure shows the results of ``peers`` too; it is drawn by
 ``python -m benchmarks draw speed_vs_accuracy``.
 
-    python -m benchmarks speed_vs_accuracy           # 20 minutes on two cores
+    python -m benchmarks speed_vs_accuracy           # 11 minutes on two cores
     python -m benchmarks speed_vs_accuracy --quick   # one flow of 64 grains, a minute
 """
 

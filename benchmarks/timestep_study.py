@@ -9,7 +9,7 @@ of both, by L + A dt^β with one limit L and an amplitude and an exponent for ea
 exceeds its minimum by no more than its value per degree of freedom (at least one), joined over fits that take in one
 time step less and one more.
 
-    python -m benchmarks timestep_study           # about 15 minutes on two cores
+    python -m benchmarks timestep_study           # about 23 minutes on two cores
     python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
 """
 

@@ -1,6 +1,6 @@
 """Contact solvers side by side: this program's and those of other packages, on the collection of contact problems.
 
-python -m benchmarks solvers          # about 10 minutes
+python -m benchmarks solvers          # about 9 minutes
 python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
 
 The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's solvers are compared
