@@ -36,7 +36,7 @@ FILE_DPI = 200  # dots per inch of a picture, unless another number is given
 LABEL_SIZE = 8.0  # points, font of the labels of axes
 TICK_SIZE = 7.5  # points, font of the numbers at the ticks
 SMALL_SIZE = 7.0  # points, font of legends and captions
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": LABEL_SIZE,
     "axes.labelsize": LABEL_SIZE,
     "axes.titlesize": LABEL_SIZE,
@@ -62,7 +62,8 @@ ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 _CAPTION = "caption"  # id of the text under the axes
 _MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
 _NARROW = 4  # largest over smallest value at and below which numbers have equal steps
