@@ -21,6 +21,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.name is None:
         print("\n".join(map(listing, BENCHMARKS)))
         return
+    if chosen.name == "draw":
+        from benchmarks.draw import redraw
+
+        redraw(chosen.pictures, chosen.output)
+        return
     benchmark = next((one for one in BENCHMARKS if one.name == chosen.name), None)
     set_up(benchmark is not None and benchmark.one_core)
     from benchmarks.output import Output, refusal
@@ -84,6 +89,10 @@ def parser() -> argparse.ArgumentParser:
     )
     about = "run all of them, one after the other; a second call goes on where the first one ended"
     names.add_parser("all", parents=[shared], help=about, description=about)
+    about = "draw the figures of the committed results again, without a measurement"
+    draw = names.add_parser("draw", help=about, description=about)
+    draw.add_argument("pictures", nargs="*", metavar="PICTURE", help="name without .png [default: all]")
+    draw.add_argument("--output", type=Path, default=default, help="folder [default: benchmarks/results]")
     for benchmark in BENCHMARKS:
         one = names.add_parser(
             benchmark.name,

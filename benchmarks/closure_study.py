@@ -13,13 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter, PercentFormatter, StrMethodFormatter
 
 import jaxgran as jg
 from benchmarks.output import Output, rounded
 from jaxgran.environment import usable_cores
-from jaxgran.inference.closure import LAWS
 from jaxgran.inference.cross_validation import leave_one_out
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.results import open_map
@@ -27,13 +24,12 @@ from jaxgran.maps.results import open_map
 SMALLER = {"grains": 64, "seeds": 1, "strain": 20.0}
 NAMES = ("pressure", "shear_stress", "force_ratio")
 TARGETS = {"pressure": 0.05, "force_ratio": 0.08}
-STYLES = (("0.0", "o"), ("0.2", "s"), ("0.4", "^"), ("0.5", "D"), ("0.6", "v"))  # of the restitutions, in turn
 
 
 def run(output: Output, dataset: Path | None = None) -> None:
-    """Fit, leave out, print, and write JSON and PNG; of a dataset of a map, or of one that is made."""
+    """Fit, leave out, print, and write JSON; of a dataset of a map, or of one that is made."""
     data = make_map(output.quick) if dataset is None else open_map(dataset)
-    errors, closure = leave_one_out(data), jg.fit_closure(data)
+    errors = leave_one_out(data)
     summary = {name: error_summary(errors, name) for name in NAMES} | {"restitution": restitution_summary(errors)}
     print("relative errors of points left out, in percent")
     print("               rms   inside     edge  largest  noise of a point   pulls   target")
@@ -48,9 +44,7 @@ def run(output: Output, dataset: Path | None = None) -> None:
         print("  α = {restitution:4.2f}   {rms:6.3f}   {quoted:6.3f}".format(**row) + end)
     print(f"  pulls, rms: {summary['restitution']['pull']:.2f}")
     made_by = {k: str(v) for k, v in data.attrs.items()}
-    head = {"run": made_by, "closure": coefficients(closure), "summary": summary}
-    output.write_rows("closure", rounded(head, 5), "points", rounded(rows(data, errors), 5))
-    output.write_picture(draw(data, errors), "closure")
+    output.write_json("closure", rounded({"run": made_by, "summary": summary}, 5))
 
 
 def make_map(quick: bool) -> xr.Dataset:
@@ -96,77 +90,3 @@ def restitution_summary(errors: xr.Dataset) -> dict:
         "pull_inside_the_range": rms(pulls[:, inside.values]),
         "by_restitution": by_restitution,
     }
-
-
-def coefficients(closure: jg.Closure) -> dict:
-    """Coefficients of each law with standard errors, and its scatter."""
-    return {
-        name: {
-            "coefficients": np.asarray(law.coefficients).tolist(),
-            "standard_errors": np.sqrt(np.diag(law.covariance)).tolist(),
-            "scatter": float(law.scatter),
-        }
-        for name, law in ((name, getattr(closure, name)) for name in LAWS)
-    }
-
-
-def rows(data: xr.Dataset, errors: xr.Dataset) -> list[dict]:
-    """One row a point."""
-    return [
-        {
-            "restitution": float(alpha),
-            "packing_fraction": float(nu),
-            "edge": bool(errors.edge.sel(restitution=alpha, packing_fraction=nu)),
-            **{name: float(data[name].sel(restitution=alpha, packing_fraction=nu)) for name in NAMES},
-            **{
-                str(name): float(value.sel(restitution=alpha, packing_fraction=nu))
-                for name, value in errors.items()
-                if name != "edge"
-            },
-        }
-        for nu in errors.packing_fraction.values
-        for alpha in errors.restitution.values
-    ]
-
-
-def draw(data: xr.Dataset, errors: xr.Dataset) -> Figure:
-    """Predicted against measured pressure and force ratio, and under each the relative error with its expected size."""
-    figure = Figure(figsize=(9.0, 6.2), layout="constrained")
-    grid = figure.subplots(2, 2, sharex="col", height_ratios=(1.5, 1.0))
-    for (above, below), (name, label) in zip(
-        grid.T, {"pressure": r"pressure $P$ ($m\dot\gamma^2$)", "force_ratio": "force ratio"}.items(), strict=True
-    ):
-        ends = np.array([data[name].min() * 0.85, data[name].max() * 1.2])
-        above.plot(ends, ends, color="0.6", lw=0.8, zorder=1)
-        below.axhline(0, color="0.6", lw=0.8, zorder=1)
-        if name in TARGETS:
-            below.axhspan(-TARGETS[name], TARGETS[name], color="0.92", zorder=0)
-        for k, alpha in enumerate(errors.restitution.values):
-            grey, marker = STYLES[k % len(STYLES)]
-            here, seen = errors.sel(restitution=alpha), data[name].sel(restitution=alpha)
-            faces = ["white" if edge else grey for edge in here.edge.values]
-            style = {"marker": marker, "s": 26, "edgecolors": grey, "facecolors": faces, "zorder": 3}
-            above.scatter(seen, here[f"{name}_predicted"], **style)
-            below.errorbar(
-                seen, here[f"{name}_error"], here[f"{name}_stderr"], color=grey, ls="", elinewidth=0.8, capsize=2
-            )
-            below.scatter(seen, here[f"{name}_error"], **style)
-            above.scatter([], [], marker=marker, s=26, color=grey, label=f"α = {alpha:g}")
-        above.set(xscale="log", yscale="log", xlim=ends, ylim=ends, ylabel=f"{label}, predicted")
-        below.set(xlabel=f"{label}, measured", ylabel="predicted / measured − 1")
-        below.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        ticks = [t for t in (0.5, 1, 1.5, 2, 3, 5, 10, 20, 50) if ends[0] <= t <= ends[1]]
-        ticks = [t for t in ticks if t != 1.5 or ends[1] < 10]
-        above.set(xticks=ticks, yticks=ticks)
-        for axis in (above.xaxis, above.yaxis):
-            axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axis.set_minor_formatter(NullFormatter())
-        note = f"rms {100 * rms(errors[f'{name}_error'].values):.1f} %"
-        noise = f"noise of a point {100 * rms(errors[f'{name}_noise'].values):.1f} %"
-        above.text(0.97, 0.04, f"{note}\n{noise}", transform=above.transAxes, ha="right", va="bottom")
-    grid[0, 0].legend(fontsize="small", loc="upper left")
-    figure.suptitle(
-        "Every point predicted from the others. Open symbols: edge of the map; bars: expected error; grey band: target",
-        fontsize="medium",
-    )
-    return figure

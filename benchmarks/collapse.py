@@ -29,11 +29,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
+from jaxgran.plotting.drawing import RATIO_LABEL, TWO_COLUMNS, styled
 
 THRESHOLDS = {3: 7 - 4 * np.sqrt(3), 4: 3 - 2 * np.sqrt(2)}
 RESTITUTIONS = {3: (0.02, 0.04, 0.055, 0.08, 0.1, 0.2), 4: (0.05, 0.1, 0.13, 0.18, 0.2, 0.3)}
@@ -43,6 +43,10 @@ GRAINS, SIDE = 32, 20.0  # the discs that are not in the row rest elsewhere
 TIMESTEPS = 10.0 ** -np.arange(2, 8.25, 0.5)  # σ over the first speed
 COARSE, FINE = 1e-4, 3e-8  # time steps between which the laws of vanishing dt are measured
 LAWS = ("most_steps", "steps_per_decade", "exponent")  # what is measured above, and below the threshold
+TITLES = {
+    3: r"three discs, $r_\mathrm{c} = 7-4\sqrt{3} = 0.0718$",
+    4: r"four discs, symmetric, $r_\mathrm{c} = 3-2\sqrt{2} = 0.1716$",
+}
 LEAST = 1e-6  # smallest excess that is drawn
 MIDDLE = 7  # time step through which the lines of the exact slopes are drawn
 
@@ -171,9 +175,10 @@ def slopes(
     return (fine[0] - coarse[0]) / decades, np.log10(coarse[1] / fine[1]) / decades
 
 
+@styled
 def draw(rows: list[dict]) -> Figure:
     """Steps and excess against dt, a column for each number of discs; lines of the exact slopes below the threshold."""
-    figure = Figure(figsize=(10.5, 7.6), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 4.6), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True, sharey="row")
     for column, discs in enumerate(RESTITUTIONS):
         for k, one in enumerate(row for row in rows if row["discs"] == discs):
@@ -181,11 +186,10 @@ def draw(rows: list[dict]) -> Figure:
             style = {
                 "color": ("black", "tab:blue", "tab:red")[k % 3],
                 "marker": "osD"[k % 3],
-                "markersize": 4.5,
-                "capsize": 2,
+                "markersize": 3.5,
                 "markerfacecolor": None if collapses else "white",
                 "linestyle": "none" if collapses else ":",
-                "label": f"r = {one['restitution']:g}",
+                "label": rf"$r={one['restitution']:g}$",
             }
             steps, excess = np.array(one["steps"]), np.array(one["excess"])
             drawn = excess > LEAST
@@ -195,23 +199,15 @@ def draw(rows: list[dict]) -> Figure:
             if collapses:
                 exact = roots(discs, one["restitution"])
                 decades = np.log10(TIMESTEPS / TIMESTEPS[MIDDLE])
-                panels[0, column].plot(
-                    TIMESTEPS, steps[MIDDLE] - exact.steps_per_decade * decades, color=style["color"], linewidth=0.8
+                lines = (
+                    steps[MIDDLE] - exact.steps_per_decade * decades,
+                    excess[MIDDLE] * 10 ** (exact.exponent * decades),
                 )
-                power = excess[MIDDLE] * 10 ** (exact.exponent * decades)
-                panels[1, column].plot(TIMESTEPS, power, color=style["color"], linewidth=0.8)
-        name = {3: "three discs, r_c = 7 − 4√3 = 0.0718", 4: "four discs, symmetric, r_c = 3 − 2√2 = 0.1716"}[discs]
-        panels[0, column].set_title(name, fontsize="medium")
-        panels[0, column].legend(fontsize="small", ncols=2, title="filled: below r_c, open: above")
-        panels[1, column].set_xlabel("time step dt (σ over the first speed)")
-    dress(panels[0, 0], panels[1, 0])
+                for axes, line in zip(panels[:, column], lines, strict=True):
+                    axes.plot(TIMESTEPS, line, color=style["color"], linewidth=0.8)
+        panels[0, column].set_title(TITLES[discs])
+        panels[0, column].legend(ncols=2, title=r"filled: below $r_\mathrm{c}$, open: above")
+        panels[1, column].set_xlabel(r"time step $\Delta t$ ($\sigma$ over the first speed)")
+    panels[0, 0].set(xscale="log", ylim=(0, 30), ylabel="steps with contacts")
+    panels[1, 0].set(yscale="log", ylim=(LEAST, 2), ylabel=f"excess of the {RATIO_LABEL} $- 1$")
     return figure
-
-
-def dress(steps: Axes, excess: Axes) -> None:
-    """Scales and labels, that panels share."""
-    steps.set(xscale="log", ylim=(0, 30), ylabel="steps with contacts (mean over starts)")
-    excess.set(yscale="log", ylim=(LEAST, 2), ylabel="excess of the force ratio, ⟨F⟩/⟨F_bc⟩ − 1")
-    steps.text(0.02, 0.02, "lines: exact slopes 1/log₁₀(λ₊/λ₋)", transform=steps.transAxes, fontsize="small")
-    style = {"transform": excess.transAxes, "fontsize": "small", "ha": "right"}
-    excess.text(0.98, 0.02, "lines: dt^β, exact exponents", **style)

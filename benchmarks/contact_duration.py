@@ -10,7 +10,7 @@ by a power of its time.
 First the event-driven program itself, at t_c = 0 and N = 1000, is compared with the values of another one that
 ``validation`` has.
 
-    python -m benchmarks contact_duration           # 10 minutes on two cores
+    python -m benchmarks contact_duration           # 19 minutes on two cores
     python -m benchmarks contact_duration --quick   # one flow of 64 grains, under a minute
 """
 
@@ -30,6 +30,7 @@ from benchmarks.output import Output
 from benchmarks.validation import EVENT_DRIVEN, OBSERVABLES
 from jaxgran.environment import usable_cores
 from jaxgran.maps.schema import path_of
+from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.statistics import standard_errors
 
 BLOCKS = 32  # of a sample, for its errors
@@ -89,7 +90,7 @@ def run(output: Output) -> None:
     head = {"plan": plan._asdict(), "wall_seconds": time.perf_counter() - start}
     head |= {"reference": reference, "matches": matches, "powers": powers, "event_driven": discs}
     output.write_rows("contact_duration", head, "jaxgran", grains)
-    output.write_picture(draw(discs, grains), "contact_duration", dpi=200)
+    output.write_picture(draw(discs, grains), "contact_duration")
 
 
 def event_driven(flow: Flow, runs: Runs, durations: tuple[float, ...]) -> list[dict]:
@@ -206,22 +207,23 @@ def report(reference: list[dict], matches: list[dict], powers: list[dict]) -> No
         print("ν {:4g}  α {:3g}".format(*some[0]["flow"]), *texts)
 
 
+@styled
 def draw(discs: list[dict], grains: list[dict]) -> Figure:
     """Pressure and collision rate of the flow that collapses most, against t_c of event-driven discs and dt here."""
-    figure = Figure(figsize=(6.7, 2.7), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 2.4), layout="constrained")
     flow = max((row["flow"] for row in grains), key=lambda flow: (flow[0], -flow[1]))
-    labels = {"pressure": r"pressure $p/m\dot\gamma^2$", "collision_rate": "collisions of a grain in a unit of strain"}
+    panels = {
+        "pressure": ("stresses agree", r"pressure $p$ ($m\dot\gamma^2$)"),
+        "collision_rate": ("collisions do not", r"collisions of a grain in a unit of strain"),
+    }
     sources = ((discs, r"event-driven, $t_\mathrm{c}$", "o:", "white"), (grains, r"jaxgran, $\Delta t$", "s-", "black"))
-    for axes, (name, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+    for axes, (name, (title, label)) in zip(figure.subplots(1, 2), panels.items(), strict=True):
         for rows, source, look, face in sources:
             here = [row for row in rows if row["flow"] == flow]
             value, error = np.array([row[name] for row in here]).T
-            times = [row["time"] for row in here]
-            axes.errorbar(times, value, error, fmt=look, color="black", mfc=face, ms=4.5, capsize=2, label=source)
-        axes.set(xscale="log", yscale="log" if name == "collision_rate" else "linear")
-        axes.set_xlabel(r"$t_\mathrm{c}$ or $\Delta t$ ($1/\dot\gamma$)", fontsize=9)
-        axes.set_ylabel(label, fontsize=8)
-        axes.tick_params(labelsize=8)
-        axes.legend(fontsize=8, frameon=False)
+            axes.errorbar([row["time"] for row in here], value, error, fmt=look, color="black", mfc=face, label=source)
+        axes.set(xscale="log", yscale="log" if name == "collision_rate" else "linear", title=title, ylabel=label)
+        axes.set_xlabel(r"$t_\mathrm{c}$ or $\Delta t$ ($1/\dot\gamma$)")
     figure.axes[0].set_ylim(bottom=0)
+    figure.axes[0].legend(loc="lower left")
     return figure

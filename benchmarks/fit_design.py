@@ -3,11 +3,12 @@
     python -m benchmarks fit_design           # 6 minutes
     python -m benchmarks fit_design --quick   # one flow, fewer points: a minute
 
-Left: the error that is predicted beside that of fits to tracks of the event-driven reference, which shares no code with
-either: N = 64, 50 frames, 12 trajectories of each flow, noise and frame rate. The fits are not told the noise. The
-median of the errors that they state, and the root mean square of how far they are off.
+``fits`` has the error that is predicted beside that of fits to tracks of the event-driven reference, which shares no
+code with either: N = 64, 50 frames, 12 trajectories of each flow, noise and frame rate. The fits are not told the
+noise. The median of the errors that they state, and the root mean square of how far they are off.
 
-Middle: the predicted error over α and ν, 100 frames of 64 discs. Right: against the time between frames.
+``over_flows`` has the predicted error over α and ν, 100 frames of 64 discs; ``over_intervals`` has it over the time
+between frames.
 
 Noise of velocities is 5 % of a component of a typical velocity, of positions 1e-3 σ with velocities and 1e-4 σ without.
 The time between frames is in collisions of a disc, by Enskog's theory. The last step of jaxgran before tracks begin is
@@ -18,20 +19,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.fit_coverage import fit_all, peculiar_velocities, trajectories, with_noise
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
-from jaxgran.plotting.drawing import label_log_axis
 from jaxgran.sampling.prediction import kinetic_theory
 
 GRAINS, FITTED_FRAMES, FRAMES = 64, 50, 100
 NOISES = {"with velocities": (0.05, 1e-3), "positions alone": (None, 1e-4)}
-MARKERS = {"with velocities": ("o", "black", "-"), "positions alone": ("s", "white", "--")}
-LINES = ("-", "--", "-.", ":")
 
 
 class Plan(NamedTuple):
@@ -57,7 +53,7 @@ QUICK = Plan(((0.6, 0.5),), (0.1,), 3, (0.4, 0.8), (0.4,), (0.05, 0.2))
 
 
 def run(output: Output) -> None:
-    """Compare with fits, predict, print, and write ``fit_design`` as JSON and PNG."""
+    """Compare with fits, predict, print, and write ``fit_design`` as JSON."""
     jax.config.update("jax_enable_x64", True)
     plan = QUICK if output.quick else FULL
     fits = []
@@ -70,7 +66,6 @@ def run(output: Output) -> None:
     over_intervals = [predicted(0.6, 0.6, interval, noise, FRAMES) for noise in NOISES for interval in plan.far]
     head = {"grains": GRAINS, "frames": {"fits": FITTED_FRAMES, "others": FRAMES}, "noises": NOISES}
     output.write_json("fit_design", {**head, "fits": fits, "over_flows": over_flows, "over_intervals": over_intervals})
-    output.write_picture(picture(fits, over_flows, over_intervals), "fit_design")
 
 
 def theory(alpha: float, nu: float) -> tuple[float, float]:
@@ -139,65 +134,4 @@ def report_line(row: dict) -> str:
     return (
         f"{head}: error {row['stderr']:.2e} ± {row['stderr_error']:.0e}, {row['collisions']:.0f} collisions, "
         f"{100 * row['usable']:.0f} % of all"
-    )
-
-
-def picture(fits: list[dict], over_flows: list[dict], over_intervals: list[dict]) -> Figure:
-    """Errors of fits against the prediction, the prediction over flows, and against the time between frames."""
-    figure = Figure((13, 4.2), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    _draw_fits(left, fits)
-    known = [row for row in over_flows if "stderr" in row]
-    for k, nu in enumerate(sorted({row["packing_fraction"] for row in known})):
-        shade = str(0.15 * k)
-        _draw_line(middle, [row for row in known if row["packing_fraction"] == nu], "restitution",
-                   f"ν = {nu:g}", (("o", "s", "^", "D")[k % 4], shade, LINES[k % 4]))  # fmt: skip
-    middle.set(xlabel="restitution α", ylabel="predicted standard error of α", yscale="log")
-    middle.set_title("0.1 collisions of a disc between frames", fontsize=10)
-    for noise, style in MARKERS.items():
-        rows = [row for row in over_intervals if row["noise"] == noise and "stderr" in row]
-        _draw_line(right, rows, "interval", noise, style)
-    right.set(xlabel="collisions of a disc between frames", xscale="log", yscale="log")
-    right.set_title("α = 0.6, ν = 0.6", fontsize=10)
-    for axis in (left.xaxis, middle.yaxis, right.xaxis, right.yaxis):
-        label_log_axis(axis)
-    for axes in (left, middle, right):
-        axes.legend(fontsize=8)
-    return figure
-
-
-def _draw_fits(axes: Axes, rows: list[dict]) -> None:
-    rows = [row for row in rows if "stderr" in row]
-    for noise, (marker, fill, _) in MARKERS.items():
-        these = [row for row in rows if row["noise"] == noise]
-        cross = "x" if noise == "with velocities" else "+"
-        for of, form, color, shift in (("stated", marker, "black", 0.98), ("off", cross, "0.5", 1.02)):
-            axes.errorbar(
-                [shift * row["stderr"] for row in these],
-                [row[of] / row["stderr"] for row in these],
-                xerr=[row["stderr_error"] for row in these],
-                yerr=[row[f"{of}_error"] / row["stderr"] for row in these],
-                fmt=form,
-                color=color,
-                markerfacecolor=fill,
-                linewidth=1,
-                label=f"{'stated' if of == 'stated' else 'true'}, {noise}",
-            )
-    axes.axhline(1, color="black", linewidth=0.8)
-    axes.set(xlabel="predicted standard error of α", ylabel="error of fits / predicted", xscale="log")
-    axes.set_ylim(0, 1.5 * max((row["off"] + row["off_error"]) / row["stderr"] for row in rows))
-    axes.set_title(f"{FITTED_FRAMES} frames of {GRAINS} discs", fontsize=10)
-
-
-def _draw_line(axes: Axes, rows: list[dict], along: str, label: str, style: tuple[str, str, str]) -> None:
-    marker, fill, line = style
-    axes.errorbar(
-        [row[along] for row in rows],
-        [row["stderr"] for row in rows],
-        yerr=[row["stderr_error"] for row in rows],
-        fmt=marker,
-        linestyle=line,
-        color="black" if fill == "white" else fill,
-        markerfacecolor=fill,
-        label=label,
     )

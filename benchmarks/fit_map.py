@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are loaded when they are used
-from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.event_driven import Law, averages, discs_of, sheared
@@ -95,45 +94,8 @@ def report_line(row: dict) -> str:
     )
 
 
-def draw(rows: list[dict]) -> Figure:
-    """Coverage, bias and the share of collisions left out against ν; a marker for each α, filled where it is large."""
-    figure = Figure(figsize=(10.8, 3.6), layout="constrained")
-    panels = figure.subplots(1, 3)
-    marks = dict(zip(RESTITUTIONS, "svoD^", strict=True))
-    for row in rows:
-        if not row["fits"] or row["restitution"] not in marks or row["camera"] == "jaxgran":
-            continue
-        place = RESTITUTIONS.index(row["restitution"])
-        grey, quicker = f"{0.75 - 0.17 * place:.2f}", row["camera"] == "quicker"
-        x = FRACTIONS.index(row["packing_fraction"]) + 0.17 * (place - 2) + 0.06 * quicker
-        style = {
-            "color": grey if not quicker else "tab:red", "marker": marks[row["restitution"]], "ms": 5, "lw": 1.2,
-            "mfc": "white" if quicker else grey,
-        }  # fmt: skip
-        low, high = row["coverage"]
-        share = row["held"] / row["fits"]
-        panels[0].errorbar(x, share, [[max(share - low, 0)], [max(high - share, 0)]], **style)
-        bias, error = row["bias_in_errors"], row["spread_in_errors"] / np.sqrt(row["fits"])
-        panels[1].errorbar(x, bias, error, **style)
-        panels[2].plot(x, row["rejected"] / (row["rejected"] + row["collisions"]), **style)
-    panels[0].axhline(0.95, color="0.5", lw=0.8, ls=":")
-    panels[1].axhline(0, color="0.5", lw=0.8, ls=":")
-    for axis, label in zip(
-        panels, ("intervals that hold", "bias, in errors", "share of collisions left out"), strict=True
-    ):
-        axis.set(xlabel="packing fraction ν", ylabel=label, xlim=(-0.5, len(FRACTIONS) - 0.5))
-        axis.set_xticks(range(len(FRACTIONS)), [f"{nu:g}" for nu in FRACTIONS])
-    panels[0].set_ylim(0, 1.03)
-    panels[2].set_ylim(0, 1)
-    for place, (alpha, mark) in enumerate(marks.items()):
-        panels[2].plot([], [], mark, color=f"{0.75 - 0.17 * place:.2f}", ms=5, label=f"α = {alpha:g}")
-    panels[2].plot([], [], "o", color="tab:red", mfc="white", ms=5, label="quicker camera")
-    panels[2].legend(fontsize=8, frameon=False, loc="upper left")
-    return figure
-
-
 def run(output: Output) -> None:
-    """Fit the trajectories of all points, print, and write JSON and PNG."""
+    """Fit the trajectories of all points, print, and write JSON."""
     runs = FEW_RUNS if output.quick else RUNS
     points = QUICK_POINTS if output.quick else [(alpha, nu) for nu in FRACTIONS for alpha in RESTITUTIONS]
     cases = [("steady", *point) for point in points]
@@ -150,4 +112,3 @@ def run(output: Output) -> None:
         print(report_line(rows[-1]), flush=True)
     head = {"grains": GRAINS, "frames": FRAMES, "velocity_noise": VELOCITY, "position_noise": POSITION}
     output.write_rows("fit_map", head | {"contact_duration": CONTACT_DURATION, "timestep": OWN_TIMESTEP}, "rows", rows)
-    output.write_picture(draw(rows), "fit_map")

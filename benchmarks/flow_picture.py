@@ -16,15 +16,17 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.plotting.drawing import LABEL_SIZE, empty_figure
-from jaxgran.plotting.flow import Colour, Scene, common_scale, draw_picture, scene_of
+from jaxgran.plotting.drawing import TWO_COLUMNS, styled
+from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, draw_scene, force_key, scene_of
 
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
+THINNER = 0.6  # lines of the figure, over those of a flow that fills a page
 TILT = 0.15  # of the cell at the first snapshot
 FILM = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
 
@@ -48,7 +50,7 @@ def run(output: Output, colour: Colour = "speed") -> None:
     for row in rows:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
-    output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow", dpi=200)
+    output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow")
     film = str(output.path("flow", ".gif"))
     subprocess.run([sys.executable, "-m", "jaxgran", *FILM.split(), film, "--overwrite"], check=True)
 
@@ -76,10 +78,18 @@ def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
     }
 
 
-def draw(scenes: list[Scene], colour: Colour):
+@styled
+def draw(scenes: list[Scene], colour: Colour) -> Figure:
     """The flows beside each other, each in its own scale."""
-    figure = empty_figure(11.0, 5.2)
+    figure = Figure(figsize=(TWO_COLUMNS, 3.15), layout="constrained")
+    handles = []
     for axes, scene, letter in zip(figure.subplots(1, len(scenes)), scenes, "ab", strict=True):
-        draw_picture(axes, scene, colour, common_scale([scene], colour))
-        axes.text(0.0, 1.02, f"({letter})", transform=axes.transAxes, fontsize=LABEL_SIZE, weight="bold")
+        scale = common_scale([scene], colour)
+        artists = draw_scene(axes, scene, colour, scale)
+        for lines in (artists.clusters, artists.binaries):
+            lines.set_linewidth(THINNER * np.array(lines.get_linewidth()))
+        *handles, widest = force_key(scale)
+        artists.title.set_text(rf"({letter}) $\alpha={scene.restitution:g}$; {widest.get_label()}")
+        figure.colorbar(artists.grains, ax=axes, label=COLOUR_LABELS[colour], extend="max", shrink=0.75, pad=0.01)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

@@ -21,8 +21,10 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.analysis.sensitivity import growth, lyapunov_exponent
 from jaxgran.model.cell import displacement
+from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 
 FLOWS = ((0.9, 0.6), (0.5, 0.6), (0.7, 0.75), (0.3, 0.75))  # restitution, packing fraction
+DRAWN = (0.9, 0.6), (0.3, 0.75)
 GRAINS, TIMESTEP, STRAIN, POINTS, RUNS = 64, 1e-6, 1.2, 48, 6
 DIFFERENCE = 1e-4  # between the restitutions of two neighbouring runs
 HORIZON = 100.0  # |∂(state)/∂α| at which a change of α by 0.01 moves the grains by a diameter
@@ -128,29 +130,26 @@ def differences(flow, state):
     return jax.lax.scan(part, (state, state), length=POINTS)[1]
 
 
+@styled
 def draw(flows: list[dict]) -> Figure:
-    """A panel for each flow: geometric means over its runs, with the scatter of the moving derivative as a band."""
-    figure = Figure(figsize=(3.1 * len(flows) + 0.6, 3.3), layout="constrained")
-    axes = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    for axis, flow in zip(axes, flows, strict=True):
+    """Growth in the flows that are drawn: geometric means over the runs, with the scatter of one as a band."""
+    figure = Figure(figsize=(TWO_COLUMNS, 2.4), layout="constrained")
+    drawn = [flow for flow in flows if (flow["restitution"], flow["packing_fraction"]) in DRAWN]
+    for axes, flow in zip(figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0], drawn, strict=True):
         strain = np.array(flow["strain"])
         logs = {name: np.log(np.array(flow[name])) for name in ("moving", "fixed", "difference")}
         middle, spread = logs["moving"].mean(0), logs["moving"].std(0)
-        axis.fill_between(strain, np.exp(middle - spread), np.exp(middle + spread), color="0.85", lw=0)
-        axis.plot(strain, np.exp(middle), "-", color="0.1", label="contacts move in time")
-        axis.plot(strain, np.exp(logs["fixed"].mean(0)), "--", color="0.35", label="contacts at fixed steps")
-        axis.plot(
-            strain[::3], np.exp(logs["difference"].mean(0))[::3], "o", ms=4, mfc="none", color="0.1",
-            label=rf"two runs, $\delta\alpha={DIFFERENCE:g}$",
-        )  # fmt: skip
-        axis.axhline(HORIZON, color="0.6", lw=0.8, ls=":")
-        rate = flow["exponents"]["moving"]
-        words = rf", $\lambda={rate[0]:.1f}\pm{rate[1]:.1f}$" if rate else ""
-        axis.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}${words}", fontsize=10)
-        axis.set_yscale("log")
-        axis.set_xlabel("strain")
-    axes[0].set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ per grain  [$\sigma$, $\sigma\dot\gamma$]")
-    axes[0].legend(fontsize=8, frameon=False)
+        axes.fill_between(strain, np.exp(middle - spread), np.exp(middle + spread), color="0.87", lw=0)
+        axes.plot(strain, np.exp(middle), "-", color="black", label="derivative, contacts move in time")
+        axes.plot(strain, np.exp(logs["fixed"].mean(0)), "--", color="0.4", label="derivative at fixed steps")
+        exponent = f"10^{{{round(np.log10(DIFFERENCE))}}}"
+        label = rf"two runs, $\delta\alpha={exponent}$"
+        axes.plot(strain[::3], np.exp(logs["difference"].mean(0))[::3], "o", mfc="none", color="black", label=label)
+        axes.axhline(HORIZON, color="0.6", lw=0.8, ls=":")
+        axes.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$")
+        axes.set(yscale="log", xlabel=r"strain $\dot\gamma t$", xlim=(0, strain[-1]))
+    figure.axes[0].set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ of a grain ($\sigma$, $\sigma\dot\gamma$)")
+    figure.axes[0].legend(loc="lower right")
     return figure
 
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.process import ROOT
 from jaxgran import environment
+from jaxgran.plotting.drawing import FILE_DPI, write
 
 RESULTS = ROOT / "benchmarks" / "results"
 PACKAGES = ("jaxgran", "jax", "jaxlib", "numpy", "numba")
@@ -90,6 +91,6 @@ class Output:
         )
         self.path(name, ".json").write_text(start[:-2] + f',\n "{key}": [\n{lines}\n ]\n}}\n')
 
-    def write_picture(self, figure: Figure, name: str, ending: str = ".png", dpi: int = 150) -> None:
+    def write_picture(self, figure: Figure, name: str, ending: str = ".png", dpi: int = FILE_DPI) -> None:
         """Write a figure as PNG."""
-        figure.savefig(self.path(name, ending), dpi=dpi)
+        write(figure, self.path(name, ending), dpi, caption=False)

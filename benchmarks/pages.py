@@ -4,7 +4,7 @@ A page is a Jinja template. ``{{ pm(row.value, row.error) }}`` stands for a valu
 over the rows of a result makes a table, so that neither can differ from the file. A name that a file does not have
 stops the build. Markdown needs braces for itself: comments of Jinja are ``{=# … #=}``.
 
-The README is filled in from ``docs/_build/README.md`` and committed, since it is read where no site is built:
+The README and the paper are filled in from ``docs/_build`` and committed, since they are read where no site is built:
 
     python -m benchmarks.pages
 """
@@ -31,7 +31,7 @@ from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS
 from jaxgran.sampling.budget import fewest_grains
 
-README = ROOT / "docs" / "_build" / "README.md"
+TEMPLATES = {"README.md": "docs/_build/README.md", "docs/paper/paper.md": "docs/_build/paper.md"}  # of committed pages
 
 
 class Results:
@@ -179,11 +179,6 @@ def differences_in_sigmas(rows: Iterable[Mapping[str, Any]], reference: Sequence
     return [difference / error for difference, error in pairs]
 
 
-def farthest_from_one(rows: Iterable[Mapping[str, float]], name: str) -> Mapping[str, float]:
-    """The row whose value is farthest from one."""
-    return max(rows, key=lambda row: abs(row[name] - 1))
-
-
 def product_of(rows: Iterable[Mapping[str, Any]], timestep: float, flow: Sequence[float] = (0.2, 0.6)) -> float:
     """Measured contact pressure over Enskog's: the product of its factors in a flow of ``enskog_factors``, N = 256."""
     row = at(rows, alpha=flow[0], nu=flow[1], grains=256, timestep=timestep)
@@ -236,10 +231,11 @@ ENVIRONMENT = jinja2.Environment(
 ENVIRONMENT.filters |= {
     "e": lambda value: f"{float(value):.0e}".replace("e-0", "e-"),
     "g": lambda value: f"{float(value):g}",
+    "date": lambda number: f"{number // 10000}-{number // 100 % 100:02d}-{number % 100:02d}",
 }
 ENVIRONMENT.globals |= {"results": Results(), "peers_table": front.table, "SOLVER_GROUPS": GROUPS}
 for _functions in (
-    (abs, max, at, found, flows_of, point, quotients, over, rms, ranked, farthest_from_one),
+    (abs, max, at, found, flows_of, point, quotients, over, rms, ranked),
     (sig, percent, percent_pm, pm, duration, signed),
     (fewest_grains, shear_stress_ratio_at),
     (peers_ratio, output_of_where, product_of, shares_of_clusters, differences_in_sigmas),
@@ -253,4 +249,5 @@ def filled(page: str) -> str:
 
 
 if __name__ == "__main__":
-    (ROOT / "README.md").write_text(filled(README.read_text(encoding="utf-8")), encoding="utf-8")
+    for page, template in TEMPLATES.items():
+        (ROOT / page).write_text(filled((ROOT / template).read_text(encoding="utf-8")), encoding="utf-8")

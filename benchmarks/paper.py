@@ -28,4 +28,4 @@ def run(output: Output) -> None:
     data.attrs |= {"command": "python -m benchmarks paper", "commit": output.hardware["commit"]}
     write_dataset(data, output.path("paper", ".nc"))
     for name, draw in FIGURES.items():
-        write(draw(data), output.path("paper", f"_{name}.png"), FILE_DPI, True)
+        write(draw(data), output.path("paper", f"_{name}.png"), FILE_DPI, False)

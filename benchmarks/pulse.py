@@ -31,12 +31,12 @@ from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.solver import Solution, solve
 from jaxgran.model.status import Status
+from jaxgran.plotting.drawing import TWO_COLUMNS, scientific, styled
 
 ROWS, LENGTH = 4, 100  # discs across, and along
 STEPS = 100
 DEFAULT = 1e-4  # tolerance of the program
 TOLERANCES = (0.3, 1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 1e-5, 1e-6)
-FLOOR = 1e-6  # smallest error of the force that is drawn
 DRAWN = (0.3, 1e-1, 1e-2, 1e-3, 1e-4)  # tolerances of the first panel
 SWEEPS = "Gauss–Seidel"
 MOST_ITERATIONS = 1_000_000
@@ -193,39 +193,26 @@ def run(output: Output) -> None:
     output.write_picture(draw(rows, length), "pulse")
 
 
+@styled
 def draw(rows: list[dict[str, Any]], length: int) -> Figure:
-    """The force on the wall in time, and speed, residual force and creep against the tolerance, by method."""
-    figure = Figure(figsize=(10.5, 8), layout="constrained")
-    (wall, speed), (force, creep) = figure.subplots(2, 2)
+    """The force on the wall in time, and the speed of the front against the tolerance, by method."""
+    figure = Figure(figsize=(TWO_COLUMNS, 2.6), layout="constrained")
+    wall, speed = figure.subplots(1, 2)
     swept = [row for row in rows if row["method"] == SWEEPS and row["tolerance"] in DRAWN]
     for row, line, shade in zip(swept, (":", "-.", "--", (0, (6, 1)), "-"), (0.65, 0.5, 0.35, 0.2, 0.0), strict=True):
-        times = np.arange(1, len(row["wall"]) + 1)
-        wall.plot(times, row["wall"], linestyle=line, color=str(shade), label=f"{row['tolerance']:g}")
-    wall.set(xscale="log", xlabel="time step", ylabel="force on the wall / force of the push", ylim=(-0.4, 1.2))
-    wall.legend(title="tolerance", fontsize="small", loc="lower center", ncols=5)
-    wall.set_title(f"(a) the force arrives late ({SWEEPS})", fontsize="medium")
+        times, label = np.arange(1, len(row["wall"]) + 1), f"${scientific(row['tolerance'])}$"
+        wall.plot(times, row["wall"], linestyle=line, color=str(shade), label=label)
+    wall.set(xscale="log", xlabel="time step", ylabel="force on the wall / force of the push", ylim=(-0.1, 1.1))
+    wall.legend(title="tolerance", loc="center", bbox_to_anchor=(0.52, 0.5))
+    wall.set_title(f"(a) {SWEEPS}", loc="left")
     for method, (colour, marker, line) in STYLES.items():
         known = [row for row in rows if row["method"] == method]
-        tolerances = [row["tolerance"] for row in known]
-        style = {"color": colour, "marker": marker, "linestyle": line, "label": method, "markersize": 5}
-        speed.plot(tolerances, [row["speed"] for row in known], **style)
-        force.plot(tolerances, [max(row["residual_force"], FLOOR) for row in known], **style)
-        creep.plot(tolerances, [row["creep"] for row in known], **style)
-    speed.axhline(length - 1, color="black", linewidth=0.8)
-    words = {"fontsize": "small", "transform": speed.get_yaxis_transform()}
-    speed.text(0.03, 1.15 * (length - 1), "all of the strip in the first step, as rigid discs do", **words)
-    speed.set(ylabel="apparent speed (diameters a time step)", ylim=(0.3, 2 * length))
-    speed.set_title("(b) a front moves, as if the discs were soft", fontsize="medium")
-    force.set(ylabel="rms error of the force on the wall, relative", ylim=(FLOOR / 2, 3))
-    words = {"fontsize": "small", "ha": "right", "transform": force.transAxes}
-    force.text(0.98, 0.93, f"drawn at {FLOOR:g}: that or less", **words)
-    force.set_title("(c) later, the wall feels another force", fontsize="medium")
-    creep.set(ylabel="speed of the pushed side (F dt/m)")
-    creep.set_title("(d) the pushed side creeps", fontsize="medium")
-    for axes in (speed, force, creep):
-        axes.set(xscale="log", yscale="log", xlabel="tolerance of the contact solve", xlim=(0.5, 5e-7))
-        axes.axvline(DEFAULT, color="tab:orange", linewidth=1, linestyle=(0, (1, 1)))
-    creep.text(DEFAULT, 0.9, " default", color="tab:orange", fontsize="small", transform=creep.get_xaxis_transform())
-    handles, labels = force.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
+        style = {"color": colour, "marker": marker, "linestyle": line, "label": method}
+        speed.plot([row["tolerance"] for row in known], [row["speed"] for row in known], **style)
+    speed.axhline(length - 1, color="0.6", linewidth=0.8, zorder=0)
+    speed.axvline(DEFAULT, color="0.6", linewidth=0.8, linestyle=":")
+    speed.set(ylabel="speed of the front (diameters a step)", ylim=(0.3, 2 * length))
+    speed.set(xscale="log", yscale="log", xlabel="tolerance of the contact solve", xlim=(0.5, 5e-7))
+    speed.set_title("(b)", loc="left")
+    speed.legend(loc="lower right")
     return figure

@@ -17,5 +17,5 @@ SMALLER = {"grains": 64, "seeds": 1, "strain": 2.0}
 def run(output: Output) -> None:
     """Map, and draw both ratios against the packing fraction, and which error dominates where."""
     data = jg.ratio_map(**PRESETS["quick"] | (SMALLER if output.quick else {}), workers=usable_cores())
-    output.write_picture(ratio_curves(data), "quick", "_curves.png", dpi=200)
-    output.write_picture(dominating_errors(data), "quick", "_errors.png", dpi=200)
+    output.write_picture(ratio_curves(data), "quick", "_curves.png")
+    output.write_picture(dominating_errors(data), "quick", "_errors.png")

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.process import printed_by
+from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 
 GRAINS, QUICK_GRAINS = (128, 512, 2_000, 10_000, 30_000, 100_000, 1_000_000), (1_000, 10_000)
 TIMESTEPS, QUICK_TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5), (1e-2, 1e-3, 1e-4)
@@ -44,7 +45,7 @@ def run(output: Output, grains: int | None = None) -> None:
     fits = exponents(rows)
     report(rows, fits)
     output.write_json("scaling", {"exponents": fits, **rows})
-    output.write_picture(draw(rows, fits), "scaling", dpi=200)
+    output.write_picture(draw(rows, fits), "scaling")
 
 
 def in_own_process(grains: int) -> dict[str, float]:
@@ -143,27 +144,26 @@ def report(rows: dict[str, list[dict]], fits: dict[str, float]) -> None:
         )
 
 
+@styled
 def draw(rows: dict[str, list[dict]], fits: dict[str, float]) -> Figure:
     """CPU time of a unit of strain against the number of grains and against the time step."""
-    figure = Figure(figsize=(6.7, 2.9), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 2.5), layout="constrained")
     grains, timestep = figure.subplots(1, 2)
     sizes = np.array([row["grains"] for row in rows["grains"]])
     costs = np.array([row["cpu seconds"] for row in rows["grains"]]) / STRAIN
-    grains.plot(sizes, costs, "ko-", ms=4, label="measured")
+    grains.plot(sizes, costs, "ko-", label=rf"measured: $N^{{{fits['grains']:.2f}}}$ up to $10^5$")
     last = np.flatnonzero(sizes <= LINEAR[1])[-1]
     grains.plot(sizes, costs[last] / sizes[last] * sizes, ":", color="gray", label=r"$\propto N$")
-    grains.set_xlabel("number of grains $N$", fontsize=9)
-    grains.set_ylabel("CPU time of a unit of strain (s)", fontsize=9)
-    for (alpha, nu), look in ((LARGE_FLOW, "ko-"), (DENSE_FLOW, "ks--")):
+    grains.set_xlabel("number of grains $N$")
+    grains.set_ylabel("CPU time of a unit of strain (s)")
+    for (alpha, nu), look in ((DENSE_FLOW, "ks--"), (LARGE_FLOW, "ko-")):
         here = [row for row in rows["timestep"] if (row["alpha"], row["nu"]) == (alpha, nu)]
         exponent = fits[f"timestep at α = {alpha:g}, ν = {nu:g}"]
         label = rf"$\alpha={alpha:g}$, $\nu={nu:g}$: $\Delta t^{{{exponent:.1f}}}$"
         x, y = ([row[name] for row in here] for name in ("timestep", "cpu seconds per strain"))
-        timestep.plot(x, y, look, ms=4, label=label)
-    timestep.set_xlabel(r"time step $\Delta t$ ($1/\dot\gamma$)", fontsize=9)
+        timestep.plot(x, y, look, label=label)
+    timestep.set_xlabel(r"time step $\Delta t$ ($1/\dot\gamma$)")
     for axes in (grains, timestep):
         axes.set(xscale="log", yscale="log")
-        axes.tick_params(labelsize=8)
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.legend()
     return figure

@@ -3,15 +3,16 @@
 Three flows are brought to their steady states once. From there each is sampled with every combination of time step,
 tolerance and activation rule, several seeds each, and compared with a reference: the finest time step and tolerance,
 run longest. A force ratio belongs to its time step and rule, so its reference is the tightest tolerance at the same
-time step and rule: its error is that of the solver alone. The figure shows the pressure; the JSON holds all four.
+time step and rule: its error is that of the solver alone. The figure shows the results of ``peers`` too; it is drawn by
+``python -m benchmarks draw speed_vs_accuracy``.
 
-    python -m benchmarks speed_vs_accuracy           # 20 minutes on two cores
+    python -m benchmarks speed_vs_accuracy           # 11 minutes on two cores
     python -m benchmarks speed_vs_accuracy --quick   # one flow of 64 grains, a minute
 """
 
-import math
 import multiprocessing
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
@@ -22,18 +23,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, LogLocator, NullLocator, StrMethodFormatter
 
 import jaxgran as jg
 from benchmarks.output import Output
+from benchmarks.peers.front import TARGET
 from jaxgran.environment import usable_cores
-from jaxgran.plotting.drawing import scientific
+from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.sample import estimates
 from jaxgran.sampling.steady_state import prepare_batch
 
 OBSERVABLES = ("pressure", "shear_stress", "granular_temperature", "force_ratio")
-DEFAULT = (1e-3, 1e-4, "midpoint")  # of the command line
+SOFT = "#b35806"
 RELAXATION = 1.0  # strain after a change of the time step
 
 
@@ -79,7 +82,7 @@ QUICK = Plan(
 
 
 def run(output: Output) -> None:
-    """Run the plan on all cores, print a table, and write ``speed_vs_accuracy`` as JSON and PNG."""
+    """Run the plan on all cores, print a table, and write ``speed_vs_accuracy`` as JSON."""
     plan = QUICK if output.quick else FULL
     tasks = list(product(plan.flows, range(plan.seeds)))
     start = time.perf_counter()
@@ -97,7 +100,6 @@ def run(output: Output) -> None:
         "flows": flows,
     }
     output.write_json("speed_vs_accuracy", result)
-    output.write_picture(draw(flows), "speed_vs_accuracy", dpi=200)
 
 
 def samples_of_seed(plan: Plan, task: tuple[tuple[float, float], int]) -> dict[Config, tuple[jg.Sample, float, int]]:
@@ -147,12 +149,6 @@ def summary(plan: Plan, flow: tuple[float, float], seeds: list[dict]) -> dict:
     return {"restitution": flow[0], "packing_fraction": flow[1], "reference": values, "rows": rows}
 
 
-def bound(row: dict, name: str) -> float:
-    """Size of an error and one standard error of it: what the error of a configuration may be."""
-    error, noise = row["errors"][name]
-    return abs(error) + noise
-
-
 def on_front(row: dict, rows: list[dict], name: str) -> bool:
     """Whether no other configuration costs less and is more accurate beyond the noise of both."""
     error, noise = row["errors"][name]
@@ -163,16 +159,6 @@ def on_front(row: dict, rows: list[dict], name: str) -> bool:
         return cheaper and other["status"] == "ok" and abs(error) - abs(its_error) > np.hypot(noise, its_noise)
 
     return row["status"] == "ok" and not any(beats(other) for other in rows)
-
-
-def staircase(rows: list[dict], name: str) -> list[dict]:
-    """Configurations that are cheaper than all with a smaller error bound, the cheapest first, but the reference."""
-    judged = [row for row in rows if row["status"] == "ok" and bound(row, name) > 0]
-    steps = []
-    for row in sorted(judged, key=lambda row: row["seconds_per_strain"]):
-        if not steps or bound(row, name) < bound(steps[-1], name):
-            steps.append(row)
-    return steps
 
 
 def report(flow: dict) -> None:
@@ -190,74 +176,88 @@ def report(flow: dict) -> None:
         print(head + "  ".join(cells) + f"  {row['status']}", flush=True)
 
 
-MARKERS = "osD^v"
-FLOOR = 1e-3  # smallest error that is drawn
-WIDTH = 6.7  # inches; 17 cm
-FRONT = "#b35806"
+# of the figure: the errors of peers that share the cell, then those of force ratio and pressure here
+PROGRAMS = {  # curve of ``peers``: label, marker, line, colour, face
+    "jaxgran": ("jaxgran, tolerance $10^{-4}$", "o", "-", "black", "black"),
+    "jaxgran, tolerance 1e-2": ("jaxgran, tolerance $10^{-2}$", "s", "--", "0.45", "0.45"),
+    "numba loop": ("numba loop", "^", ":", "black", "white"),
+    "LAMMPS, 20 steps a contact": ("LAMMPS, 20 steps a contact", "D", "-", SOFT, SOFT),
+    "LAMMPS, 10 steps a contact": ("LAMMPS, 10 steps a contact", "d", "--", SOFT, "white"),
+}
+SERIES = {  # observable, tolerance, activation: label, marker, line, colour, face
+    ("force_ratio", 1e-4, "midpoint"): ("force ratio, tolerance $10^{-4}$", "o", "-", "black", "black"),
+    ("force_ratio", 1e-2, "midpoint"): ("force ratio, tolerance $10^{-2}$", "s", "--", "0.45", "0.45"),
+    ("force_ratio", 1e-1, "midpoint"): ("force ratio, tolerance $10^{-1}$", "v", ":", "0.6", "0.6"),
+    ("force_ratio", 1e-4, "touching"): ("force ratio, touching rule", "o", "-", "tab:green", "white"),
+    ("pressure", 1e-4, "midpoint"): ("pressure, tolerance $10^{-4}$", "^", "-", "tab:blue", "white"),
+}
+TICKS = (-1, -0.3, -0.1, -0.03, 0, 0.03, 0.1, 0.3, 1, 3)
 
 
-def draw(flows: list[dict], name: str = "pressure") -> Figure:
-    """Size of the error of one average against cost, a panel for each flow; the line is the front."""
-    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
-    panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    timesteps, tolerances = (
-        sorted({row[key] for f in flows for row in f["rows"]}) for key in ("timestep", "tolerance")
-    )
-    marker = dict(zip(timesteps, MARKERS, strict=False))
-    grey = dict(zip(tolerances, np.linspace(0, 0.78, len(tolerances)).astype(str), strict=True))
-    for flow, axes in zip(flows, panels, strict=True):
-        for row in flow["rows"]:
-            draw_point(axes, row, name, marker[row["timestep"]], grey[row["tolerance"]])
-        front = staircase(flow["rows"], name)
-        costs, bounds = [row["seconds_per_strain"] for row in front], [max(bound(row, name), FLOOR) for row in front]
-        axes.step(costs, bounds, where="post", color=FRONT, zorder=1)
-        axes.set(
-            xscale="log", yscale="log", ylim=(FLOOR, 1), xlim=widened([r["seconds_per_strain"] for r in flow["rows"]])
-        )
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+@styled
+def draw(peers: dict, own: dict) -> Figure:
+    """Signed errors against cost: the pressure by three programs, and below it force ratio and pressure of jaxgran.
+
+    Args:
+      peers: the result of the benchmark of this name.
+      own: the result of this one. A force ratio is compared with that of the finest time step and tolerance.
+    """
+    figure = Figure(figsize=(TWO_COLUMNS, 4.6), layout="constrained")
+    grid = figure.subplots(2, 3, sharey=True, sharex="col")
+    for axes, flow in zip(grid[0], peers["flows"], strict=True):
+        for curve, look in PROGRAMS.items():
+            rows = [row for row in flow["rows"] if row["curve"] == curve and "errors" in row]
+            draw_curve(
+                axes,
+                [1e6 * row["cpu_seconds_per_strain"] / peers["discs"] for row in rows],
+                *np.transpose([row["errors"]["pressure"] for row in rows]),
+                look,
+            )
+    flows = sorted(own["flows"], key=lambda flow: flow["packing_fraction"])
+    for axes, flow in zip(grid[1], flows, strict=True):
+        finest = next(row for row in flow["rows"] if Config(**{n: row[n] for n in Config._fields}) == FULL.reference)
+        for (name, tolerance, activation), look in SERIES.items():
+            rows = [row for row in flow["rows"] if (row["tolerance"], row["activation"]) == (tolerance, activation)]
+            costs = np.array([1e6 * row["seconds_per_strain"] / own["plan"]["grains"] for row in rows])
+            values, noise = np.transpose([row["values"][name] for row in rows])
+            right = finest["values"][name][0]
+            draw_curve(axes, costs, values / right - 1, noise / right, look)
+            bad = np.array([row["status"] != "ok" for row in rows])
+            axes.plot(costs[bad], (values / right - 1)[bad], "x", color="tab:red", ms=5, zorder=4)
+    for row, letters, what in zip(grid, ("abc", "def"), ("pressure", "force ratio and pressure"), strict=True):
+        for axes, letter, flow in zip(row, letters, peers["flows"] if what == "pressure" else flows, strict=True):
+            axes.set_title(
+                rf"({letter}) $\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$", loc="left"
+            )
+        row[0].set_ylabel(f"error of {what}")
+    for axes in grid.flat:
+        axes.axhspan(-TARGET, TARGET, color="0.92", zorder=0)
+        axes.axhline(0, color="0.5", lw=0.6, zorder=1)
+        axes.set(xscale="log", ylim=(-1.1, 5))
+        axes.set_yscale("symlog", linthresh=TARGET, linscale=0.6)
+        axes.yaxis.set_major_locator(FixedLocator(TICKS))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:+.0f} %".replace("-", "−").replace("+0", "0"))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1,)))
         axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$", fontsize=9)
-        axes.tick_params(labelsize=8)
-    panels[len(panels) // 2].set_xlabel("CPU time of a unit of strain (s)", fontsize=9)
-    panels[0].set_ylabel(f"|relative error| of the {name.replace('_', ' ')}", fontsize=9)
-    style = {"linestyle": "none", "markersize": 5, "color": "0.3"}
-    handles = [
-        *(
-            Line2D([], [], marker=marker[dt], label=rf"$\Delta t={scientific(dt)}/\dot\gamma$", **style)
-            for dt in timesteps
-        ),
-        *(
-            Line2D([], [], marker="o", label=f"tolerance ${scientific(t)}$", **{**style, "color": grey[t]})
-            for t in tolerances
-        ),
-        Line2D([], [], marker="o", label="touching rule", markerfacecolor="white", **style),
-        Line2D([], [], marker="x", label="status not ok", **{**style, "color": "#b2182b"}),
-        Line2D([], [], marker="*", label="default", **{**style, "markersize": 11, "color": FRONT}),
-        Line2D([], [], color=FRONT, label="front"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=7, frameon=False)
+    grid[1, 1].set_xlabel(r"CPU time of a grain in a unit of strain (µs)")
+    columns = [legend_of(list(looks.values())) for looks in (PROGRAMS, SERIES)]
+    columns[1].append(Line2D([], [], marker="x", color="tab:red", ls="none", ms=5, label="status not ok"))
+    columns[0].append(Patch(color="0.92", label=f"within {100 * TARGET:g} %"))
+    for handles, place in zip(columns, ("upper", "lower"), strict=True):
+        figure.legend(handles=handles, loc=f"outside {place} center", ncols=3)
     return figure
 
 
-def widened(costs: list[float]) -> tuple[float, float]:
-    """Limits of an axis of costs, so wide that its ticks have room where all cost the same."""
-    middle, width = math.sqrt(min(costs) * max(costs)), max(1.3 * math.sqrt(max(costs) / min(costs)), 2.5)
-    return middle / width, middle * width
+def legend_of(looks: list[tuple[str, ...]]) -> list[Line2D | Patch]:
+    """Entries of a legend."""
+    return [
+        Line2D([], [], marker=marker, ls=line, color=colour, mfc=face, label=label)
+        for label, marker, line, colour, face in looks
+    ]
 
 
-def draw_point(axes: Axes, row: dict, name: str, marker: str, grey: str) -> None:
-    """One configuration with its standard error: a cross where its status is not ok, a star for the default."""
-    error, noise = row["errors"][name]
-    if error == 0 and noise == 0:
-        return  # the reference itself
-    size, cost = max(abs(error), FLOOR), row["seconds_per_strain"]
-    face = grey if row["activation"] == "midpoint" else "white"
-    if row["status"] == "ok":
-        axes.errorbar(cost, size, [[min(noise, size - FLOOR)], [noise]], color="0.75", elinewidth=0.8, zorder=2)
-    if (row["timestep"], row["tolerance"], row["activation"]) == DEFAULT:
-        axes.plot(cost, size, "*", color=FRONT, markersize=11, markeredgecolor="black", zorder=5)
-    elif row["status"] == "ok":
-        axes.plot(cost, size, marker, color=grey, markerfacecolor=face, markersize=4.5, zorder=3)
-    else:
-        axes.plot(cost, size, "x", color="#b2182b", markersize=5)
+def draw_curve(axes: Axes, costs: Sequence[float], errors: np.ndarray, noise: np.ndarray, look: tuple) -> None:
+    """One curve with its standard errors."""
+    _, marker, line, colour, face = look
+    axes.errorbar(costs, errors, noise, marker=marker, ls=line, color=colour, mfc=face, ms=3.5, lw=0.9, elinewidth=0.6)

@@ -3,7 +3,7 @@
 For every restitution α and packing fraction ν a flow of 128 grains is brought to its steady state at a fine time step.
 From that state it is sheared by a half (at least 20 steps, at most 3000) at each time step, by the default solver and
 by three that fail earlier. The parameters go beyond what the package accepts. Each cell of the figure shows what failed
-first; the vertical axis is dt √T / σ, the distance that a grain of thermal speed moves in one step.
+first at α = 0.5; its vertical axis is dt √T / σ, the distance that a grain of thermal speed moves in one step.
 
 The steps of a cell are done in ten parts, each as long as all before it, and it ends with the first part that fails.
 Only deep overlaps do not end it. In the part that fails the worst failure counts, in the order of ``OUTCOMES``. An
@@ -18,6 +18,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -28,6 +29,7 @@ from benchmarks.output import Output
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import DEEP_OVERLAP
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, scientific, styled
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.batch import stack
 from jaxgran.sampling.prediction import predicted
@@ -43,7 +45,13 @@ VARIANTS = {
     "Jacobi with diag W, ω = 1": {"solver": jg.JacobiDiagonal(relaxation=1.0)},
     "float32": {"dtype": "float32"},
 }
-DRAWN = (("default", 0.0), ("default", 0.5), ("default", 0.9)), tuple((name, 0.5) for name in tuple(VARIANTS)[1:4])
+ALPHA = 0.5  # of the figure
+DRAWN = {  # variants of the figure and their titles
+    "default": "default",
+    "Jacobi, ω = 1.8": r"Jacobi, $\omega=1.8$",
+    "Jacobi, ω = 2": r"Jacobi, $\omega=2$",
+    "Jacobi with diag W, ω = 1": r"Jacobi, diag $W$, $\omega=1$",
+}
 GRAINS = 128
 STRAIN, FEWEST_STEPS, MOST_STEPS, PARTS = 0.5, 20, 3000, 10
 PREPARATION = [(0.05, 1e-3)] * 20 + [(0.2, 1e-3)] * 8 + [(0.1, 3e-4)] * 4  # strain, dt √T / σ
@@ -52,14 +60,13 @@ GAIN = {"float64": 1e-6, "float32": 1e-3}  # of the energies exchanged; what rou
 # Mildest first: letter, colour, meaning.
 OUTCOMES = {
     "ok": ("·", "1.0", "nothing fails"),
-    "iteration_limit": ("i", "0.85", "a solve ends above the tolerance"),
-    "deep_overlap": ("o", "0.72", "an overlap beyond 0.01 σ"),
-    "infeasible": ("J", "0.58", "no impulses exist: jammed"),
-    "energy_gain": ("E", "0.46", "energy gained"),
-    "capacity": ("C", "0.34", "a step outruns the lists of near pairs"),
-    "nonfinite": ("N", "0.15", "not finite"),
+    "iteration_limit": ("i", "0.87", "solve above tolerance"),
+    "deep_overlap": ("o", "0.72", r"overlap above $0.01\,\sigma$"),
+    "infeasible": ("J", "0.58", "jammed: no impulses exist"),
+    "energy_gain": ("E", "0.4", "energy gained"),
+    "capacity": ("C", "0.2", "step outruns near pairs"),
+    "nonfinite": ("N", "0.05", "not finite"),
 }
-NOT_RUN = "aliceblue"
 
 advance = jax.jit(jg.advance)
 pack = jax.jit(jg.pack)
@@ -210,25 +217,27 @@ def accepts(alpha: float, nu: float, dt: float) -> bool:
     return True
 
 
+@styled
 def draw(cells: list[dict]) -> Figure:
-    """What failed first: the default at three restitutions, and below it three solvers at α = 0.5."""
-    figure = Figure(figsize=(6.7, 6.2), layout="constrained")
-    grid = figure.subplots(2, 3, sharex=True, sharey=True)
-    nus, crossings = (sorted({one[name] for one in cells}) for name in ("nu", "crossing"))
-    for axes, (name, alpha) in zip(grid.flat, (one for row in DRAWN for one in row), strict=True):
-        panel(axes, [one for one in cells if (one["variant"], one["alpha"]) == (name, alpha)], nus, crossings)
-        axes.set_title(rf"{name}, $\alpha={alpha:g}$", fontsize=8)
-    for axes in grid[:, 0]:
-        axes.set_ylabel(r"$\Delta t\,\sqrt{T}\,/\,\sigma$", fontsize=9)
-    grid[1, 1].set_xlabel(r"packing fraction $\nu$", fontsize=9)
-    outcomes = [outcome for outcome in OUTCOMES if outcome in {one["outcome"] for one in cells}]
-    handles = [
+    """What failed first at α = 0.5, a panel for each solver; the cells of a map lie below the thick line."""
+    figure = Figure(figsize=(TWO_COLUMNS, 3.1), layout="constrained")
+    panels = figure.subplots(1, len(DRAWN), sharex=True, sharey=True)
+    coarse = [one for one in cells if one["variant"] == list(DRAWN)[-1]]
+    nus, crossings = (sorted({one[name] for one in coarse}) for name in ("nu", "crossing"))
+    drawn = [one for one in cells if one["alpha"] == ALPHA and one["variant"] in DRAWN]
+    drawn = [one for one in drawn if one["nu"] in nus and one["crossing"] in crossings]
+    for axes, (name, title) in zip(panels, DRAWN.items(), strict=True):
+        panel(axes, [one for one in drawn if one["variant"] == name], nus, crossings)
+        axes.set_title(title)
+    panels[0].set_ylabel(r"step of a thermal grain $\Delta t\sqrt{T/m}\,/\sigma$")
+    figure.supxlabel(r"packing fraction $\nu$", fontsize=LABEL_SIZE)
+    failed = [outcome for outcome in OUTCOMES if outcome in {one["outcome"] for one in drawn}]
+    handles: list[Artist] = [
         Patch(facecolor=OUTCOMES[name][1], edgecolor="0.5", label=f"{OUTCOMES[name][0]}  {OUTCOMES[name][2]}")
-        for name in outcomes
+        for name in failed
     ]
-    handles.append(Patch(facecolor=NOT_RUN, edgecolor="0.5", label="not run"))
-    handles.append(Line2D([], [], color="black", lw=2, label="accepted by a map"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+    handles.append(Line2D([], [], color="black", lw=2, label="limit of a map"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=4)
     return figure
 
 
@@ -239,13 +248,14 @@ def panel(axes: Axes, cells: list[dict], nus: list[float], crossings: list[float
         letter, shade, _ = OUTCOMES[one["outcome"]]
         axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=shade, edgecolor="white", lw=0.5))
         ink = "white" if float(shade) < 0.5 else "black"
-        axes.text(x, y, letter, ha="center", va="center", color=ink, weight="bold", fontsize=7)
-    accepted = [
-        max([crossings.index(c["crossing"]) + 1 for c in cells if c["nu"] == nu and c["accepted"]] or [0]) for nu in nus
-    ]
+        axes.text(x, y, letter, ha="center", va="center", color=ink, weight="bold", fontsize=SMALL_SIZE)
     if {one["variant"] for one in cells} == {"default"}:
+        accepted = [
+            max([crossings.index(c["crossing"]) + 1 for c in cells if c["nu"] == nu and c["accepted"]] or [0])
+            for nu in nus
+        ]
         axes.stairs(np.array(accepted) - 0.5, np.arange(len(nus) + 1) - 0.5, baseline=-0.5, color="black", lw=2)
-    axes.set(xlim=(-0.5, len(nus) - 0.5), ylim=(-0.5, len(crossings) - 0.5), facecolor=NOT_RUN)
+    axes.set(xlim=(-0.5, len(nus) - 0.5), ylim=(-0.5, len(crossings) - 0.5))
     axes.set_xticks(range(len(nus)), [f"{nu:g}" for nu in nus], rotation=90)
-    axes.set_yticks(range(len(crossings)), [f"{crossing:.0e}".replace("e-0", "e-") for crossing in crossings])
-    axes.tick_params(length=0, labelsize=7)
+    axes.set_yticks(range(len(crossings)), [f"${scientific(crossing)}$" for crossing in crossings])
+    axes.tick_params(length=0)

@@ -2,7 +2,7 @@
 
 For every (restitution, packing fraction, dt) a flow is prepared once. Then jaxgran and the rival advance the same state
 by the same number of steps in turn, several times; the medians, their ratio and its geometric mean over the points are
-printed and written as JSON and PNG. Compilation is reported apart.
+printed and written as JSON. Compilation is reported apart.
 
     python -m benchmarks step_cost            # about 1 minute
     python -m benchmarks step_cost --quick    # half a minute
@@ -14,7 +14,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks import rival_numba
@@ -26,7 +25,7 @@ GRAINS, TOLERANCE = 256, 1e-4
 
 
 def run(output: Output, repeats: int = 7) -> None:
-    """Compare at every point, print, and write JSON and PNG."""
+    """Compare at every point, print, and write JSON."""
     compile_seconds = compilation()
     grid = [(alpha, nu) for alpha in RESTITUTIONS for nu in PACKING_FRACTIONS]
     if output.quick:
@@ -55,7 +54,6 @@ def run(output: Output, repeats: int = 7) -> None:
         "points": points,
     }
     output.write_json("step_cost", result)
-    output.write_picture(draw(points, means), "step_cost")
 
 
 def compilation() -> float:
@@ -118,34 +116,3 @@ def rival_arguments(flow: jg.ShearFlow, state: jg.State) -> dict[str, np.ndarray
         "activation": flow.activation_fraction,
         "tolerance": TOLERANCE,
     }
-
-
-def draw(points: list[dict], means: dict[float, float]) -> Figure:
-    """Microseconds per step of both programs at every point, one panel a time step."""
-    figure = Figure(figsize=(4.2 * len(means), 3.8), layout="constrained")
-    for axes, dt in zip(np.atleast_1d(figure.subplots(1, len(means), sharey=True)), means, strict=True):
-        here = [p for p in points if p["dt"] == dt]
-        place = np.arange(len(here))
-        for name, colour, hatch, shift in (("jaxgran", "0.25", "", -0.2), ("rival", "0.8", "//", 0.2)):
-            height = np.array([p[f"{name}_us"] for p in here])
-            low, high = np.array([p[f"{name}_us_range"] for p in here]).T
-            label = "numba Gauss–Seidel loop" if name == "rival" else name
-            axes.bar(
-                place + shift,
-                height,
-                0.4,
-                color=colour,
-                hatch=hatch,
-                edgecolor="black",
-                label=label,
-                yerr=[height - low, high - height],
-                error_kw={"elinewidth": 1, "capsize": 2},
-            )
-        axes.set(
-            yscale="log", title=rf"$\mathrm{{d}}t=10^{{{np.log10(dt):.0f}}}/\dot\gamma$, mean ratio {means[dt]:.2g}"
-        )
-        axes.set_xticks(place, [f"{p['alpha']:g}\n{p['nu']:g}" for p in here])
-        axes.set_xlabel("restitution α (above), packing fraction ν (below)")
-    figure.axes[0].set_ylabel("µs per replica and step")
-    figure.axes[0].legend(loc="upper left", fontsize="small")
-    return figure

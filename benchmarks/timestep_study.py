@@ -9,7 +9,7 @@ of both, by L + A dt^β with one limit L and an amplitude and an exponent for ea
 exceeds its minimum by no more than its value per degree of freedom (at least one), joined over fits that take in one
 time step less and one more.
 
-    python -m benchmarks timestep_study           # about 15 minutes on two cores
+    python -m benchmarks timestep_study           # about 23 minutes on two cores
     python -m benchmarks timestep_study --quick   # two flows down to 1e-4, under a minute
 """
 
@@ -30,6 +30,7 @@ from scipy.optimize import minimize_scalar
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
+from jaxgran.plotting.drawing import RATIO_LABEL, TWO_COLUMNS, styled
 from jaxgran.sampling.sample import estimates
 
 RULES = ("midpoint", "touching")
@@ -170,16 +171,17 @@ def power_law(dt: np.ndarray, excess: np.ndarray, error: np.ndarray) -> tuple[fl
 LEAST = 1e-5  # smallest excess that is drawn
 
 
+@styled
 def draw(flows: list[dict]) -> Figure:
     """Excess of the force ratio against the time step, a panel for every packing fraction, with the limits."""
     fractions, restitutions = (sorted({f[name] for f in flows}) for name in ("packing_fraction", "restitution"))
-    figure = Figure(figsize=(1.4 + 4.2 * len(fractions), 4.8), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 3.4), layout="constrained")
     panels = figure.subplots(1, len(fractions), sharey=True, squeeze=False)[0]
     for axes, nu in zip(panels, fractions, strict=True):
         here = sorted((f for f in flows if f["packing_fraction"] == nu), key=lambda f: -f["restitution"])
         for flow in here:
             k = restitutions.index(flow["restitution"])
-            style = {"color": ("black", "tab:blue", "tab:red")[k % 3], "marker": "osD"[k % 3], "markersize": 4}
+            style = {"color": ("black", "tab:blue", "tab:red")[k % 3], "marker": "osD"[k % 3], "markersize": 3.5}
             for rule, points in flow["points"].items():
                 dt, excess, error = arrays(points)
                 shown = excess > LEAST
@@ -189,27 +191,24 @@ def draw(flows: list[dict]) -> Figure:
                     dt[shown],
                     excess[shown],
                     [lower[shown], error[shown]],
-                    label=f"α {flow['restitution']:g}, {rule}",
-                    capsize=2,
+                    label=rf"$\alpha={flow['restitution']:g}$, {rule}",
                     **{**style, "linestyle": "-", **touching},
                 )
                 bad = np.array([p["status"] != "ok" for p in points]) & shown
-                axes.plot(dt[bad], excess[bad], "x", color="0.4", markersize=9, zorder=4)
+                axes.plot(dt[bad], excess[bad], "x", color="0.4", markersize=7, zorder=4)
             draw_limit(axes, flow["limit"], dt.min() / (2.2 + 1.3 * here.index(flow)), style)
         axes.axvline(dt.min() / 1.6, color="0.7", linewidth=0.8)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_ylim(LEAST / 1.6, 20)
+        axes.set_ylim(LEAST / 1.6, 30)
         axes.set_xticks([10.0**k for k in range(round(np.log10(dt.min())), -1)])
-        axes.text(dt.min() / 3, 12, "dt → 0", fontsize="small", ha="center")
-        axes.set_title(f"packing fraction {nu:g}", fontsize="medium")
-        axes.set_xlabel("time step dt (1/shear rate)")
-    panels[0].set_ylabel("excess of the force ratio, ⟨F⟩/⟨F_bc⟩ − 1")
+        axes.text(dt.min() / 3, 8, r"$\Delta t\to 0$", ha="center")
+        axes.set_title(rf"$\nu={nu:g}$")
+        axes.set_xlabel(r"time step $\Delta t$ ($1/\dot\gamma$)")
+    panels[0].set_ylabel(f"excess of the {RATIO_LABEL} $- 1$")
     handles, labels = panels[0].get_legend_handles_labels()
-    handles.append(Line2D([], [], marker="x", linestyle="none", color="0.4", markersize=9))
-    figure.legend(
-        handles, [*labels, "status not ok"], loc="outside lower center", ncols=4, fontsize="small", frameon=False
-    )
+    handles.append(Line2D([], [], marker="x", linestyle="none", color="0.4", markersize=7))
+    figure.legend(handles, [*labels, "status not ok"], loc="outside lower center", ncols=4)
     return figure
 
 

@@ -104,6 +104,8 @@ def test_measured_numbers_of_a_page_come_from_files(page: str) -> None:
     assert "{%" not in filled and "{{" not in filled
     written = re.sub(r"{{.*?}}|{%.*?%}", "", text)  # what remains was typed
     assert not re.search(r"\d ± \d|[−+]\d[\d.]* %", written)
+    if page.startswith("benchmarks/") or page == "comparison.md":
+        assert not re.findall(r"\S*\d (?:%|ns|µs|ms|s|KiB|MiB|MB|GiB|times)(?!\w)", written)
 
 
 def test_a_changed_result_changes_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -133,9 +135,11 @@ def test_examples_of_docstrings_hold(module: str) -> None:
     assert outcome.failed == 0
 
 
-def test_readme_is_that_of_the_results() -> None:
-    """``python -m benchmarks.pages`` makes it anew."""
-    assert (ROOT / "README.md").read_text(encoding="utf-8") == pages.filled(pages.README.read_text(encoding="utf-8"))
+@pytest.mark.parametrize("page", pages.TEMPLATES)
+def test_readme_and_paper_are_those_of_the_results(page: str) -> None:
+    """``python -m benchmarks.pages`` makes them anew."""
+    written, template = ((ROOT / name).read_text(encoding="utf-8") for name in (page, pages.TEMPLATES[page]))
+    assert written == pages.filled(template)
 
 
 def test_readme_is_short_and_its_links_lead_somewhere() -> None:

@@ -24,7 +24,7 @@ import numpy as np
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.peers import jaxgran_itself, lammps, numba_rival
-from benchmarks.peers.front import OBSERVABLES, TARGET, draw, table
+from benchmarks.peers.front import OBSERVABLES, TARGET, table
 from benchmarks.peers.problem import Discs, Flow, Stress
 from benchmarks.peers.workers import Worker
 from jaxgran.statistics import jackknife
@@ -54,7 +54,7 @@ QUICK = Plan((Case(Flow(0.8, 0.6), 2, 4, 40),), 256, 1)
 
 
 def run(output: Output) -> None:
-    """Compare in all flows, print the tables, and write JSON and PNG."""
+    """Compare in all flows, print the tables, and write JSON."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     plan = QUICK if output.quick else FULL
@@ -78,7 +78,6 @@ def run(output: Output) -> None:
         "flows": flows,
     }
     output.write_json("peers", result)
-    output.write_picture(draw(flows), "peers", dpi=200)
 
 
 def compare_peers(plan: Plan, case: Case, peers: list) -> dict:

@@ -1,24 +1,10 @@
-"""From times and errors to a picture and a table: the time that an error of 3 % takes."""
+"""From times and errors to a table: the time that an error of 3 % takes."""
 
 import math
 
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
 OBSERVABLES = ("pressure", "shear_stress")
 TARGET = 0.03
-FLOOR = 2e-3  # smallest error that is drawn
 COST = "cpu_seconds_per_strain"
-STYLES = {  # marker, shade
-    "jaxgran": ("o", "0.0"),
-    "jaxgran, tolerance 1e-2": ("s", "0.35"),
-    "numba loop": ("^", "0.0"),
-    "LAMMPS, 20 steps a contact": ("D", "#b35806"),
-    "LAMMPS, 10 steps a contact": ("d", "#b35806"),
-}
-LINES = dict(zip(STYLES, ("-", "--", ":", "-", "--"), strict=True))
 
 
 def largest_error(row: dict, names: tuple[str, ...]) -> float:
@@ -60,18 +46,15 @@ def _misses(row: dict, names: tuple[str, ...]) -> bool:
 
 
 def table(flows: list[dict]) -> str:
-    """Markdown: seconds of a core for a unit of strain at 3 %, and their ratio to those of jaxgran."""
-    lines = [
-        f"| α, ν | | s to {100 * TARGET:g} % in pressure | in shear stress | in both | over jaxgran's | by the clock |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    choices = (("pressure",), ("shear_stress",), OBSERVABLES)
-    for flow in flows:
-        for curve in dict.fromkeys(row["curve"] for row in flow["rows"]):
-            cells = [_time(*time_to_target(_rows(flow, curve), names)) for names in choices]
-            ratios = [ratio(flow, curve, cost) for cost in (COST, "wall_seconds_per_strain")]
-            head = f"{flow['restitution']:g}, {flow['packing_fraction']:g}"
-            lines.append(f"| {head} | {curve} | " + " | ".join(cells + ratios) + " |")
+    """Markdown: seconds of a core for a unit of strain at 3 %, a column for each flow, and their ratio to jaxgran's."""
+    names = [f"α {flow['restitution']:g}, ν {flow['packing_fraction']:g}" for flow in flows]
+    lines = ["| | " + " | ".join(f"{name} | over jaxgran's" for name in names) + " |"]
+    lines.append("| --- |" + " --- |" * 2 * len(names))
+    for curve in dict.fromkeys(row["curve"] for flow in flows for row in flow["rows"]):
+        cells = [
+            f"{_time(*time_to_target(_rows(flow, curve), OBSERVABLES))} | {ratio(flow, curve, COST)}" for flow in flows
+        ]
+        lines.append(f"| {curve} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -99,49 +82,3 @@ def ratio(flow: dict, curve: str, cost: str) -> str:
         return "–"
     bounds = {("=", "="): "", ("<", "="): "< ", ("=", "<"): "> ", ("<", "<"): "~ "}
     return f"{bounds[sign, our_sign]}{theirs / ours:.2g}" if curve != "jaxgran" else "1"
-
-
-def draw(flows: list[dict]) -> Figure:
-    """Size of the errors against the time of a unit of strain, one panel a flow."""
-    figure = Figure(figsize=(6.7, 3.4), layout="constrained")
-    panels = figure.subplots(1, len(flows), sharey=True, squeeze=False)[0]
-    curves = [curve for curve in STYLES if any(_drawn(flow, curve) for flow in flows)]
-    for flow, axes in zip(flows, panels, strict=True):
-        for curve in curves:
-            for name, filled, shift in zip(OBSERVABLES, (True, False), (0.97, 1.03), strict=True):
-                _draw_curve(axes, _drawn(flow, curve), curve, name, filled, shift)
-        axes.axhline(TARGET, color="0.6", linewidth=0.8, zorder=0)
-        axes.set(xscale="log", yscale="log", ylim=(FLOOR, 1))
-        axes.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$", fontsize=8)
-        axes.tick_params(labelsize=7.5)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 3)))
-        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    panels[0].set_ylabel("|relative error| of a stress", fontsize=8)
-    panels[len(flows) // 2].set_xlabel("CPU time of a unit of strain (s)", fontsize=8)
-    handles = [
-        Line2D([], [], marker=STYLES[c][0], color=STYLES[c][1], linestyle=LINES[c], label=c, linewidth=1)
-        for c in curves
-    ]
-    handles += [
-        Line2D([], [], marker="o", color="0.4", linestyle="none", label="pressure"),
-        Line2D([], [], marker="o", color="0.4", linestyle="none", markerfacecolor="white", label="shear stress"),
-        Line2D([], [], color="0.6", linewidth=0.8, label=f"{100 * TARGET:g} %"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
-    return figure
-
-
-def _drawn(flow: dict, curve: str) -> list[dict]:
-    return [row for row in _rows(flow, curve) if "errors" in row]
-
-
-def _draw_curve(axes: Axes, rows: list[dict], curve: str, name: str, filled: bool, shift: float) -> None:
-    marker, colour = STYLES[curve]
-    places, sizes = [shift * row[COST] for row in rows], [max(abs(row["errors"][name][0]), FLOOR) for row in rows]
-    noise = [row["errors"][name][1] for row in rows]
-    lower = [min(one, size - FLOOR) for one, size in zip(noise, sizes, strict=True)]
-    axes.errorbar(places, sizes, [lower, noise], color=colour, elinewidth=0.5, linestyle="none", alpha=0.6)
-    face = colour if filled else "white"
-    line = LINES[curve] if filled else "none"
-    axes.plot(places, sizes, marker, color=colour, linestyle=line, linewidth=0.8, markerfacecolor=face, markersize=3.5)

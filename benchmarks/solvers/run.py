@@ -1,6 +1,6 @@
 """Contact solvers side by side: this program's and those of other packages, on the collection of contact problems.
 
-python -m benchmarks solvers          # solvers.json and solvers.png; about 10 minutes
+python -m benchmarks solvers          # about 9 minutes
 python -m benchmarks solvers --quick  # every tenth problem and the smallest ones, under 3 minutes
 
 The other packages come with pip install "jaxgran[solver-peers]"; without them, this program's solvers are compared
@@ -18,7 +18,6 @@ import numpy as np
 from benchmarks.collection import Entry, load
 from benchmarks.networks import SLOTS
 from benchmarks.output import Output
-from benchmarks.solvers.charts import draw_times
 from benchmarks.solvers.groups import FLOWS, summary, table
 from benchmarks.solvers.measure import LIMIT, TARGETS, Attempt, run_solvers, stress_error
 from benchmarks.solvers.roster import DEFAULT, NUMBA_ENGINE, Solver, our_solvers, package_solvers, versions
@@ -28,7 +27,7 @@ _AGREED = 1e-8  # residual of solutions whose velocities are compared
 
 
 def run(output: Output) -> None:
-    """Measure, print the tables, and write ``solvers`` as JSON and PNG."""
+    """Measure, print the tables, and write ``solvers`` as JSON."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     solvers = roster()
@@ -65,9 +64,7 @@ def run(output: Output) -> None:
             for name, found in stress.items()
         },
     }
-    lines = summary(rows)
-    output.write_rows("solvers", head, "summary", lines)
-    output.write_picture(draw_times(lines), "solvers", dpi=200)
+    output.write_rows("solvers", head, "summary", summary(rows))
 
 
 def roster() -> dict[str, Solver]:

@@ -1,6 +1,7 @@
-"""What all figures share: point markers, legends, captions and files.
+"""What all figures share: size, fonts, point markers, legends, captions and files.
 
-Figures use no global plotting state, so they need no display.
+A figure is one or two columns of a journal wide, and its text has at least 7 points at that width. ``STYLE`` says how
+all look, and ``styled`` gives it to a function that draws. No plotting state remains changed, and no display is needed.
 """
 
 from __future__ import annotations
@@ -8,10 +9,11 @@ from __future__ import annotations
 import os
 import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -29,16 +31,39 @@ from jaxgran.maps.schema import FINEST
 from jaxgran.model.checks import InputError, short_repr
 
 LONGEST_NAME = 200  # bytes of a stem; file systems accept 255, and the names of figures are longer than their stem
+ONE_COLUMN, TWO_COLUMNS = 8.5 / 2.54, 17 / 2.54  # inches, width of a figure
 FILE_DPI = 200  # dots per inch of a picture, unless another number is given
-LABEL_SIZE = 9.0  # points, font of the labels of axes
-TICK_SIZE = 8.0  # points, font of the numbers at the ticks
+LABEL_SIZE = 8.0  # points, font of the labels of axes
+TICK_SIZE = 7.5  # points, font of the numbers at the ticks
 SMALL_SIZE = 7.0  # points, font of legends and captions
+STYLE: dict[Any, Any] = {
+    "font.size": LABEL_SIZE,
+    "axes.labelsize": LABEL_SIZE,
+    "axes.titlesize": LABEL_SIZE,
+    "axes.linewidth": 0.6,
+    "figure.titlesize": LABEL_SIZE,
+    "xtick.labelsize": TICK_SIZE,
+    "ytick.labelsize": TICK_SIZE,
+    "xtick.direction": "in",
+    "ytick.direction": "in",
+    "xtick.top": True,
+    "ytick.right": True,
+    "legend.fontsize": SMALL_SIZE,
+    "legend.title_fontsize": SMALL_SIZE,
+    "legend.frameon": False,
+    "legend.handlelength": 2.4,
+    "lines.linewidth": 1.0,
+    "lines.markersize": 4.0,
+    "errorbar.capsize": 0.0,
+}
 PANEL_TITLE: dict[str, Any] = {"fontsize": LABEL_SIZE, "y": 1.0}  # a fixed height: Matplotlib would search for one
 ALPHA_TITLE = "restitution α"
 ALPHA_LABEL = r"$1-\alpha$"
 NU_LABEL = r"packing fraction $\nu$"
 RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 
+P = ParamSpec("P")
+R = TypeVar("R")
 _CAPTION = "caption"  # id of the text under the axes
 _MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
 _NARROW = 4  # largest over smallest value at and below which numbers have equal steps
@@ -206,6 +231,17 @@ class ShownFigure(Figure):
         memory = BytesIO()
         self.savefig(memory, format="png", dpi=110)
         return memory.getvalue()
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Return a function that draws in the style of all figures."""
+
+    @wraps(draw)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> R:
+        with rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return drawn
 
 
 def empty_figure(width: float, height: float) -> Figure:

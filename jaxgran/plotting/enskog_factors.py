@@ -15,6 +15,7 @@ from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     NU_LABEL,
     PANEL_TITLE,
+    TWO_COLUMNS,
     empty_figure,
     finish,
     missing_note,
@@ -80,7 +81,7 @@ def enskog_factors(data: MapData, rate: Literal["pressure", "shear_stress", "dis
     data = require_map(data, *RATIO, *_needed(rate))
     require_plane(data)
     data = finest(ordered(data, *_needed(rate)))
-    figure = empty_figure(width=7.6, height=5.9)
+    figure = empty_figure(TWO_COLUMNS, height=5.3)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
     measured = np.isfinite(data[f"theory/enskog_factor_{rate}_pairs"].values)
     fields, noisy, over = [], False, []

@@ -14,7 +14,9 @@ from jaxgran.plotting.drawing import (
     NU_LABEL,
     PANEL_TITLE,
     RATIO_LABEL,
+    SMALL_SIZE,
     TICK_SIZE,
+    TWO_COLUMNS,
     empty_figure,
     finish,
     ordered,
@@ -58,7 +60,7 @@ def dominating_errors(data: MapData) -> Figure:
     data = require_map(data, *RATIO, *_NEEDED)
     data = finest(ordered(data, *_NEEDED))
     x, y = np.meshgrid(1 - data.restitution.values, data.packing_fraction.values)
-    figure = empty_figure(width=3.4 * len(_PANELS) + 0.6, height=4.6)
+    figure = empty_figure(TWO_COLUMNS, height=4.4)
     panels = figure.subplots(1, len(_PANELS), sharex=True, sharey=True)
     for axes, (name, title) in zip(panels, _PANELS.items(), strict=True):
         parts = relative_ci95(data, name)
@@ -73,7 +75,9 @@ def dominating_errors(data: MapData) -> Figure:
         if whole.size <= 60:
             for *place, error in zip(x[known], y[known], whole[known], strict=True):
                 text = f"{100 * error:.2g}"
-                axes.annotate(text, place, (0, -9), textcoords="offset points", ha="center", va="top", fontsize=6)
+                axes.annotate(
+                    text, place, (0, -9), textcoords="offset points", ha="center", va="top", fontsize=SMALL_SIZE
+                )
         if known.any():
             median, worst = np.median(whole[known]), whole[known].max()
             title += f"\n{100 * median:.2g} % (median), {100 * worst:.2g} % (largest)"

@@ -27,6 +27,7 @@ from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     NU_LABEL,
     SMALL_SIZE,
+    TWO_COLUMNS,
     add_ring_legend,
     curve_key,
     curve_styles,
@@ -68,7 +69,7 @@ def friction_figure(data: MapData) -> Figure:
     data = finest(ordered(data, "macroscopic_friction", "inertial_number"))
     measured = np.isfinite(data.macroscopic_friction.values)
     styles = dict(zip(data.restitution.values.tolist(), curve_styles(data.sizes["restitution"]), strict=True))
-    figure = empty_figure(width=8.6, height=4.4 + 0.16 * len(styles))
+    figure = empty_figure(TWO_COLUMNS, height=3.6 + 0.15 * len(styles))
     left, right = figure.subplots(1, 2)
     for axes, name in ((left, "macroscopic_friction"), (right, "packing_fraction")):
         axes.set_xscale("log")

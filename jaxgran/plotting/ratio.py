@@ -47,8 +47,10 @@ from jaxgran.plotting.drawing import (
     ALPHA_TITLE,
     LABEL_SIZE,
     NU_LABEL,
+    ONE_COLUMN,
     RATIO_LABEL,
     TICK_SIZE,
+    TWO_COLUMNS,
     add_curve_legend,
     curve_key,
     curve_styles,
@@ -93,7 +95,7 @@ def ratio_curves(data: MapData) -> Figure:
     labels = {"force_ratio": RATIO_LABEL}
     if "shear_stress_ratio" in data:
         labels = {"force_ratio": f"(a) {RATIO_LABEL}", "shear_stress_ratio": f"(b) {_SHEAR_LABEL}"}
-    figure = empty_figure(width=2.3 + 2.7 * len(labels), height=3.5)
+    figure = empty_figure(TWO_COLUMNS, height=3.0)
     grid = figure.subplots(1, len(labels), sharey=True, squeeze=False)[0]
     handles: list[Line2D] = []
     joined = {} if has_one_timestep(data) else {"linestyle": "none"}
@@ -146,7 +148,7 @@ def ratio_contours(data: MapData) -> Figure:
     excess, stderr = data.force_ratio.values - 1.0, data.force_ratio_stderr.values
     measured, field = np.isfinite(excess), excess_field(data)
 
-    figure = empty_figure(width=4.5, height=4.1)
+    figure = empty_figure(ONE_COLUMN, height=3.6)
     axes = figure.add_subplot()
     _shade(axes, x, y, field)
     lines = draw_levels(axes, x, y, field, EXCESS_VALUES, colors="black", linewidths=1.1, zorder=3)
@@ -190,8 +192,7 @@ def ratio_against_timestep(data: MapData) -> Figure:
     panels, title = point_panels(data)
     columns = math.ceil(math.sqrt(len(panels)))
     rows = math.ceil(len(panels) / columns)
-    width, height = (5.0, 3.5) if len(panels) == 1 else (1.0 + 1.9 * columns, 1.0 + 1.6 * rows)
-    figure = empty_figure(width, height)
+    figure = empty_figure(TWO_COLUMNS, height=3.0 if len(panels) == 1 else 0.8 + 1.5 * rows)
     grid = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
     handles: list[Line2D] = []
     for axes, (name, curves) in zip(grid, panels, strict=False):

@@ -15,6 +15,7 @@ from jaxgran.plotting.drawing import (
     LABEL_SIZE,
     RATIO_LABEL,
     TICK_SIZE,
+    TWO_COLUMNS,
     add_curve_legend,
     curve_key,
     curve_styles,
@@ -62,9 +63,7 @@ def averages_against_grains(data: MapData) -> Figure:
     data, left_out = _with_few_restitutions(finest(ordered(data, *_QUANTITIES), "timestep"))
     names = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
     panels, title = point_panels(data)
-    figure = empty_figure(
-        1.2 + 2.0 * len(names), (1.2 + 2.2 * len(panels)) if len(panels) == 1 else 1 + 1.7 * len(panels)
-    )
+    figure = empty_figure(TWO_COLUMNS, height=3.0 if len(panels) == 1 else 0.8 + 1.5 * len(panels))
     grid = figure.subplots(len(panels), len(names), sharex=True, squeeze=False)
     handles: list[Line2D] = []
     for row, (words, curves) in zip(grid, panels, strict=True):

@@ -30,8 +30,10 @@ from jaxgran.plotting.drawing import (
     ALPHA_TITLE,
     LABEL_SIZE,
     NU_LABEL,
+    ONE_COLUMN,
     PANEL_TITLE,
     SMALL_SIZE,
+    TWO_COLUMNS,
     add_ring_legend,
     curve_key,
     curve_styles,
@@ -144,7 +146,7 @@ def theory_errors(data: MapData) -> Figure:
     require_plane(data)
     data = finest(ordered(data, *_STRESSES, "stress_ratio"))
     titles = "(a) total: theory/measured", "(b) collisions: binary/measured", "(c) closure: theory/binary"
-    figure = empty_figure(width=7.6, height=5.9)
+    figure = empty_figure(TWO_COLUMNS, height=5.3)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
     fields, noisy, over = [], False, []
     measured = np.ones(data.force_ratio.shape, bool)
@@ -216,7 +218,7 @@ def cluster_shares(data: MapData) -> Figure:
     shares = {"pressure": "stresses/cluster_pressure_share", "shear stress": "stresses/cluster_shear_share"}
     measured = np.isfinite(data["stresses/cluster_pressure_share"].values)
     plane = is_plane(data)
-    figure = empty_figure(*((8.8, 4.6) if plane else (4.8, 4.6)))
+    figure = empty_figure(TWO_COLUMNS if plane else ONE_COLUMN, height=3.8)
     axes = figure.subplot_mosaic("pm;sm" if plane else "p;s", width_ratios=(1.0, 1.15) if plane else None)
     axes["s"].sharex(axes["p"])
     for name, (quantity, share) in zip("ps", shares.items(), strict=True):

@@ -1,0 +1,50 @@
+"""Figures of committed results, drawn again without a measurement: ``python -m benchmarks draw``.
+
+Pictures of single flows (``fields``, ``flow``) and of the quick map keep no result, so their benchmarks draw them.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from benchmarks import (
+    collapse,
+    contact_duration,
+    coverage,
+    gradients,
+    paper,
+    pulse,
+    scaling,
+    speed_vs_accuracy,
+    stability,
+    timestep_study,
+    validation,
+)
+from benchmarks.output import RESULTS, Output
+from benchmarks.pages import read
+from jaxgran.maps.results import open_map
+
+PICTURES: dict[str, Callable[[], Figure]] = {
+    "collapse": lambda: collapse.draw(read("collapse")["rows"]),
+    "contact_duration": lambda: contact_duration.draw(
+        read("contact_duration")["event_driven"], read("contact_duration")["jaxgran"]
+    ),
+    "coverage": lambda: coverage.draw(read("coverage")["over_flows"]),
+    "gradients": lambda: gradients.draw(read("gradients")["flows"]),
+    "pulse": lambda: pulse.draw(read("pulse")["rows"], read("pulse")["run"]["discs_along"]),
+    "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
+    "speed_vs_accuracy": lambda: speed_vs_accuracy.draw(read("peers"), read("speed_vs_accuracy")),
+    "stability": lambda: stability.draw(read("stability")["cells"]),
+    "timestep_study": lambda: timestep_study.draw(read("timestep_study")["flows"]),
+    "validation": lambda: validation.draw(read("validation")["rows"], read("contact_duration")["reference"]),
+    **{f"paper_{name}": lambda draw=draw: draw(open_map(RESULTS / "paper.nc")) for name, draw in paper.FIGURES.items()},
+}
+
+
+def redraw(names: Sequence[str], folder: Path) -> None:
+    """Write the pictures of these names, or all."""
+    output = Output(folder, quick=False, hardware={})
+    for name in names or PICTURES:
+        output.write_picture(PICTURES[name](), name)
+        print(output.path(name, ".png"), flush=True)
