@@ -63,7 +63,7 @@ MEASURED_LAWS = CorrelationLaws(
     pairs=np.array([0.3711, 0.01574, 1.613]),
     pairs_stderr=np.array([0.0239, 0.0008276, 0.01444]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1226, 0.1533, 0.1534]),
+    scatter=np.array([0.1242, 0.1553, 0.1495]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 6400 or 1600, dt = 1e-4",
