@@ -29,6 +29,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.analysis.force_chains import cluster_share, clusters
+from jaxgran.model.display import with_error
 from jaxgran.sampling.averages import averages
 
 jax.config.update("jax_enable_x64", True)
@@ -78,7 +79,7 @@ state, sample = jg.sample(flow, state, strain)
 errors = sample.errors()
 print(f"N = {grains}, dt = {flow.timestep:g}, strain {strain:g}, ± one standard error")
 for name in ("pressure", "shear_stress", "granular_temperature", "coordination_number", "force_ratio"):
-    print(f"{name:22s}{float(sample.averages[name]):8.3f} ± {float(errors[name]):.3f}")
+    print(f"{name:22s}{with_error(float(sample.averages[name]), float(errors[name]))}")
 print("status:", jg.Status(int(sample.status)).name)
 
 # %% [markdown]
@@ -117,8 +118,7 @@ print(f"{impulse.sum() / binary.sum():.4f} by hand, {same.force_ratio:.4f} by jg
 # %%
 share = cluster_share(seen)
 print(f"N = {grains}, dt = {flow.timestep:g}, {steps} time steps, ± one standard error; in clusters are")
-print(f"{share.contacts.value:.3f} ± {share.contacts.error:.3f} of the loaded contacts,", end=" ")
-print(f"{share.force.value:.3f} ± {share.force.error:.3f} of the force")
+print(f"{with_error(*share.contacts)} of the loaded contacts, {with_error(*share.force)} of the force")
 loaded = contacts.used & (impulse > 0)
 time, slot = np.nonzero(loaded)
 clustered = clusters(seen).sizes[time, contacts.i[time, slot]] > 2
@@ -147,7 +147,7 @@ _, samples = jg.sample(flows, states, strain)
 errors = samples.errors()
 
 for k, timestep in enumerate(flows.timestep):
-    found = [f"{samples.averages[name][k]:.3f} ± {errors[name][k]:.3f}" for name in ("force_ratio", "pressure")]
+    found = [with_error(samples.averages[name][k], errors[name][k]) for name in ("force_ratio", "pressure")]
     print(f"N = {grains}, dt = {timestep:.0e}: force ratio {found[0]}, pressure {found[1]}")
 
 # %%

@@ -29,6 +29,7 @@ import numpy as np
 import xarray as xr
 
 import jaxgran as jg
+from jaxgran.model.display import with_error
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
@@ -48,8 +49,7 @@ run = {"grains": 64, "seeds": 1, "strain": 4.0, "equilibrate": 2.0} if quick els
 data = jg.ratio_map(restitution, packing_fraction, timestep=timestep, **run)
 print(f"{int((data.status == jg.Status.ok).sum())} of {data.status.size} points have the status ok")
 print(f"force ratio ± one standard error, N = {run['grains']}, dt = {timestep:g}; a column for each α:")
-ratio, stderr = (data[name].to_pandas() for name in ("force_ratio", "force_ratio_stderr"))
-ratio.map("{:.3f}".format) + stderr.map(" ± {:.3f}".format)
+xr.apply_ufunc(with_error, data.force_ratio, data.force_ratio_stderr, vectorize=True).to_pandas()
 
 # %% [markdown]
 # The force ratio (a) and the shear-stress ratio (b) with one standard error. Both belong to the time step that the

@@ -28,6 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran as jg
+from jaxgran.model.display import with_error
 from jaxgran.theory.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
 
 jax.config.update("jax_enable_x64", True)
@@ -50,23 +51,23 @@ data = jg.ratio_map(restitution, packing_fraction, grains=grains, seeds=1, times
 names = ["local_temperature", "anisotropy", "chaos", "pairs", "binary"]
 
 
-def with_error(data, name):
+def text(data, name):
     """A variable and its standard error as text."""
-    return f"{float(data[name]):.3f} ± {float(data[name + '_stderr']):.3f}"
+    return with_error(float(data[name]), float(data[f"{name}_stderr"]))
 
 
-point = data.sel(restitution=restitution[-2], packing_fraction=packing_fraction[1])
-print(f"α = {restitution[-2]}, ν = {packing_fraction[1]}, N = {grains}, dt = 3e-4, ± one standard error")
+point = data.sel(restitution=restitution[2], packing_fraction=packing_fraction[1])
+print(f"α = {restitution[2]}, ν = {packing_fraction[1]}, N = {grains}, dt = 3e-4, ± one standard error")
 for name in names:
-    print(f"{name:18s} {with_error(point, f'theory/enskog_factor_pressure_{name}')}")
+    print(f"{name:18s} {text(point, f'theory/enskog_factor_pressure_{name}')}")
 product = np.prod([float(point[f"theory/enskog_factor_pressure_{name}"]) for name in names])
 whole = float(point["stresses/contact_pressure"] / point["theory/enskog_pressure"])
 print(f"measured over Enskog's contact pressure: {whole:.4f}; product of the factors: {product:.4f}")
 
 # %% [markdown]
-# The product is an identity. Pairs and chaos compensate each other, and the local temperature lowers both Enskog's
-# pressures and its error: a theory may be right for the wrong reasons. Over the plane, chaos fails first as grains
-# become dissipative, pairs as flows become dense. The binary assumption fails last, where both hold.
+# The product is an identity. Chaos and pairs compensate each other, so a theory may be right for the wrong reasons.
+# Over the plane, chaos fails first as grains become dissipative, and pairs as flows become dense. The binary assumption
+# fails last, where flows are both.
 
 # %%
 jg.enskog_factors(data)
@@ -75,8 +76,9 @@ jg.enskog_factors(data)
 # ## What clusters become as dt → 0
 #
 # The binary factor belongs to its time step. In a shorter one a cluster is a succession of collisions of the same
-# grains: more pairs that approach more slowly. The product stays. So at small α "clusters" and "correlated collisions"
-# are two names for the same thing. At larger α the binary factor goes to one, and the error of the theory remains.
+# grains: more pairs that approach more slowly, and the product stays. At α = 0.2 "clusters" and "correlated collisions"
+# are therefore two names for the same thing. At α = 0.5 the binary factor goes to one, while chaos and pairs keep their
+# values.
 
 # %%
 timesteps = [1e-3, 3e-4] if quick else [1e-3, 1e-4, 3e-5]
@@ -90,8 +92,8 @@ stderr = ratio * np.hypot(
 for alpha in (0.2, 0.5):
     for timestep in timesteps:
         one = {"restitution": alpha, "packing_fraction": 0.6, "timestep": timestep}
-        parts = [f"{x} {with_error(fine.sel(one), f'theory/enskog_factor_pressure_{x}')}" for x in names[2:]]
-        total = f"product {float(ratio.sel(one)):.2f} ± {float(stderr.sel(one)):.2f}"
+        parts = [f"{x} {text(fine.sel(one), f'theory/enskog_factor_pressure_{x}')}" for x in names[2:]]
+        total = f"product {with_error(float(ratio.sel(one)), float(stderr.sel(one)))}"
         print(f"α = {alpha}, ν = 0.6, N = {size}, dt = {timestep:.0e}: {', '.join(parts)}, {total}")
 
 # %% [markdown]
@@ -106,7 +108,7 @@ grown = jg.ratio_map([0.5], [0.6], grains=sizes, timestep=1e-3, seeds=1, **chose
     packing_fraction=0, restitution=0
 )
 for n in sizes:
-    both = [with_error(grown.sel(grains=n), name) for name in ("granular_temperature", "local_granular_temperature")]
+    both = [text(grown.sel(grains=n), name) for name in ("granular_temperature", "local_granular_temperature")]
     print(f"α = 0.5, ν = 0.6, N = {n}, dt = 1e-3: T = {both[0]}, local T = {both[1]} mσ²γ̇²")
 
 # %% [markdown]
@@ -133,7 +135,7 @@ smooth = np.linspace(packing_fraction[0], packing_fraction[-1], 80)
 for k, alpha in enumerate(restitution):
     axes.errorbar(packing_fraction, length[:, k], error[:, k], fmt="os^Dv"[k], ms=4, color=colours[k], label=alpha)
     axes.plot(smooth, correlation_length(MEASURED_LAWS, alpha, smooth), color=colours[k], lw=0.8)
-axes.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L^\prime/\sigma$")
+axes.set(xlabel=r"packing fraction $\nu$", ylabel=r"correlation length $L^\prime/\sigma$")
 axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon=False)
 plt.show()
 
@@ -172,3 +174,7 @@ for axes, (name, (own, label)) in zip(panels, pairs.items(), strict=True):
 panels[0].set_ylabel("predicted")
 panels[0].legend(fontsize=7, frameon=False)
 plt.show()
+
+# %% [markdown]
+# Bars: the scatter of the laws in other flows that were not fitted, and one standard error of what was measured. The
+# rightmost point is nearly elastic and dense, where flows are more viscous than in Enskog's theory.

@@ -32,6 +32,7 @@ import numpy as np
 from jax_md import partition
 
 import jaxgran as jg
+from jaxgran.model.display import with_error
 
 jax.config.update("jax_enable_x64", True)
 warnings.filterwarnings("ignore", "scatter inputs have incompatible types")  # of jax-md's lists, harmless
@@ -149,8 +150,8 @@ parts = force_ratio(sums[:, 0], sums[:, 1])
 engine = force_ratio(tally.impulse, tally.binary_impulse)
 print(f"N = 64, dt = 1e-3, {seeds} seeds of strain {steps * 1e-3:g}")
 for (alpha, nu), *row in zip(points, *parts, *engine, strict=True):
-    line = "α = {}, ν = {}: from parts {:.4f} ± {:.4f}, jg.sample {:.4f} ± {:.4f}, difference {:+.1f} standard errors"
-    print(line.format(alpha, nu, *row, (row[0] - row[2]) / np.hypot(row[1], row[3])))
+    print(f"α = {alpha}, ν = {nu}: from parts {with_error(*row[:2])}, jg.sample {with_error(*row[2:])},", end=" ")
+    print(f"difference {(row[0] - row[2]) / np.hypot(row[1], row[3]):+.1f} standard errors")
 
 # %%
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
