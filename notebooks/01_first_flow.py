@@ -101,7 +101,7 @@ jg.flow_figure(seen)
 # contacts. Taken from the snapshots by hand, it is that of `jg.sample` over the same steps:
 
 # %%
-steps = 20 if quick else 500
+steps = 50 if quick else 500
 state, _ = jg.snapshot_series(flow, state, flow.timestep, 1)
 _, same = jg.sample(flow, state, steps * flow.timestep)
 _, seen = jg.snapshot_series(flow, state, steps * flow.timestep, steps)

@@ -37,7 +37,7 @@ quick = bool(os.environ.get("QUICK"))
 restitution = [0.2, 0.5, 0.8] if quick else [0.1, 0.3, 0.5, 0.7, 0.9]
 packing_fraction = [0.6, 0.7, 0.78] if quick else [0.4, 0.5, 0.6, 0.7, 0.75, 0.79]
 timestep = 5e-4
-run = {"grains": 64, "seeds": 1, "strain": 4.0, "equilibrate": 2.0} if quick else {"grains": 256, "seeds": 2}
+run = {"grains": 64, "seeds": 1} if quick else {"grains": 256, "seeds": 2}
 
 # %% [markdown]
 # ## The map

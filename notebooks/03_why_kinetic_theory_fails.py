@@ -36,7 +36,7 @@ plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layo
 quick = bool(os.environ.get("QUICK"))
 restitution = [0.3, 0.55, 0.8] if quick else [0.2, 0.4, 0.6, 0.8, 0.95]
 packing_fraction = [0.5, 0.65, 0.75] if quick else [0.3, 0.5, 0.6, 0.7, 0.78]
-grains, chosen = (64, {"equilibrate": 2.0, "strain": 4.0}) if quick else (400, {})
+grains = 64 if quick else 400
 colours = plt.cm.viridis(np.linspace(0, 0.85, len(restitution)))
 
 # %% [markdown]
@@ -47,7 +47,7 @@ colours = plt.cm.viridis(np.linspace(0, 0.85, len(restitution)))
 # anisotropy, the speeds at which colliding grains approach (chaos), the pairs at contact, and the impulses (binary).
 
 # %%
-data = jg.ratio_map(restitution, packing_fraction, grains=grains, seeds=1, timestep=3e-4, **chosen)
+data = jg.ratio_map(restitution, packing_fraction, grains=grains, seeds=1, timestep=3e-4)
 names = ["local_temperature", "anisotropy", "chaos", "pairs", "binary"]
 
 
@@ -83,7 +83,7 @@ jg.enskog_factors(data)
 # %%
 timesteps = [1e-3, 3e-4] if quick else [1e-3, 1e-4, 3e-5]
 size = min(grains, 256)
-fine = jg.ratio_map([0.2, 0.5], [0.6, 0.65], timestep=timesteps, grains=size, seeds=1 if quick else 2, **chosen)
+fine = jg.ratio_map([0.2, 0.5], [0.6, 0.65], timestep=timesteps, grains=size, seeds=1 if quick else 2)
 whole, below = fine["stresses/contact_pressure"], fine["theory/enskog_pressure"]
 ratio = whole / below
 stderr = ratio * np.hypot(
@@ -104,9 +104,7 @@ for alpha in (0.2, 0.5):
 
 # %%
 sizes = [64, 144] if quick else [100, 400, 1600]
-grown = jg.ratio_map([0.5], [0.6], grains=sizes, timestep=1e-3, seeds=1, **chosen).isel(
-    packing_fraction=0, restitution=0
-)
+grown = jg.ratio_map([0.5], [0.6], grains=sizes, timestep=1e-3, seeds=1).isel(packing_fraction=0, restitution=0)
 for n in sizes:
     both = [text(grown.sel(grains=n), name) for name in ("granular_temperature", "local_granular_temperature")]
     print(f"α = 0.5, ν = 0.6, N = {n}, dt = 1e-3: T = {both[0]}, local T = {both[1]} mσ²γ̇²")

@@ -42,7 +42,7 @@ grains, strain, seeds = (64, 2.0, 4) if quick else (256, 20.0, 8)
 # %% [markdown]
 # ## A time step costs less than it seems
 #
-# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Eight seeds of one flow from
+# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Several seeds of one flow from
 # the same states, with ever shorter time steps. The first sample lets the contacts adapt, and compiles.
 
 # %%
