@@ -60,7 +60,7 @@ _, transient = jg.sample(flow, start, 6.0, blocks=60)
 blocks = averages(transient.tally, transient.area, grains, transient.shear_rate)
 
 # %%
-figure, axes = plt.subplots(2, 1, figsize=(3.35, 3.2), sharex=True)
+figure, axes = plt.subplots(2, 1, figsize=(3.35, 3.6), sharex=True)
 middle = 0.1 * (np.arange(60) + 0.5)
 axes[0].plot(middle, blocks["granular_temperature"], "k-")
 axes[0].set(ylabel=r"temperature $T$ / $m\sigma^2\dot\gamma^2$", ylim=0)

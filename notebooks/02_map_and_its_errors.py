@@ -135,9 +135,10 @@ for k, one in enumerate(restitution):
     shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
     style = {"fmt": "os^Dv"[k] + "-", "ms": 4, "lw": 0.8, "color": shade, "mfc": "white"}
     axes.errorbar(packing_fraction, 100 * off[:, k], 100 * interval[:, k], label=one, **style)
-    axes.plot(nu[near[:, k], k], 100 * off[near[:, k], k], "os^Dv"[k], ms=4, color=shade)
+    axes.plot(nu[near[:, k], k], 100 * off[near[:, k], k], "os^Dv"[k], ms=4, color=shade, zorder=4)
 axes.set(xlabel=r"packing fraction $\nu$", ylabel="theory's error of the pressure (%)")
-axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon=False, loc="lower left")
+keys = {"title": r"restitution $\alpha$", "title_fontsize": 7, "fontsize": 7, "frameon": False, "columnspacing": 0.8}
+figure.legend(loc="outside upper center", ncols=len(restitution), handletextpad=0.2, **keys)
 plt.show()
 
 # %% [markdown]

@@ -42,8 +42,8 @@ grains, strain, seeds = (64, 2.0, 4) if quick else (256, 20.0, 8)
 # %% [markdown]
 # ## A time step costs less than it seems
 #
-# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Several seeds of one flow from
-# the same states, with ever shorter time steps. The first sample lets the contacts adapt, and compiles.
+# Steps without a contact are jumped over, so a run costs its collisions and not its steps. Several seeds of one flow
+# from the same states, with ever shorter time steps. The first sample lets the contacts adapt, and compiles.
 
 # %%
 timesteps = [3e-3, 1e-3, 3e-4, 1e-4] + ([] if quick else [3e-5])
