@@ -5,10 +5,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import jupytext
 import numpy as np
 import pytest
 from flows import GRAINS
-from test_docs import python_of
+from test_docs import ROOT
 
 import jaxgran as jg
 from jaxgran.analysis.order import pair_correlation
@@ -158,15 +159,14 @@ def test_batch_is_refused_and_vmap_applies(state: State) -> None:
     np.testing.assert_array_equal(distances[0], jg.jax_md_space(state).displacement(*state.positions[:2]))
 
 
-def test_contact_dynamics_of_the_page_has_the_impulses_of_a_sample(tmp_path, monkeypatch) -> None:
+def test_simulator_of_the_notebook_has_the_impulses_of_a_sample(monkeypatch) -> None:
     """Over 40 steps, to ten tolerances of the solver: later, flows of many collisions diverge."""
-    monkeypatch.chdir(tmp_path)
-    first, example = python_of("how-to/jax-md.md")
-    full, short = "1000, 8\nALPHAS, NUS = (0.3, 0.9), (0.5, 0.6, 0.7)\n", "40, 2\nALPHAS, NUS = (0.3,), (0.5, 0.7)\n"
-    assert full in example
+    monkeypatch.setenv("QUICK", "1")
+    cells = jupytext.read(ROOT / "notebooks" / "05_simulator_from_parts.py").cells
+    code = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
     names: dict = {}
-    exec(first + example.replace(full, short), names)
-    sums, tally = names["sums"], names["samples"].tally
-    expected = np.concatenate([tally.impulse, tally.binary_impulse], axis=1)
-    np.testing.assert_allclose(sums[:, :2], expected, rtol=10 * names["SOLVER"].tolerance)
-    assert np.all(expected > 0) and (tmp_path / "public_parts.png").stat().st_size > 1000
+    exec(code[: code.index("plt.rcParams")], names)
+    assert names["steps"] == 40
+    expected = np.concatenate([names["tally"].impulse, names["tally"].binary_impulse], axis=1)
+    np.testing.assert_allclose(names["sums"][:, :2], expected, rtol=10 * names["solver"].tolerance)
+    assert np.all(expected > 0)

@@ -3,6 +3,7 @@
 They are run by ``QUICK=1 pytest --nbmake notebooks``.
 """
 
+import re
 from pathlib import Path
 
 import jupytext
@@ -12,7 +13,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks() -> None:
-    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05", "06"]
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05"]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -24,11 +25,11 @@ def test_a_notebook_and_its_script_are_the_same(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_has_no_outputs_begins_with_a_question_and_ends_with_a_figure(path: Path) -> None:
+def test_a_notebook_has_no_outputs_begins_with_a_question_and_shows_figures(path: Path) -> None:
     cells = jupytext.read(path).cells
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
     title = cells[0].source.splitlines()[0]
     assert title.startswith("# ") and title.endswith("?")
-    last = cells[-1].source.splitlines()[-1]
-    figures = ("plt.show()", "jg.flow_figure(", "jg.ratio_contours(", "jg.theory_errors(", "jg.enskog_factors(")
-    assert last.startswith(figures)
+    shown = [cell.source.splitlines()[-1] for cell in cells if cell.cell_type == "code"]
+    assert any(line == "plt.show()" or re.match(r"jg\.\w+\(", line) for line in shown)
+    assert 'os.environ.get("QUICK")' in "".join(cell.source for cell in cells)

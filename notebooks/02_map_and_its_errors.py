@@ -1,0 +1,146 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Where are collisions binary, and how sure is that?
+#
+# A map of the force ratio over restitution α and packing fraction ν (Lois, Lemaître and Carlson, *Momentum transport in
+# granular flows*), the errors of its numbers, and beside it what `jg.validity` knows without a simulation. `QUICK=1` in
+# the environment makes everything smaller.
+
+# %%
+import os
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import xarray as xr
+
+import jaxgran as jg
+from jaxgran.model.display import with_error
+
+jax.config.update("jax_enable_x64", True)
+plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
+quick = bool(os.environ.get("QUICK"))
+restitution = [0.2, 0.5, 0.8] if quick else [0.1, 0.3, 0.5, 0.7, 0.9]
+packing_fraction = [0.6, 0.7, 0.78] if quick else [0.4, 0.5, 0.6, 0.7, 0.75, 0.79]
+timestep = 5e-4
+run = {"grains": 64, "seeds": 1} if quick else {"grains": 256, "seeds": 2}
+
+# %% [markdown]
+# ## The map
+#
+# Each point is a few independent flows, the seeds. Each is packed, sheared until it is steady, and sampled over six
+# correlation strains. A point where something went wrong keeps its value and has a status.
+
+# %%
+data = jg.ratio_map(restitution, packing_fraction, timestep=timestep, **run)
+print(f"{int((data.status == jg.Status.ok).sum())} of {data.status.size} points have the status ok")
+print(f"force ratio ± one standard error, N = {run['grains']}, dt = {timestep:g}; a column for each α:")
+xr.apply_ufunc(with_error, data.force_ratio, data.force_ratio_stderr, vectorize=True).to_pandas()
+
+# %% [markdown]
+# The force ratio (a) and the shear-stress ratio (b) with one standard error. Both belong to the time step that the
+# caption names.
+
+# %%
+jg.ratio_curves(data)
+
+# %% [markdown]
+# Contours of the excess, the force ratio less one. Above the lowest one more than a twentieth of the mean force is not
+# that of binary collisions at this time step.
+
+# %%
+jg.ratio_contours(data)
+
+# %% [markdown]
+# ## The parts of the total error
+#
+# A standard error says how far another sample of the same flow may be off. The total error also bounds what the time
+# step, the number of grains and the tolerance of the solver change: it is half of a 95 % interval for a large system
+# with exact collisions. A force ratio belongs to its time step, so it has no error from dt. In per cent, at one point:
+
+# %%
+names = ["force_ratio", "pressure", "shear_stress", "granular_temperature"]
+point = data.to_dataset().isel(restitution=1, packing_fraction=1)
+print(f"α = {point.restitution:g}, ν = {point.packing_fraction:g}, N = {run['grains']}, dt = {timestep}")
+xr.Dataset({name: 100 * point[f"{name}_ci95"] / point[name] for name in names}).to_dataframe()[names].round(2)
+
+# %% [markdown]
+# The largest part decides what to do about it: more strain or seeds for sampling, more grains for size.
+
+# %%
+jg.dominating_errors(data)
+
+# %% [markdown]
+# ## Beside the reference map
+#
+# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should agree with that of the
+# map above within both total errors, although N and dt differ. Its force ratio need not: it belongs to another dt.
+
+# %%
+alpha, nu = np.meshgrid(restitution, packing_fraction)
+known = jg.validity(alpha, nu)
+measured, error = data.pressure.values, data.pressure_ci95.sel(error_source="total").values
+inside = abs(measured - known.measured["pressure"]) <= np.hypot(error, known.measured_ci95["pressure"])
+print(f"pressure: {inside.sum()} of {inside.size} differences within the combined 95 % intervals")
+
+# %%
+figure, axes = plt.subplots(figsize=(3.35, 3.0))
+fine = np.linspace(min(packing_fraction), max(packing_fraction), 60)
+for k, one in enumerate(restitution):
+    line = jg.validity(one, fine)
+    middle, half = line.measured["pressure"], line.measured_ci95["pressure"]
+    shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
+    axes.fill_between(fine, middle - half, middle + half, color=shade, alpha=0.3, lw=0)
+    axes.errorbar(packing_fraction, measured[:, k], error[:, k], fmt="os^Dv"[k], ms=3.5, color=shade, label=one)
+axes.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel=r"pressure $p$ / $m\dot\gamma^2$")
+axes.legend(title=r"restitution $\alpha$", title_fontsize=7, fontsize=7, frameon=False)
+plt.show()
+
+# %% [markdown]
+# Bands: the reference map, points: the map above, both with their 95 % intervals.
+#
+# ## Does kinetic theory hold where collisions are binary?
+#
+# Not necessarily. A force ratio near one says that clusters carry little, not that velocities are independent. The best
+# theory of this package, moments of an anisotropic Gaussian with Enskog's collision rate, against the reference map:
+
+# %%
+for one in [(0.9, 0.6), (0.8, 0.75), (0.5, 0.4), (0.2, 0.5)]:
+    print(f"α = {one[0]}, ν = {one[1]}: {jg.validity(*one).verdict()}\n")
+
+# %%
+off, interval, ratio = known.error["pressure"], known.error_ci95["pressure"], known.measured["force_ratio"]
+near = ratio < 1.05
+print(f"{near.sum()} of {near.size} points have a force ratio below 1.05 (N = 1000, dt = 1e-5); at", end=" ")
+print(f"{(near & (abs(off) < 0.1)).sum()} of these the theory's pressure is within 10 %")
+
+# %%
+figure, axes = plt.subplots(figsize=(3.35, 3.0))
+axes.axhspan(-10, 10, color="0.9", zorder=0)
+for k, one in enumerate(restitution):
+    shade = plt.cm.viridis(0.85 * k / (len(restitution) - 1))
+    style = {"fmt": "os^Dv"[k] + "-", "ms": 4, "lw": 0.8, "color": shade, "mfc": "white"}
+    axes.errorbar(packing_fraction, 100 * off[:, k], 100 * interval[:, k], label=one, **style)
+    axes.plot(nu[near[:, k], k], 100 * off[near[:, k], k], "os^Dv"[k], ms=4, color=shade, zorder=4)
+axes.set(xlabel=r"packing fraction $\nu$", ylabel="theory's error of the pressure (%)")
+keys = {"title": r"restitution $\alpha$", "title_fontsize": 7, "fontsize": 7, "frameon": False, "columnspacing": 0.8}
+figure.legend(loc="outside upper center", ncols=len(restitution), handletextpad=0.2, **keys)
+plt.show()
+
+# %% [markdown]
+# Filled symbols: force ratio below 1.05. Grey: 10 %. Bars: 95 % intervals for a large system. The theory fails well
+# below the lowest contour of the force ratio, and the next notebook says why.
