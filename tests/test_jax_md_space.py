@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import GRAINS
-from test_docs import python_of
 
 import jaxgran as jg
 from jaxgran.analysis.order import pair_correlation
@@ -156,17 +155,3 @@ def test_batch_is_refused_and_vmap_applies(state: State) -> None:
         jg.jax_md_space(several)
     distances = jax.vmap(lambda one: jg.jax_md_space(one).displacement(*one.positions[:2]))(several)
     np.testing.assert_array_equal(distances[0], jg.jax_md_space(state).displacement(*state.positions[:2]))
-
-
-def test_contact_dynamics_of_the_page_has_the_impulses_of_a_sample(tmp_path, monkeypatch) -> None:
-    """Over 40 steps, to ten tolerances of the solver: later, flows of many collisions diverge."""
-    monkeypatch.chdir(tmp_path)
-    first, example = python_of("how-to/jax-md.md")
-    full, short = "1000, 8\nALPHAS, NUS = (0.3, 0.9), (0.5, 0.6, 0.7)\n", "40, 2\nALPHAS, NUS = (0.3,), (0.5, 0.7)\n"
-    assert full in example
-    names: dict = {}
-    exec(first + example.replace(full, short), names)
-    sums, tally = names["sums"], names["samples"].tally
-    expected = np.concatenate([tally.impulse, tally.binary_impulse], axis=1)
-    np.testing.assert_allclose(sums[:, :2], expected, rtol=10 * names["SOLVER"].tolerance)
-    assert np.all(expected > 0) and (tmp_path / "public_parts.png").stat().st_size > 1000
