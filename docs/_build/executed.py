@@ -10,6 +10,7 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from contextlib import chdir, redirect_stdout
 from functools import cache
 from io import BytesIO, StringIO
@@ -66,5 +67,5 @@ def _shell(code: str) -> str:
     for words in map(shlex.split, code.replace("\\\n", " ").splitlines()):
         command = [sys.executable, "-m", *words]
         done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-        printed += [line.rstrip() for line in done.stdout.splitlines()]
+        printed += [textwrap.fill(line, 80) if line[:1].isalpha() else line.rstrip() for line in done.stdout.splitlines()]
     return "\n".join(printed)

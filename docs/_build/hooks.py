@@ -116,11 +116,15 @@ def options(command: str) -> str:
     """A table of the options of a command."""
     rows = ["| option | meaning | default |", "| --- | --- | --- |"]
     for name, one in table_of(command, "OPTIONS").items():
-        names = [f"-{one.short}", option_name(name)] if one.short else [option_name(name)]
-        value = "" if one.kind is bool else f" {placeholder(one)}"
+        flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
         meaning = with_options(one.help, parameters(command)) + (f" In {one.unit}." if one.unit else "")
-        cells = (f"`{', '.join(names)}{value}`", meaning, one.default or "–")
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        if isinstance(one.kind, tuple):
+            flag, meaning = f"{flag} NAME", f"{meaning} One of {', '.join(f'`{choice}`' for choice in one.kind)}."
+        elif one.kind is not bool:
+            flag = f"{flag} {placeholder(one)}".replace("|auto", " or auto")
+        elif one.off:
+            flag = f"{flag}, --no-{name}"
+        rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
     return "\n".join(rows)
 
 
