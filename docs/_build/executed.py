@@ -14,11 +14,13 @@ import textwrap
 from contextlib import chdir, redirect_stdout
 from functools import cache
 from io import BytesIO, StringIO
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from matplotlib.figure import Figure
 
+ROOT = Path(__file__).parents[2]
 PAGES = ("tutorial.md",)
 _BLOCK = re.compile(r"^```(python|shell)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
@@ -62,7 +64,7 @@ def _python(code: str, names: dict[str, Any]) -> tuple[str, bytes | None]:
 
 def _shell(code: str) -> str:
     """What commands of ``jaxgran`` print, in 80 columns; an error stops the build."""
-    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
+    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1", "PYTHONPATH": str(ROOT)}  # of this checkout
     printed = []
     for words in map(shlex.split, code.replace("\\\n", " ").splitlines()):
         command = [sys.executable, "-m", *words]
