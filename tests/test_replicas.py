@@ -139,7 +139,7 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
     assert len(example.splitlines()) <= 13
     assert all(line.strip() in jg.__doc__ for line in example.splitlines())
     assert example.split("import jaxgran as jg\n")[1].strip().splitlines()[:2] == [
-        line for line in python_of("tutorial.md")[2].splitlines() if line.startswith(("alphas", "flows"))
+        line for line in python_of("tutorial.md")[1].splitlines() if line.startswith(("alphas", "flows"))
     ]
     exec(example, {})
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")

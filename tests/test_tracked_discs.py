@@ -12,7 +12,7 @@ from benchmarks.tracked_discs import FRAMES, RATE, RESTITUTION, rows
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "notebooks" / "tracked_discs.csv"
-PAGE = (ROOT / "docs" / "how-to" / "tracked-discs.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "commands" / "fit.md").read_text(encoding="utf-8")
 FITS = re.findall(r"^\| `jaxgran (fit \w+\.csv[^`]*)` \| ([^|]+) \| ([^|]+) \| (\d+) \|$", PAGE, re.MULTILINE)
 
 

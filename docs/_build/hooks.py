@@ -1,10 +1,19 @@
 """What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages of its root.
 
-Nothing is kept twice. Charts come from ``benchmarks/results`` into ``charts`` of the site, and the file of tracked discs
-from ``notebooks``. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build.
-``charts/paper.html``, the paper's map as a page to look into, is made from its dataset. ``{OBSERVABLES}`` in a page stands for
-the names, units and meanings in ``jaxgran/sampling/observables.py``, and ``{OPTIONS COMMAND}`` for its options, and ``{BENCHMARKS}`` for the table of
-``benchmarks/registry.py``. Pages are templates, see ``benchmarks/pages.py``. A line between two ``$$`` is a formula of TeX.
+Charts come from ``benchmarks/results`` into ``charts`` of the site, and the file of tracked discs from ``notebooks``. The
+drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build, and
+``charts/paper.html`` from the dataset of the paper's map. Pages are templates (``benchmarks/pages.py``), and those of
+``executed.PAGES`` show what their examples print. A line between two ``$$`` is a formula of TeX.
+
+==================  ================================================================================
+mark in a page      replaced by
+==================  ================================================================================
+{OBSERVABLES}       names, units and meanings of ``jaxgran/sampling/observables.py``
+{OPTIONS COMMAND}   the options of a command
+{EXAMPLES COMMAND}  the examples of its ``--help``
+{BENCHMARKS}        the table of ``benchmarks/registry.py``
+{NOTEBOOKS}         links to the notebooks, by their titles
+==================  ================================================================================
 """
 
 import importlib
@@ -12,8 +21,10 @@ import re
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import architecture
+import executed
 import notebooks
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -31,14 +42,14 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 from benchmarks import pages  # noqa: E402 - not installed, but beside the package
 CHARTS = ROOT / "benchmarks" / "results"
-CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.png)"[^>]*>)')
+CHART = re.compile(r'(<img [^>]*src="([^"]*charts/[^"]+\.(?:png|gif))"[^>]*>)')
 MATHEMATICS = re.compile(r"^\$\$(.+)\$\$$", re.MULTILINE)
 PAGES = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md", "security.md": "SECURITY.md"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the charts and the drawing, and the pages that stand at the root of the project."""
-    for chart in sorted(CHARTS.glob("*.png")):
+    for chart in sorted([*CHARTS.glob("*.png"), *CHARTS.glob("*.gif")]):
         files.append(File.generated(config, f"charts/{chart.name}", abs_src_path=str(chart)))
     files.append(File.generated(config, "charts/architecture.svg", content=architecture.picture()))
     files.append(File.generated(config, "charts/paper.html", content=explore(open_map(CHARTS / "paper.nc")).text))
@@ -48,18 +59,25 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for file, content in beside.items():
             files.append(File.generated(config, f"notebooks/{file}", content=content))
     discs = ROOT / "notebooks" / "tracked_discs.csv"
-    files.append(File.generated(config, f"how-to/{discs.name}", abs_src_path=str(discs)))
+    files.append(File.generated(config, f"commands/{discs.name}", abs_src_path=str(discs)))
     for page, source in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put in the tables of what is measured and of the benchmarks."""
+    """Run the examples, and put in numbers, tables and formulas."""
+    name = page.file.src_uri
+    if name in executed.PAGES:
+        markdown, pictures = executed.executed(markdown, name.removesuffix(".md"))
+        for file, content in pictures.items():
+            files.append(File.generated(config, file, content=content))
     markdown = pages.filled(markdown)
-    charts = "../" * page.file.src_uri.count("/") + "charts/"
+    charts = "../" * name.count("/") + "charts/"
     markdown = re.sub(r"\{OPTIONS (\w+)\}", lambda mark: options(mark[1]), markdown)
-    for mark, table in {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts)}.items():
+    markdown = re.sub(r"\{EXAMPLES (\w+)\}", lambda mark: examples(mark[1]), markdown)
+    tables = {"{OBSERVABLES}": observables, "{BENCHMARKS}": lambda: benchmarks(charts), "{NOTEBOOKS}": list_of_notebooks}
+    for mark, table in tables.items():
         if mark in markdown:
             markdown = markdown.replace(mark, table())
     return MATHEMATICS.sub(lambda formula: typeset(formula[1]), markdown)
@@ -88,16 +106,38 @@ def observables() -> str:
     return "\n".join(rows)
 
 
+def table_of(command: str, kind: str) -> Any:
+    """A constant of the command line, such as ``MAP_OPTIONS``."""
+    module = "map" if command == "plot" else command
+    return getattr(importlib.import_module(f"jaxgran.cli.{module}"), f"{command.upper()}_{kind}")
+
+
 def options(command: str) -> str:
     """A table of the options of a command."""
     rows = ["| option | meaning | default |", "| --- | --- | --- |"]
-    for name, one in getattr(importlib.import_module(f"jaxgran.cli.{command}"), f"{command.upper()}_OPTIONS").items():
-        names = [f"-{one.short}", option_name(name)] if one.short else [option_name(name)]
-        value = "" if one.kind is bool else f" {placeholder(one)}"
+    for name, one in table_of(command, "OPTIONS").items():
+        flag = f"-{one.short}, {option_name(name)}" if one.short else option_name(name)
         meaning = with_options(one.help, parameters(command)) + (f" In {one.unit}." if one.unit else "")
-        cells = (f"`{', '.join(names)}{value}`", meaning, one.default or "–")
-        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        if isinstance(one.kind, tuple):
+            flag, meaning = f"{flag} NAME", f"{meaning} One of {', '.join(f'`{choice}`' for choice in one.kind)}."
+        elif one.kind is not bool:
+            flag = f"{flag} {placeholder(one)}".replace("|auto", " or auto")
+        elif one.off:
+            flag = f"{flag}, --no-{name}"
+        rows.append(f"| `{flag}` | {meaning} | {one.default or '–'} |")
     return "\n".join(rows)
+
+
+def examples(command: str) -> str:
+    """The examples of a command."""
+    lines = [f"# {meaning}\n{example}" for meaning, example in table_of(command, "EXAMPLES").items()]
+    return "\n".join(["```shell", *lines, "```"])
+
+
+def list_of_notebooks() -> str:
+    """The notebooks by their titles, as a list of links from a page beside their folder."""
+    titles = (notebooks.shown(name).markdown.split("\n", 1)[0].lstrip("# ") for name in notebooks.NAMES)
+    return "\n".join(f"- [{title}](notebooks/{name}.md)" for name, title in zip(notebooks.NAMES, titles, strict=True))
 
 
 def benchmarks(charts: str) -> str:

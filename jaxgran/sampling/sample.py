@@ -264,34 +264,13 @@ def sample(
     """Shear a flow, or a batch of flows, and average its observables; ``jit``, ``vmap`` and ``lax.map`` apply.
 
     A batch is a flow or a state whose arrays have a leading (replicas,) axis; what lacks it is the same for all. Each
-    replica has the results of its own call. These two lines do the same; the first is faster with the engine ``Jax``,
-    and is compiled for 1, 2, 4, 8, … replicas only:
-
-        states, samples = jg.sample(flows, states, 5.0)
-        states, samples = jax.vmap(jg.sample, (0, 0, None))(flows, states, 5.0)
+    replica has the results of its own call. ``jax.vmap`` of this function does the same. A batch is faster with the
+    engine ``Jax``, and is compiled for 1, 2, 4, 8, … replicas only.
 
     The result of ``observe`` is averaged over **every** time step, in the same run (see ``observer``). A few instants
     do not suffice for contact forces: at a short time step, most instants of a collisional flow have no contact with a
     force. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and velocities
     are observed once a free flight; their averages are accurate up to the strain of a flight, about 1e-3.
-
-    This example averages the temperatures of small and large grains and the fabric tensor of the contacts:
-
-        def observe(snapshot):
-            grains, n = snapshot.state.grains, snapshot.contacts.normals
-            kinetic = grains.masses * jnp.sum(snapshot.state.velocities**2, axis=1) / 2
-            small = grains.radii < 0.5
-            loaded = (snapshot.impulses > 0).astype(n.dtype)
-            return {
-                "small": jnp.sum(jnp.where(small, kinetic, 0)) / jnp.sum(small),
-                "large": jnp.sum(jnp.where(small, 0, kinetic)) / jnp.sum(~small),
-                "fabric": jnp.einsum("c,ca,cb->ab", loaded, n, n),
-                "contacts": jnp.sum(loaded),
-            }
-
-        state, measured = jg.sample(flow, state, 5.0, observe=observe)
-        means, errors = measured.observed()
-        fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
 
     Args:
       flow: parameters of the state, with its packing fraction and polydispersity; or those (replicas,) of a batch.
@@ -319,6 +298,21 @@ def sample(
         than the flow; the flow is not sheared; the strain is not a positive number, is shorter than one time step a
         block, or is longer than 2**31 - 1 time steps; positions in float32 cannot resolve the time step; the result of
         ``observe`` is not summed over contacts; or the engine cannot do this.
+
+    Examples:
+      The fabric of the contacts that carry a force:
+
+      >>> import jaxgran as jg
+      >>> flow = ShearFlow(grains=32, restitution=0.5, packing_fraction=0.7, timestep=1e-3)
+      >>> state = jg.prepare(flow, jax.random.key(0), equilibrate=0.4)
+      >>> def observe(snapshot):
+      ...     normals = snapshot.contacts.normals
+      ...     loaded = (snapshot.impulses > 0).astype(normals.dtype)
+      ...     return {"fabric": jnp.einsum("c,ca,cb->ab", loaded, normals, normals), "contacts": jnp.sum(loaded)}
+      >>> state, measured = sample(flow, state, 0.4, observe=observe)
+      >>> fabric, error = measured.observed(lambda mean: mean["fabric"] / mean["contacts"])
+      >>> round(float(fabric.trace()), 6), bool(measured.errors()["pressure"] > 0)
+      (1.0, True)
     """
     require_whole("blocks", blocks, 1, MOST_BLOCKS, "as a tally is kept for each")
     strain = as_array(strain)

@@ -104,14 +104,7 @@ def prepare(
 ) -> State:
     """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
 
-    A batch of keys gives as many states, each to rounding that of its own flow and key alone. ``jax.vmap`` does the
-    same:
-
-        flows = jg.ShearFlow(256, restitution=jnp.array([0.5, 0.7]), packing_fraction=0.7, timestep=1e-3)
-        keys = jax.random.split(jax.random.key(0), 2)
-        states = jg.prepare(flows, keys)
-        states = jax.vmap(jg.prepare)(flows, keys)
-        first = states[0]
+    A batch of keys gives as many states, each to rounding that of its own flow and key alone, as does ``jax.vmap``.
 
     Args:
       flow: parameters of one flow; or numbers (replicas,) of several flows.
@@ -132,6 +125,12 @@ def prepare(
         engine cannot do this. Or this function, which decides in Python when a flow is steady, is called within
         ``jax.jit`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
+
+    Examples:
+      >>> flows = ShearFlow(grains=16, restitution=[0.5, 0.9], packing_fraction=0.5, timestep=1e-3)
+      >>> states = prepare(flows, jax.random.split(jax.random.key(0), 2), equilibrate=0.4)
+      >>> states[0].positions.shape, states.tilt.shape
+      ((16, 2), (2,))
     """
     if is_traced(flow, key, grains):
 
