@@ -119,7 +119,8 @@ def make_table(data: xr.DataTree, others: list[xr.DataTree], folder: Path, made_
     attributes = {name: data.attrs[name] for name in ("timestep", "seeds", "polydispersity", "activation")}
     head: dict[str, Any] = {
         "contents": "averages of the reference map of jaxgran in units of m, sigma and 1/shear rate, see table.py",
-        "system": "large, extrapolated from the grains of each point",
+        "grains": " or ".join(str(size) for size in sorted(set(where[-1].tolist()), reverse=True))
+        + ", extrapolated to a large system",
         **{name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in attributes.items()},
         "map commit": data.attrs["commit"],
         **made_from,

@@ -6,7 +6,7 @@ from jaxgran.cli.tables import Table, plain, print_table
 from jaxgran.maps.parameters import Option
 from jaxgran.model.display import with_error
 from jaxgran.reference.table import FACTORS, MEASURED, THEORIES, shipped_table
-from jaxgran.reference.validity import Validity, validity
+from jaxgran.reference.validity import COLUMNS, Validity, validity
 
 WHERE_EXAMPLES = {
     "Does kinetic theory hold at a restitution and a packing fraction": "jaxgran where --restitution 0.7 "
@@ -36,7 +36,7 @@ def run_where_command(restitution: float, packing_fraction: float, json: bool = 
     table = shipped_table()
     print(plain(found.verdict()))
     about = f"α = {restitution:g}, ν = {packing_fraction:g}; ± 95 %; units of m, σ and 1/γ̇"
-    averages = Table(about, ("average", "measured", "kinetic theory", "error"), found.rows())
+    averages = Table(about, COLUMNS, found.rows())
     print_table(averages)
     assumed = "Enskog's contact pressure at the measured granular temperature, one assumption after the other"
     factors = Table(assumed, ("assumed", "factor if measured instead"))
@@ -65,6 +65,11 @@ def _entries(found: Validity) -> dict[str, Entry]:
     for name, value in found.error.items():
         entries[f"error/{name}"] = Entry(value, "kinetic theory over measured average, less one")
         entries[f"error/{name}_ci95"] = Entry(found.error_ci95[name], half)
+    for name, value in found.corrected.items():
+        entries[f"corrected/{name}"] = Entry(value, "prediction of the corrected theory", _UNITS[name])
+    for name, value in found.corrected_error.items():
+        entries[f"corrected_error/{name}"] = Entry(value, "corrected theory over measured average, less one")
+        entries[f"corrected_error/{name}_ci95"] = Entry(found.corrected_error_ci95[name], half)
     for name, value in found.factors.items():
         entries[f"factor/{name}"] = Entry(value, f"contact pressure as measured, over that if {_ASSUMPTIONS[name]}")
         entries[f"factor/{name}_ci95"] = Entry(found.factors_ci95[name], half)

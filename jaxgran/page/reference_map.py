@@ -7,7 +7,7 @@ import xarray as xr
 
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.reference.table import FACTORS, LENGTH, shipped_table
-from jaxgran.reference.validity import validity
+from jaxgran.reference.validity import COLUMNS, validity
 from jaxgran.sampling.observables import OBSERVABLES
 
 _PLANE = ("packing_fraction", "restitution")
@@ -82,6 +82,6 @@ def verdicts(packing_fractions: np.ndarray, restitutions: np.ndarray) -> dict[st
         "about": f"Reference map: {table.made_with}, diameters uniform in σ ± {table.head['polydispersity']} σ; "
         "± is half of the 95 % interval for a large system.",
         "outside": f"The reference map covers α = {first:g} to {last:g} and ν = {loosest:g} to {densest:g}.",
-        "columns": ["average", "measured", "kinetic theory", "error"],
+        "columns": list(COLUMNS),
         "flows": flows,
     }

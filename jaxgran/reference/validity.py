@@ -12,7 +12,10 @@ import numpy as np
 from jaxgran.model.choices import HALF_INTERVAL
 from jaxgran.model.display import with_error
 from jaxgran.reference.evaluation import estimates, over_range
-from jaxgran.reference.table import FACTORS, Table, excess_from_surface, shipped_table
+from jaxgran.reference.table import CORRECTED, FACTORS, Table, excess_from_surface, shipped_table, theory_of
+
+COLUMNS = ("average", "measured", "kinetic theory", "error", "error if corrected")
+"""What ``Validity.rows`` gives of every average."""
 
 _NEGLIGIBLE = 0.02  # a factor of the contact pressure this close to one is not said to fail
 _CAUSES = {  # what is said where a factor is below one, and where it is above
@@ -40,6 +43,9 @@ class Validity(NamedTuple):
     error          theory over measured, less one, of all but the granular temperature and the force ratio; the theory's
                    temperature is compared with the local one
     error_ci95     of each
+    corrected      the same predictions by ``corrected_shear``, with measured laws of correlations and pairs
+    corrected_error, corrected_error_ci95
+                   as error and error_ci95
     factors        the assumptions of Enskog's contact pressure at the measured granular temperature, by name: factors
                    whose product is the measured contact pressure over Enskog's (``sampling.enskog_factors``)
     factors_ci95   of each, from sampling and interpolation at the number of grains of the map
@@ -53,6 +59,9 @@ class Validity(NamedTuple):
     theory: dict[str, Any]
     error: dict[str, Any]
     error_ci95: dict[str, Any]
+    corrected: dict[str, Any]
+    corrected_error: dict[str, Any]
+    corrected_error_ci95: dict[str, Any]
     factors: dict[str, Any]
     factors_ci95: dict[str, Any]
 
@@ -82,16 +91,20 @@ class Validity(NamedTuple):
         return sentences if sentences.ndim else sentences.item()
 
     def rows(self) -> list[list[str]]:
-        """Averages of one flow as texts: name, measured and its interval, theory, error and its interval."""
+        """The ``COLUMNS`` of every average of one flow, as texts; an average and an error with a 95 % interval."""
         found = []
         for name, measured in self.measured.items():
             predicted = self.theory.get(name.removeprefix("local_"))
             theory = "" if predicted is None else f"{predicted:.4g}"
-            error = ""
+            errors = ["", ""]
             if name in self.error:
-                error = f"{with_error(100 * float(self.error[name]), 100 * float(self.error_ci95[name]))} %"
+                of_theories = (
+                    (self.error[name], self.error_ci95[name]),
+                    (self.corrected_error[name], self.corrected_error_ci95[name]),
+                )
+                errors = [f"{with_error(100 * float(x), 100 * float(ci95))} %" for x, ci95 in of_theories]
             interval = with_error(float(measured), float(self.measured_ci95[name]))
-            found.append([name.replace("_", " "), interval, theory, error])
+            found.append([name.replace("_", " "), interval, theory, *errors])
         return found
 
     def _sentence(self) -> str:
@@ -148,14 +161,18 @@ def validity(restitution: Any, packing_fraction: Any) -> Validity:
 
 def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     """The dictionaries of a ``Validity`` at coordinates in the measured range."""
-    measured, ci95, theory, error, error_ci95 = ({} for _ in range(5))
+    measured, ci95, theory, error, error_ci95, corrected, corrected_error, corrected_ci95 = ({} for _ in range(8))
+    logs = table.series(where, xp)
     for name, one in estimates(table, where, xp).items():
+        log = logs[CORRECTED + theory_of(name)]
         measured[name], ci95[name] = one.value_and_ci95(xp)
         if not name.startswith("local_"):
-            theory[name] = xp.exp(one.theory)
+            theory[name], corrected[name] = xp.exp(one.theory), xp.exp(log)
         if name != "granular_temperature":
             error[name] = xp.expm1(-one.over)
             error_ci95[name] = xp.exp(-one.over) * xp.sinh(one.half)
+            over = one.over + one.theory - log
+            corrected_error[name], corrected_ci95[name] = xp.expm1(-over), xp.exp(-over) * xp.sinh(one.half)
     value, stderr = table.surfaces["force_ratio"](where, xp)
     measured["force_ratio"] = 1 + excess_from_surface(value, xp)
     sampling = excess_from_surface(HALF_INTERVAL * stderr, xp) * xp.cosh(value)
@@ -164,4 +181,5 @@ def _evaluated(table: Table, where: Any, xp: Any) -> tuple[dict[str, Any], ...]:
     for name in FACTORS:
         log, stderr = table.surfaces[f"pressure_{name}"](where, xp)
         factors[name], factors_ci95[name] = xp.exp(log), xp.exp(log) * xp.sinh(HALF_INTERVAL * stderr)
-    return measured, ci95, theory, error, error_ci95, factors, factors_ci95
+    corrections = corrected, corrected_error, corrected_ci95
+    return measured, ci95, theory, error, error_ci95, *corrections, factors, factors_ci95
