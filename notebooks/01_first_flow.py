@@ -85,7 +85,7 @@ print("status:", jg.Status(int(sample.status)).name)
 # %% [markdown]
 # ## Contact forces
 #
-# A series of snapshots, one of each of twenty time steps. Lines join grains that push each other, and their width is
+# A series of snapshots, one at each of twenty time steps. Lines join grains that push each other, and their width is
 # the mean force. Red pairs collide alone. Black ones belong to clusters of three or more grains that push at once.
 
 # %%

@@ -59,8 +59,8 @@ xr.apply_ufunc(with_error, data.force_ratio, data.force_ratio_stderr, vectorize=
 jg.ratio_curves(data)
 
 # %% [markdown]
-# Contours of the excess, the force ratio less one. Above the lowest one more than a twentieth of the mean force is not
-# that of binary collisions at this time step.
+# Contours of the excess, the force ratio less one. Above the lowest one the mean force exceeds that of binary
+# collisions by more than a twentieth, at this time step.
 
 # %%
 jg.ratio_contours(data)
@@ -87,8 +87,8 @@ jg.dominating_errors(data)
 # %% [markdown]
 # ## Beside the reference map
 #
-# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should agree with that of the
-# map above within both total errors, although N and dt differ. Its force ratio need not: it belongs to another dt.
+# `jg.validity` reads a map of N = 1000 and dt = 1e-5 that was measured once. Its pressure should agree with that above
+# within the combined intervals, although N and dt differ. Its force ratio need not, since it belongs to another dt.
 
 # %%
 alpha, nu = np.meshgrid(restitution, packing_fraction)

@@ -16,9 +16,9 @@
 # %% [markdown]
 # # Why does kinetic theory fail, and what mends it?
 #
-# Clusters are the obvious suspect. They carry the stress of dense, dissipative flows, but kinetic theory has failed
-# before, where collisions are still binary. This notebook takes measured stresses apart, factor by factor, and puts
-# what it finds back into the theory. `QUICK=1` in the environment makes everything smaller.
+# Clusters are the obvious suspect. They carry the stress of dense, dissipative flows, but kinetic theory fails long
+# before that, where collisions are still binary. This notebook takes measured stresses apart, factor by factor, and
+# puts what it finds back into the theory. `QUICK=1` in the environment makes everything smaller.
 
 # %%
 import os
@@ -143,8 +143,8 @@ plt.show()
 # ## The theory, mended
 #
 # The error of the theory's stress is mainly one of its temperature: with too much dissipation the flow is too cold.
-# `corrected_shear` divides the dissipation by L′ and multiplies collisions by a measured number of pairs at contact,
-# and solves the balance of the moments as before. It needs α and ν only; nothing is adjusted to T, p or τ.
+# `corrected_shear` divides the dissipation by L′, multiplies the pairs at contact by a measured factor, and solves the
+# balance of the moments as before. It needs α and ν only; nothing is adjusted to T, p or τ.
 
 # %%
 alphas, nus = np.meshgrid(restitution, packing_fraction)

@@ -166,7 +166,7 @@ plt.show()
 # What is the restitution of grains that were seen twice? Each flow below is observed at its start, and after a strain
 # of 0.03 with noise of a thousandth of a diameter in its positions. Gauss–Newton steps from α = 0.5 minimise the
 # misfit. The derivative of all positions comes from `jax.jvp`, with `moving_contacts=True`, so that it includes the
-# shift of each collision in time. Its size also gives the standard error, noise/|∂x/∂α|.
+# shift of each collision in time. Its magnitude also gives the standard error, noise/|∂x/∂α|.
 
 # %%
 truth, noise, replicas, iterations = 0.73, 1e-3, (3 if quick else 12), 6
