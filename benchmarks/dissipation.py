@@ -245,7 +245,7 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
 
     A point counts as much as the area of the plane of ln(1 − α) and ν that it stands for.
     """
-    laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points))
+    laws, rms_of, roots = MEASURED_LAWS, {}, np.sqrt(areas(points["alpha"], points["nu"]))
     for name in CORRECTIONS:
 
         def weighted(coefficients: np.ndarray, laws: CorrelationLaws = laws, name: str = name) -> np.ndarray:
@@ -259,10 +259,10 @@ def fitted_laws(points: Points) -> tuple[CorrelationLaws, dict[str, float]]:
     return laws, rms_of
 
 
-def areas(points: Points) -> np.ndarray:
+def areas(alphas: np.ndarray, nus: np.ndarray) -> np.ndarray:
     """The area of the plane of ln(1 − α) and ν that each point of a grid stands for, over the mean."""
-    found = np.ones(points["nu"].size)
-    for x in (-np.log(1 - points["alpha"]), points["nu"]):
+    found = np.ones(nus.size)
+    for x in (-np.log(1 - alphas), nus):
         values, place = np.unique(x, return_inverse=True)
         found *= np.gradient(values)[place]
     return found / found.mean()

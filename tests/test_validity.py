@@ -202,7 +202,7 @@ def test_what_pages_say_of_the_plane_follows_from_the_table(result: dict) -> Non
     page = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
     plane = result["plane"]
     worst, share = plane["worst_binary"], plane["0.1"]
-    assert f"{share['points_binary_within']} of the {plane['points_binary']} points" in page
+    assert f"{100 * share['share_of_binary']:.0f} % of the part" in page
     assert f"{100 * share['share']:.0f} %" in page
     assert f"{100 * plane['0.05']['share']:.0f} %" in page
     assert f"{-100 * worst['error']:.0f} % too low" in page

@@ -106,7 +106,7 @@ class Table:
     @property
     def timestep(self) -> str:
         """Time step of the map as it is written by hand."""
-        return self.head["timestep"].replace("e-0", "e-")
+        return f"{float(self.head['timestep']):.0e}".replace("e-0", "e-")
 
     @property
     def made_with(self) -> str:
