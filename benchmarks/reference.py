@@ -266,9 +266,9 @@ def coverage(rows: list[dict[str, float]]) -> dict[str, dict[str, float]]:
 
 
 def plane(table: Table) -> dict[str, Any]:
-    """Shares of the plane of ln(1 − α) and ν where the theory's pressure is within limits, also where collisions are binary.
+    """Shares of the plane of ln(1 − α) and ν, and of its binary part, where the theory's pressure is within limits.
 
-    There the force ratio is below 1.05. The worst point is the one of the map where the theory's pressure is the lowest.
+    In the binary part the force ratio is below 1.05. Its worst point is that of the map with the lowest prediction.
     """
     alphas, nus = table.columns["restitution"], table.columns["packing_fraction"]
     x, y = (
