@@ -138,6 +138,7 @@ def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) ->
     first, second, _ = batches()
     run.add(first)
     shutil.rmtree(run.folder)
+    run._next_write = 0.0
     run.add(second)
     with pytest.raises(InputError, match="another process is writing"):
         Checkpoint(output, SETTINGS, resume=True)

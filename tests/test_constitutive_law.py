@@ -75,7 +75,9 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
 
     at, step = jnp.array([0.45, 0.71, 1.3]), 1e-4
     by_steps = [(of(at + step * one) - of(at - step * one)) / (2 * step) for one in np.eye(3)]
-    np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=1e-5, atol=1e-8)
+    # an interval is the root of a difference of numbers of order 500, whose rounding a difference over steps magnifies
+    rtol = 1e-4 if name.endswith("ci95") else 1e-5
+    np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=rtol, atol=1e-8)
 
 
 def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:

@@ -150,7 +150,7 @@ def test_force_ratios_at_several_time_steps_are_neither_contoured_nor_joined(tmp
     timesteps = np.linspace(1e-4, 9e-4, 9).reshape(3, 3)
     data = data.assign_coords(point_timestep=(data.force_ratio.dims, timesteps))
     data.attrs["timestep_by_point"] = timesteps.ravel()
-    with pytest.raises(InputError, match=r"^a contour of the force ratio needs .* are 0.0001 to 0.0009 / shear rate"):
+    with pytest.raises(InputError, match=r"^a contour of the force ratio needs .* at 0.0001 to 0.0009 / shear rate"):
         ratio_contours(data)
     curves = [one[0] for one in ratio_curves(data).axes[0].containers if isinstance(one, ErrorbarContainer)]
     assert {line.get_linestyle() for line in curves} == {"None"}

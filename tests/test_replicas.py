@@ -144,7 +144,7 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
     exec(example, {})
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     printed, shown = (
-        np.array([re.findall(r"\d+\.\d+", line) for line in text.splitlines() if line.startswith("α = ")], float)
+        np.array([re.findall(r"\d+\.\d+", line) for line in re.findall("^α = .*: .* ± .*", text, re.MULTILINE)], float)
         for text in (capsys.readouterr().out, readme)
     )
     assert printed.shape == (9, 4)

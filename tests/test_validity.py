@@ -97,6 +97,9 @@ def test_the_table_is_met_at_its_points_within_their_intervals() -> None:
         assert np.mean(apart < own) > 0.95
 
 
+VARIANCE_ROUNDING = 1e-4  # of a half-width: eps × 500 × √294 points over 1e-8 is 2e-4 of the variance at most
+
+
 def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     alphas, nus = np.array([0.2, 0.5, 0.9]), np.array([[0.3], [0.7]])
     found = jg.validity(alphas, nus)
@@ -107,8 +110,8 @@ def test_arrays_broadcast_and_jit_vmap_give_the_same_numbers() -> None:
     )
     for one in (compiled, mapped):
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(one), strict=True):
-            # a variance is the difference of two numbers of order 100, and those of factors are of order 1e-6
-            np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=1e-5)
+            # a variance is the difference of two numbers of order 500, and those of factors are of order 1e-8
+            np.testing.assert_allclose(np.broadcast_to(a, (2, 3)), b, rtol=VARIANCE_ROUNDING)
 
 
 @pytest.mark.parametrize("name", ["pressure", "shear_stress", "local_granular_temperature", "force_ratio"])
@@ -123,14 +126,14 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
 
 
 def test_outside_the_range_is_refused_or_nan_where_jax_traces_it() -> None:
-    with pytest.raises(jg.InputError, match=r"packing_fraction must be between 0.1 and 0.82, the range"):
-        jg.validity(0.5, [0.5, 0.83])
+    with pytest.raises(jg.InputError, match=r"packing_fraction must be between 0.1 and 0.83, the range"):
+        jg.validity(0.5, [0.5, 0.84])
     for wrong in ("a", None, np.nan, []):
         with pytest.raises(jg.InputError, match="restitution must be between"):
             jg.validity(wrong, 0.5)
-    values = jax.jit(jg.validity)(jnp.array([0.05, 0.5]), 0.5).measured["pressure"]
+    values = jax.jit(jg.validity)(jnp.array([0.04, 0.5]), 0.5).measured["pressure"]
     assert list(np.isnan(values)) == [True, False]
-    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(jnp.array([0.05, 0.5]))
+    slopes = jax.grad(lambda x: jnp.nansum(jg.validity(x, 0.5).measured["pressure"]))(jnp.array([0.04, 0.5]))
     assert np.all(np.isfinite(slopes))
 
 
@@ -143,7 +146,7 @@ def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> jg.
     all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {name: np.array(x) for name, x in factors.items()}
     measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
     errors = {"pressure": np.array(error)}, {"pressure": np.array(ci95)}
-    return jg.Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, all_factors, {})
+    return jg.Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {})
 
 
 @pytest.mark.parametrize(
@@ -173,7 +176,8 @@ def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: 
     assert printed["verdict"]["value"] == found.verdict()
     for name in MEASURED:
         assert printed[name]["value"] == pytest.approx(float(found.measured[name]))
-        assert printed[f"{name}_ci95"]["value"] == pytest.approx(float(found.measured_ci95[name]))
+        ci95 = float(found.measured_ci95[name])
+        assert printed[f"{name}_ci95"]["value"] == pytest.approx(ci95, rel=VARIANCE_ROUNDING)
 
 
 @pytest.mark.parametrize(("alpha", "nu"), FLOWS)
