@@ -11,7 +11,10 @@ tolerance  34 times the relative residual of a contact solve, for the part of th
            (``tests/test_solvers.py``)
 size       ``size_error``: long waves of velocity are missing in small systems, and the packing fraction at which
            they jam scatters (``benchmarks size_limits``)
-=========  ================================================================================================="""
+=========  ========================================================================================================
+
+A force ratio belongs to its time step, so the time step adds no error to it.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
