@@ -19,9 +19,8 @@ pairs              the pairs at contact: B/E(T) over the factor chaos, with B th
 binary             the impulses: C/B, with C the measured rate
 =================  ==================================================================================================
 
-The local temperature is relative to the mean velocity of boxes of about 25 grains. It has a limit for a large system.
-Whether the granular temperature has one, to which long waves add, is not decided (page "What the number of grains
-does").
+The local temperature is relative to the mean velocity of boxes of about 25 grains. In larger systems it hardly changes.
+The granular temperature, to which long waves add, still grows at 25,600 grains (page "System size").
 
 A binary stress is the density of pairs at contact times ⟨g²⟩, the mean square of the speed of approach g over these
 pairs. A mean over pairs is a sum of 1/g over collisions. Where grains collapse onto each other this sum diverges, as
