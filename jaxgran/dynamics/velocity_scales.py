@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxgran.model.cell import wrap
 from jaxgran.model.state import State
 
 BOX_GRAINS = 25  # mean number of grains in a box, as nearly as equal boxes allow
@@ -56,6 +57,6 @@ def wave_temperature(state: State) -> Float[Array, ""]:
 
 def _in_cell(state: State) -> Float[Array, "grains 2"]:
     """Positions in the sheared cell, in units of its lattice vectors, from 0 to 1."""
-    x, y = state.positions.T
-    across = jnp.stack([x - state.tilt * y, y], axis=1) / state.side
-    return across - jnp.floor(across)
+    x, y = wrap(state.positions, state.side, state.tilt).T
+    across = (x - state.tilt * y) / state.side
+    return jnp.stack([across - jnp.floor(across), y / state.side], axis=1)
