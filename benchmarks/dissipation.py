@@ -25,7 +25,7 @@ from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import flattened
-from jaxgran.plotting.drawing import curve_styles, label_log_axis
+from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 from jaxgran.theory.corrected_shear import (
     MEASURED_LAWS,
     CorrelationLaws,
@@ -108,6 +108,11 @@ def sizes_of(data: xr.DataTree) -> dict[str, int]:
 def keep(row: dict[str, float]) -> dict[str, float]:
     """What a prediction of the flow is compared with."""
     return {name: row[name] for name in ("alpha", "nu", *PREDICTED, "length_from_pressure", "pair_factor")}
+
+
+def of_rows(rows: list[dict[str, float]]) -> Points:
+    """Points from their rows in a result."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
 def compared(data: xr.Dataset) -> Points:
@@ -368,9 +373,10 @@ def root_chaos(points: Points) -> float:
     return float(np.max(abs(points["times_root_chaos"] - 1)[abs(points["binary"] - 1) < 0.01]))
 
 
+@styled
 def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
     """L′ against the packing fraction with its law, and predicted over measured pressure at flows of another map."""
-    figure = Figure(figsize=(7.4, 3.6), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     dense = np.linspace(points["nu"].min(), points["nu"].max(), 200)
     for alpha, style in zip(DRAWN, curve_styles(len(DRAWN)), strict=True):
@@ -389,6 +395,6 @@ def draw(points: Points, judged: Points, laws: CorrelationLaws) -> Figure:
     right.set(yscale="log", xlabel=r"packing fraction $\nu$", ylabel="predicted / measured pressure")
     for axes, place in ((left, "upper left"), (right, "lower left")):
         axes.axhline(1, color="0.6", linewidth=0.8, zorder=0)
-        axes.legend(fontsize="small", frameon=False, loc=place)
+        axes.legend(fontsize=SMALL_SIZE, frameon=False, loc=place)
         label_log_axis(axes.yaxis)
     return figure

@@ -12,10 +12,13 @@ from benchmarks import (
     collapse,
     contact_duration,
     coverage,
+    dissipation,
+    enskog_factors,
     gradients,
     paper,
     pulse,
     scaling,
+    size_figures,
     speed_vs_accuracy,
     stability,
     timestep_study,
@@ -24,12 +27,18 @@ from benchmarks import (
 from benchmarks.output import RESULTS, Output
 from benchmarks.pages import read
 from jaxgran.maps.results import open_map
+from jaxgran.theory.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "collapse": lambda: collapse.draw(read("collapse")["rows"]),
     "contact_duration": lambda: contact_duration.draw(
         read("contact_duration")["event_driven"], read("contact_duration")["jaxgran"]
     ),
+    "dissipation": lambda: dissipation.draw(
+        *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")), MEASURED_LAWS
+    ),
+    "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),
+    "enskog_factors": lambda: enskog_factors.draw(enskog_factors.FULL, read("enskog_factors")["rows"]),
     "coverage": lambda: coverage.draw(read("coverage")["over_flows"]),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),
     "pulse": lambda: pulse.draw(read("pulse")["rows"], read("pulse")["run"]["discs_along"]),

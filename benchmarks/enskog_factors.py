@@ -27,7 +27,7 @@ import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.theory_variables import LENGTHS
-from jaxgran.plotting.drawing import curve_styles
+from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
 from jaxgran.sampling.enskog_factors import FACTORS, RATES, measured_over_enskog
 from jaxgran.sampling.sample import estimates
 
@@ -136,9 +136,10 @@ def line(one: dict) -> str:
     return begin + "{:8.3f} ± {:.3f}".format(*one["force_ratio"]) + f"{warm:8.2f} {factors}"
 
 
+@styled
 def draw(plan: Plan, rows: list[dict]) -> Figure:
     """The factors of the pressure: a row for each, against dt on the left and N on the right, a line for each flow."""
-    figure = Figure(figsize=(7.4, 9.6), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 8.2), layout="constrained")
     grid = figure.subplots(len(FACTORS), 2, sharex="col", sharey="row")
     sides = (("timestep", "grains", plan.size_of_timesteps), ("grains", "timestep", START))
     for panels, factor in zip(grid, FACTORS, strict=True):
@@ -168,7 +169,7 @@ def draw(plan: Plan, rows: list[dict]) -> Figure:
         title="contact pressure: measured over assumed",
         loc="outside upper center",
         ncols=3,
-        fontsize="small",
+        fontsize=SMALL_SIZE,
         frameon=False,
     )
     return figure

@@ -6,6 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, styled
+
 LOOSE = 0.7  # packing fraction up to which a flow is drawn among the loose ones
 STYLES = [
     {"color": "black", "marker": "o", "linestyle": "-"},
@@ -33,11 +35,12 @@ def flow_name(alpha: float, nu: float) -> str:
     return f"α {alpha:g}, ν {nu:g}"
 
 
+@styled
 def draw_sizes(rows: list[dict]) -> Figure:
     """Values against N, relative to the largest one; a column for each kind of flow, with standard errors."""
     groups = [(name, [row for row in rows if inside(row)]) for name, inside in GROUPS]
     groups = [(name, chosen) for name, chosen in groups if chosen]
-    figure = Figure(figsize=(1.2 + 3.6 * len(groups), 11), layout="constrained")
+    figure = Figure(figsize=(TWO_COLUMNS, 8.0), layout="constrained")
     panels = figure.subplots(len(PANELS), len(groups), sharex=True, squeeze=False)
     for column, (title, chosen) in zip(panels.T, groups, strict=True):
         flows = sorted({(row["restitution"], row["packing_fraction"]) for row in chosen})
@@ -51,8 +54,8 @@ def draw_sizes(rows: list[dict]) -> Figure:
                 axes.set_yscale("log")
             else:
                 axes.axhline(1, color="0.6", linewidth=0.8)
-        column[0].set_title(f"{title}", fontsize="medium")
-        column[0].legend(fontsize="x-small", frameon=False)
+        column[0].set_title(f"{title}", fontsize=LABEL_SIZE)
+        column[0].legend(fontsize=SMALL_SIZE, frameon=False)
         column[-1].set_xlabel("number of grains N")
     for axes, (_, label) in zip(panels[:, 0], PANELS, strict=True):
         axes.set_ylabel(label)
@@ -97,7 +100,7 @@ def draw_waves(states: Mapping[tuple[float, float], tuple[int, dict]], edges: np
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.axhline(1, color="0.6", linewidth=0.8)
-        axes.set_title(title, fontsize="medium")
+        axes.set_title(title, fontsize=LABEL_SIZE)
         axes.set_xlabel("wave number (1/σ)")
         axes.set_ylabel(label)
         axes.grid(color="0.9")
