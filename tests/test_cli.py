@@ -123,7 +123,7 @@ MISTAKES = {  # one for each kind of option, check and file
     "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
     "explore text.nc --output page.nc": "output must be a file name that ends in .html",
     "plot none.nc": "there is no file",
-    "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.82",
+    "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.83",
     "fit text.gsd --pressure 3": "--pressure requires a map, and 'text.gsd' is none",
     "fit text.nc --frame-time 1": "--frame-time requires tracks of discs, and 'text.nc' is a map",
     "fit text.nc --pressure 3": "--packing-fraction must be given, too",
