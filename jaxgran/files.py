@@ -63,7 +63,7 @@ def read_cached(path: Path) -> bytes | None:
     return None
 
 
-def other_version(name: str, found: object, version: int) -> str:
+def other_version(name: str, found: object, version: int | str) -> str:
     """A sentence if a file has another ``format_version`` than this version of jaxgran reads; "" if it has the same."""
     if found == version:
         return ""

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxgran.files import other_version
+from jaxgran.model.checks import InputError
 from jaxgran.reference.surface import Shape, Surface, coordinates, packing_fraction
 
 MEASURED = {
@@ -47,6 +49,7 @@ FACTORS = ("local_temperature", "anisotropy", "chaos", "pairs", "binary")
 """Factors of the contact pressure over Enskog's, in the order of ``sampling.enskog_factors``."""
 
 FOLDER = Path(__file__).parent
+_FORMAT_VERSION = "1"  # of the files
 _EXCESS = 0.01  # the force ratio's surface is that of asinh((ratio − 1)/0.01): linear below, logarithmic above
 _BOUND_SHAPE = Shape(1.0, (1.0, 1.0))  # of the logarithm of a bound, which varies slowly
 _BOUND_STDERR = 0.02
@@ -174,15 +177,17 @@ def read_table(folder: Path) -> Table:
 
 
 def read_columns(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Head and columns of a file."""
+    """Head and columns of a file; InputError if it has another format."""
     lines = path.read_text(encoding="utf-8").splitlines()
     head = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
+    if wrong := other_version(path.name, head.get("format_version"), _FORMAT_VERSION):
+        raise InputError(wrong)
     names, *rows = [line.split(",") for line in lines if not line.startswith("#")]
     return head, dict(zip(names, np.array(rows, float).T, strict=True))
 
 
 def write_columns(path: Path, head: dict[str, Any], columns: dict[str, Any], digits: int = 6) -> None:
     """Write a file that ``read_columns`` reads."""
-    lines = [f"# {name}: {value}" for name, value in head.items()]
+    lines = [f"# {name}: {value}" for name, value in {"format_version": _FORMAT_VERSION, **head}.items()]
     rows = [",".join(f"{value:.{digits}g}" for value in row) for row in zip(*columns.values(), strict=True)]
     path.write_text("\n".join([*lines, ",".join(columns), *rows]) + "\n", encoding="utf-8")
