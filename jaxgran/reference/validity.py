@@ -114,16 +114,14 @@ class Validity(NamedTuple):
         if abs(error) > ci95:
             side = "over" if error > 0 else "under"
             start = f"Kinetic theory {side}estimates the pressure by {with_error(abs(error), ci95)} %"
-            before = ": "
         else:
             start = f"Kinetic theory agrees with the measured pressure (error {with_error(error, ci95)} %)"
-            before = "; the largest departure from Enskog's assumptions: "
         if first == "none":
             cause = "; no assumption changes the contact pressure by more than 2 %"
         else:
             factor = float(self.factors[first])
-            why = f"a factor of {factor:.2g} in the contact pressure at the measured temperature"
-            cause = f"{before}{_CAUSES[first][factor > 1]} ({why})"
+            why = f"a factor of {factor:.3g} in the contact pressure at the measured temperature"
+            cause = f"; the largest departure from Enskog's assumptions: {_CAUSES[first][factor > 1]} ({why})"
         ratio, ratio_ci95 = (float(x["force_ratio"]) for x in (self.measured, self.measured_ci95))
         off = max(ratio - 1, 0.0) + ratio_ci95
         if off < 0.05:

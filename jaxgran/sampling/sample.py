@@ -282,8 +282,8 @@ def sample(
         such as a lambda that is written anew, is compiled, so define it once. Beside the numba engine this takes about
         2 s. Where the engine ``Jax`` runs, or the function uses values from outside that JAX traces, that engine is
         compiled with it, in about 20 s. The next process loads the program.
-        The contacts are those of a step with an approaching contact, before the impulses act. The size of their
-        buffers varies, so ``observe`` must sum over contacts. A step without an approaching contact counts as zero.
+        The contacts are those of a step with an approaching contact, before the impulses act; other steps have none.
+        The size of their buffers varies, so ``observe`` must return sums over contacts or over grains.
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
         One block is then compiled at a time, and neither batches nor JAX transformations apply.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
