@@ -1,9 +1,8 @@
 """Estimates for a large system, from a map of several numbers of grains N.
 
-Averages of a sheared flow depend on N. Dense flows hardly change beyond N = 400. Loose dissipative flows change by
-about the same amount for each factor of four, up to some thousands of grains. They follow neither 1/N nor 1/L, with L
-the side of the cell, so nothing is extrapolated. The estimate is the value at the largest N, and its error bounds the
-change beyond N.
+Averages of a sheared flow depend on N. They approach those of a large system by a power of N that differs between
+averages and is small (page "System size"). A few sizes do not determine it, so nothing is extrapolated here. The
+estimate is the value at the largest N, and its error bounds the change beyond N.
 
 The change beyond N is at most K times the difference between N and N/4. In flows with 0.2 ≤ α ≤ 0.95 and 0.2 ≤ ν ≤
 0.8, run up to N = 25600, K was at most 2 for the pressure and 3 for the granular temperature.
