@@ -7,10 +7,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxgran.model.choices import HALF_INTERVAL
+from jaxgran.plotting.drawing import ONE_COLUMN
 from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import FACTORS, Table, excess_from_surface
 
-COLUMN = 8.5 / 2.54  # inches
 NATURAL = 0.75  # packing fraction below which most natural flows are
 LEVELS = (-0.5, -0.25, -0.1, -0.05, 0.05, 0.1, 0.25, 0.5)
 NEGLIGIBLE = 0.02  # a factor this close to one is not shaded
@@ -34,7 +34,7 @@ def draw(table: Table) -> Figure:
     x = np.geomspace(*(1 - np.array(table.range("restitution"))), POINTS)
     y = np.linspace(*table.range("packing_fraction"), POINTS)
     where = coordinates(*np.meshgrid(1 - x, y))
-    figure = Figure(figsize=(COLUMN, 1.2 * COLUMN), layout="constrained")
+    figure = Figure(figsize=(ONE_COLUMN, 1.2 * ONE_COLUMN), layout="constrained")
     axes = figure.add_subplot()
     axes.set_xscale("log")
     axes.set_xlim(x.min(), x.max())

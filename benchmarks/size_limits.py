@@ -25,7 +25,7 @@ import jaxgran as jg
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.sampling.budget import SIZE_SPREAD
+from jaxgran.sampling.budget import SIZE_SPREAD, SizeLaw
 
 AVERAGES = ("pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -35,7 +35,6 @@ LAWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 EXPONENTS = np.arange(0.01, 1.5, 0.005)
 LARGEST_FRACTION, LEAST_GRAINS = 0.7, 400
-WIDTH = 0.1  # of the packing fractions over which waves end
 START = (0.4, 0.01, 0.1, 0.5, 0.84)  # s, a, b, m, ν_w
 
 
@@ -135,9 +134,7 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
 
 def missing_part(constants: np.ndarray, flow: Flow) -> np.ndarray:
     """The missing part of an average over its limit, at every N of a flow."""
-    s, a, b, m, end = constants
-    waves = (a + b * (1 - flow.restitution)) * np.exp(m * (flow.packing_fraction - 0.5))
-    return waves * np.clip((end - flow.packing_fraction) / WIDTH, 0, 1) * (flow.grains / 1600) ** -s
+    return SizeLaw(*constants).missing(flow.restitution, flow.packing_fraction, flow.grains)
 
 
 def law_of(flows: list[Flow]) -> dict[str, Any]:
