@@ -119,6 +119,13 @@ BENCHMARKS = (
         ("dense_rheology.json", "dense_rheology.png"),
     ),
     Benchmark(
+        "dense_flows",
+        "What are friction and pressure of 4000 grains between ν = 0.83 and jamming?",
+        (60, 0.5),
+        ("dense_flows.json",),
+        one_core=True,
+    ),
+    Benchmark(
         "dense_limit",
         "Are dense flows compatible with the exponents that are published for the jamming transition?",
         (0.1, 0.1),
