@@ -1,14 +1,15 @@
-"""Are the flows of ``dense_rheology`` compatible with the exponents that are published for the jamming transition?
+"""Are dense flows compatible with the exponents that are published for the jamming transition?
 
-Reads the 16 flows of ``python -m benchmarks dense_rheology`` (0.79 ≤ ν ≤ 0.83), and fits packing fraction and friction
-by
+Reads the 16 flows of ``python -m benchmarks dense_rheology`` (N = 1000, 0.79 ≤ ν ≤ 0.83) and those of ``dense_flows``
+(N = 4000, from ν = 0.83 on), and fits packing fraction and friction by
 
     ν(I) = ν_c − k I^c − k₂ I^d,        μ(I) = μ₀ + a I^c + a₂ I^d,
 
 with c fixed to 0.40, which is 2/β with β = 5.0 ± 0.4 (Vågberg, Olsson and Teitel, Phys. Rev. E 93, 052902, 2016), or to
 0.35 (DeGiuli, Düring, Lerner and Wyart, Phys. Rev. E 91, 062206, 2015), and with the correction to scaling d fixed to
 2c or to 1; the spread over these choices is the model error. A fit whose k is negative contradicts its law. Beside
-them stands the fit of one power law with a free exponent.
+them stand the fits of one power law with a free exponent, to all flows and without the loosest: an exponent that goes
+on falling is an effective one.
 The exponent δ of p/T ∝ (ν_c − ν)^(−δ) is fitted with each ν_c; 2 is published (Otsuki, Hayakawa and Luding, Prog.
 Theor. Phys. Suppl. 184, 110, 2010).
 
@@ -27,6 +28,8 @@ from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
 
 EXPONENTS = (0.40, 0.35)
+LOOSEST = (0.79, 0.81, 0.82)  # smallest packing fraction of a fit with a free exponent
+FREE = np.linspace(0.1, 1.4, 261)  # exponents that are tried
 ROUNDS = 30  # of the effective variance
 
 
@@ -64,6 +67,39 @@ def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[floa
     return constants[1], np.sqrt(covariance[1, 1] * reduced)
 
 
+def free_fit(points: dict[str, np.ndarray], abscissa: str) -> dict[str, Any]:
+    """Offset and exponent of one power law of I, each with its standard error, and the reduced χ².
+
+    The error of the exponent is half the range in which χ² grows by one, or by its reduced value where that is larger;
+    that of the offset is half of its range there.
+    """
+    number, number_error = points["inertial_number"], points["inertial_number_stderr"]
+    error = points.get(f"{abscissa}_stderr", np.zeros_like(number))
+    fits = [fit(number, number_error, points[abscissa], error, exponent) for exponent in FREE]
+    freedom = len(number) - 3
+    chi_squared = np.array([one.reduced_chi_squared for one in fits]) * (len(number) - 2)
+    best = int(np.argmin(chi_squared))
+    reduced = chi_squared[best] / freedom
+    inside = chi_squared - chi_squared[best] <= max(1.0, reduced)
+    offsets = np.array([one.offset for one in fits])
+    found = {
+        "offset": [offsets[best], np.ptp(offsets[inside]) / 2],
+        "exponent": [FREE[best], np.ptp(FREE[inside]) / 2],
+        "reduced_chi_squared": reduced,
+    }
+    return rounded({name: np.asarray(value, float).tolist() for name, value in found.items()}, 4)
+
+
+def free_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """The fits of one power law to packing fraction and friction, a row for each smallest packing fraction."""
+    rows = []
+    for least in LOOSEST:
+        chosen = {name: values[points["packing_fraction"] >= least] for name, values in points.items()}
+        laws = {name: free_fit(chosen, name) for name in ("packing_fraction", "macroscopic_friction")}
+        rows.append({"least_packing_fraction": least, "points": len(chosen["packing_fraction"]), **laws})
+    return rows
+
+
 def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """A row for each exponent and each correction to scaling."""
     number, number_error = points["inertial_number"], points["inertial_number_stderr"]
@@ -93,25 +129,24 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
 
 def run(output: Output) -> None:
     """Fit, print a line for each fit, and write them as JSON."""
-    study = json.loads((RESULTS / "dense_rheology.json").read_text())
-    flows = [row for row in study["points"] if row["status"] == 0]
-    points = {name: np.array([row[name] for row in flows]) for name in flows[0]}
-    free = next(row for row in study["rows"] if row["mixture"] == "uniform" and row["restitution"] == "all")
-    rows = corrected_fits(points)
-    for row in rows:
+    studies = [json.loads((RESULTS / f"{name}.json").read_text()) for name in ("dense_rheology", "dense_flows")]
+    flows = [row for study in studies for row in study["points"] if row["status"] == 0]
+    points = {name: np.array([row[name] for row in flows]) for name in studies[0]["points"][0]}
+    rows, free = corrected_fits(points), free_fits(points)
+    for row in (*free, *rows):
         print(", ".join(f"{name} {value}" for name, value in row.items()))
-    onset = [free["friction_at_onset"], *(row["friction_at_onset"][0] for row in rows)]
+    onset = [
+        *(row["macroscopic_friction"]["offset"][0] for row in free),
+        *(row["friction_at_onset"][0] for row in rows),
+    ]
+    critical = free[0]["packing_fraction"]["offset"][0]
     head = {
-        "study": study["hardware"]["commit"],
+        "studies": [study["hardware"]["commit"] for study in studies],
         "points": len(flows),
-        "one_power_law": {
-            "critical_packing_fraction": [free["critical_packing_fraction"], free["critical_packing_fraction_stderr"]],
-            "exponent": [free["c"], free["c_stderr"]],
-            "friction_at_onset": [free["friction_at_onset"], free["friction_at_onset_stderr"]],
-            "exponent_of_pressure_over_temperature": rounded(
-                list(ratio_exponent(points, free["critical_packing_fraction"])), 5
-            ),
-        },
+        "largest_packing_fraction": float(points["packing_fraction"].max()),
+        "smallest_inertial_number": float(points["inertial_number"].min()),
+        "power_laws": free,
+        "exponent_of_pressure_over_temperature": rounded(list(ratio_exponent(points, critical)), 5),
         "friction_at_onset_of_all_fits": [min(onset), max(onset)],
     }
     output.write_rows("dense_limit", head, "rows", rows)

@@ -38,6 +38,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
         *(dissipation.of_rows(read("dissipation")[name]) for name in ("points", "judged_points")), MEASURED_LAWS
     ),
     "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),
+    "size_study_waves": lambda: size_figures.draw_waves(read("size_study")["flows"]),
     "enskog_factors": lambda: enskog_factors.draw(enskog_factors.FULL, read("enskog_factors")["rows"]),
     "coverage": lambda: coverage.draw(read("coverage")["over_flows"]),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),

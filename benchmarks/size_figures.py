@@ -1,14 +1,13 @@
 """The figures of ``size_study``: values against N, and waves of velocity and density."""
 
-from collections.abc import Mapping
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, styled
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
 
 LOOSE = 0.7  # packing fraction up to which a flow is drawn among the loose ones
+WAVE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.5, 0.6), (0.8, 0.2), (0.8, 0.6), (0.95, 0.6))  # of the figure of waves
 STYLES = [
     {"color": "black", "marker": "o", "linestyle": "-"},
     {"color": "tab:blue", "marker": "s", "linestyle": "--"},
@@ -30,6 +29,11 @@ GROUPS = (
 )
 
 
+def flow_of(row: dict) -> tuple[float, float]:
+    """Restitution and packing fraction of a row."""
+    return row["restitution"], row["packing_fraction"]
+
+
 def flow_name(alpha: float, nu: float) -> str:
     """A flow in the legend."""
     return f"α {alpha:g}, ν {nu:g}"
@@ -43,10 +47,10 @@ def draw_sizes(rows: list[dict]) -> Figure:
     figure = Figure(figsize=(TWO_COLUMNS, 8.0), layout="constrained")
     panels = figure.subplots(len(PANELS), len(groups), sharex=True, squeeze=False)
     for column, (title, chosen) in zip(panels.T, groups, strict=True):
-        flows = sorted({(row["restitution"], row["packing_fraction"]) for row in chosen})
+        flows = sorted({flow_of(row) for row in chosen})
         for axes, (name, _) in zip(column, PANELS, strict=True):
             for k, flow in enumerate(flows):
-                here = [row for row in chosen if (row["restitution"], row["packing_fraction"]) == flow]
+                here = [row for row in chosen if flow_of(row) == flow]
                 draw_curve(axes, name, here, k, len(flows), flow_name(*flow))
             axes.set_xscale("log")
             axes.grid(color="0.9")
@@ -76,34 +80,21 @@ def draw_curve(axes: Axes, name: str, rows: list[dict], k: int, count: int, labe
         axes.errorbar(grains, value / largest, error / largest, label=label, capsize=2, markersize=4, **STYLES[k % 6])
 
 
-def draw_waves(states: Mapping[tuple[float, float], tuple[int, dict]], edges: np.ndarray) -> Figure:
-    """Granular temperature and structure factor of waves against wave number, in the largest cells."""
-    chosen = [flow for flow in states if flow[1] <= LOOSE]
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    panels = figure.subplots(1, 3, sharex=True)
-    middle = np.sqrt(edges[1:] * edges[:-1])
-    for k, flow in enumerate(sorted(chosen)):
-        grains, row = states[flow]
-        waves = row["waves"].mean(axis=(0, 1))
-        seen = waves > 0
-        temperature = row["tally_kinetic_moment"].sum(axis=(0, 1)).trace() / 2 / row["tally_duration"].sum() / grains
-        parts = [row[name].mean(axis=(0, 1))[seen] / waves[seen] for name in ("transverse", "along", "density")]
-        parts = [parts[0] / temperature, parts[1] / temperature, parts[2]]
-        style = {**STYLES[k % 6], "markersize": 3, "label": f"{flow_name(*flow)}, N {grains}"}
-        if k >= 6:
-            style["markerfacecolor"] = "white"
-        for axes, part in zip(panels, parts, strict=True):
-            axes.plot(middle[seen], part, **style)
-    titles = ("velocity across the wave vector", "velocity along the wave vector", "density")
-    labels = ("energy of a wave over equipartition", "energy of a wave over equipartition", "structure factor")
-    for axes, title, label in zip(panels, titles, labels, strict=True):
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+@styled
+def draw_waves(rows: list[dict]) -> Figure:
+    """Energy of the velocity across a wave vector and structure factor against wave number, in the largest cells."""
+    largest = [row for row in rows if "spectrum" in row]
+    chosen = [row for row in largest if flow_of(row) in WAVE_FLOWS] or largest
+    figure = Figure(figsize=(TWO_COLUMNS, 2.9), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True)
+    for row, style in zip(chosen, curve_styles(len(chosen)), strict=True):
+        style |= {"markersize": 3, "linewidth": 1, "label": flow_name(*flow_of(row))}
+        for axes, name in zip(panels, ("transverse", "density"), strict=True):
+            axes.plot(row["spectrum"]["wave_number"], row["spectrum"][name], **style)
+    labels = ("energy of velocity across $k$\nover that of equipartition", "structure factor $S(k)$")
+    for axes, label in zip(panels, labels, strict=True):
+        axes.set(xscale="log", yscale="log", xlabel=r"wave number $k$ ($1/\sigma$)", ylabel=label)
         axes.axhline(1, color="0.6", linewidth=0.8)
-        axes.set_title(title, fontsize=LABEL_SIZE)
-        axes.set_xlabel("wave number (1/σ)")
-        axes.set_ylabel(label)
-        axes.grid(color="0.9")
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize="small", frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False)
     return figure

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 import jaxgran as jg
-from benchmarks.output import Output
+from benchmarks.output import Output, rounded
 from benchmarks.process import ROOT
 from benchmarks.size_figures import draw_sizes, draw_waves
 from jaxgran.dynamics.tally import TABLE, Tally
@@ -292,6 +292,20 @@ def structure_result(row: dict[str, np.ndarray], grains: int) -> dict[str, float
     }
 
 
+def spectrum(row: dict[str, np.ndarray], grains: int) -> dict[str, list[float]]:
+    """Energy of a wave of the velocity across its wave vector over equipartition, and structure factor, by wave number.
+
+    Bins without a wave are left out.
+    """
+    waves = row["waves"].mean(axis=(0, 1))
+    present = waves > 0
+    temperature = row["tally_kinetic_moment"].sum(axis=(0, 1)).trace() / 2 / row["tally_duration"].sum() / grains
+    transverse, density = (row[name].mean(axis=(0, 1))[present] / waves[present] for name in ("transverse", "density"))
+    middle = np.sqrt(WAVE_BINS[1:] * WAVE_BINS[:-1])[present]
+    series = {"wave_number": middle, "transverse": transverse / temperature, "density": density}
+    return {name: rounded(values.tolist(), 4) for name, values in series.items()}
+
+
 def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
     """Measure what is not yet done, and write ``size_study`` as JSON, and figures of values and waves."""
     plan = QUICK if output.quick else FULL
@@ -304,13 +318,14 @@ def run(output: Output, largest: int = 100_000, folder: Path = KEPT) -> None:
         if n <= most and kept_file(folder, alpha, nu, n).exists()
     ]
     rows = [result(plan, k, n, folder) for k, n in done]
+    for (k, n), row in zip(done, rows, strict=True):
+        if n == dict(done)[k]:  # the last one of a flow is its largest
+            row["spectrum"] = spectrum(read_flow(folder, *plan.flows[k][:2], n), n)
     print_table(rows)
     head = {"prepared_memories": PREPARED, "sampled_memories": SAMPLED, "blocks": BLOCKS, "timestep": 1e-3}
     output.write_rows("size_study", head, "flows", rows)
     output.write_picture(draw_sizes(rows), "size_study")
-    largest_of = dict(done)  # the last one of a flow is its largest
-    states = {plan.flows[k][:2]: (n, read_flow(folder, *plan.flows[k][:2], n)) for k, n in largest_of.items()}
-    output.write_picture(draw_waves(states, WAVE_BINS), "size_study", "_waves.png")
+    output.write_picture(draw_waves(rows), "size_study", "_waves.png")
 
 
 def print_table(rows: list[dict]) -> None:
