@@ -152,9 +152,11 @@ def same_tracks(path: Path, rows: pd.DataFrame, **options) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(plain, name))
 
 
+UNITS = {"x": "x [mm]", "y": "Y (mm)"}
 SPREADSHEETS = {
     "decimal commas": lambda rows, path: rows.to_csv(path, index=False, sep=";", decimal=","),
-    "units": lambda rows, path: rows.rename(columns={"x": "x [mm]", "y": "Y (mm)"}).to_csv(path, index=False),
+    "units": lambda rows, path: rows.rename(columns=UNITS).to_csv(path, index=False),
+    "both": lambda rows, path: rows.rename(columns=UNITS).to_csv(path, index=False, sep=";", decimal=","),
 }
 
 

@@ -181,6 +181,8 @@ def _fit_map(file: Path, stresses: list[float] | None, relative_error: float, js
         nu, pressure, shear = stresses
         noise = (relative_error * pressure, relative_error * shear)
         found = restitution_from_stresses(closure, nu, pressure, shear, *noise)
+        if not math.isfinite(found.restitution):
+            stop(f"no restitution could be found for these stresses in {short_repr(file.name)}.", BAD_STATUS)
         if json:
             flow = {
                 "restitution": Entry(found.restitution, "restitution of a flow with these stresses", "1", found.stderr),

@@ -111,7 +111,7 @@ def read_tracks(
 def _csv_table(path: Path) -> Table:
     import pandas as pd
 
-    separators = ((",", "."), (r"\s+", "."), (";", "."), (";", ","))  # with the decimal mark
+    separators = ((",", "."), (";", "."), (";", ","), (r"\s+", "."))  # with the decimal mark
     rows = pd.DataFrame()
     try:
         if "\0" in path.read_text(encoding="utf-8"):
