@@ -122,6 +122,7 @@ def test_a_part_that_is_none_is_refused(part: Any) -> None:
         replace(SETTINGS, part=part)
 
 
+@pytest.mark.environment
 def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -> None:
     """The commands of the batch script, each in a process of its own, on a map of a few grains."""
     lines = CLUSTER.read_text(encoding="utf-8").splitlines()
