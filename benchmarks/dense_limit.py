@@ -23,9 +23,11 @@ import json
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
+from jaxgran.plotting.drawing import NU_LABEL, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 
 EXPONENTS = (0.40, 0.35)
 LOOSEST = (0.79, 0.81, 0.82)  # smallest packing fraction of a fit with a free exponent
@@ -38,7 +40,7 @@ class Fit(NamedTuple):
 
     offset: float
     offset_error: float  # standard error; times the square root of the reduced χ² where that is above one
-    leading: float  # coefficient of the first exponent
+    coefficients: tuple[float, ...]  # of the powers
     reduced_chi_squared: float
 
 
@@ -51,7 +53,7 @@ def fit(number: np.ndarray, number_error: np.ndarray, y: np.ndarray, y_error: np
         deviation = np.hypot(y_error, slopes @ constants * number_error)
         constants, covariance, chi_squared = weighted_fit(design, y, deviation)
     reduced = chi_squared / (len(y) - len(constants))
-    return Fit(constants[0], np.sqrt(covariance[0, 0] * max(1.0, reduced)), constants[1], reduced)
+    return Fit(constants[0], np.sqrt(covariance[0, 0] * max(1.0, reduced)), tuple(constants[1:]), reduced)
 
 
 def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[float, float]:
@@ -119,7 +121,7 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
             found = {
                 "critical_packing_fraction": list(fraction[:2]),
                 "friction_at_onset": list(friction[:2]),
-                "leading_coefficients": [-fraction.leading, friction.leading],
+                "leading_coefficients": [-fraction.coefficients[0], friction.coefficients[0]],
                 "reduced_chi_squared": [fraction.reduced_chi_squared, friction.reduced_chi_squared],
                 "exponent_of_pressure_over_temperature": list(ratio_exponent(points, fraction.offset)),
             }
@@ -127,11 +129,55 @@ def corrected_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     return rows
 
 
-def run(output: Output) -> None:
-    """Fit, print a line for each fit, and write them as JSON."""
+@styled
+def draw(points: dict[str, np.ndarray], free: list[dict[str, Any]]) -> Figure:
+    """Friction and packing fraction against the inertial number, with one power law and two of published exponents."""
+    figure = Figure(figsize=(TWO_COLUMNS, 3.1), layout="constrained")
+    panels = figure.subplots(1, 2)
+    flows = {
+        r"$N=1000$, $\alpha=0.2$": (points["grains"] == 1000) & (points["restitution"] == 0.2),
+        r"$N=1000$, $\alpha=0.5$": (points["grains"] == 1000) & (points["restitution"] == 0.5),
+        r"$N=4000$, $\alpha=0.2$": points["grains"] == 4000,
+    }
+    number, number_error = points["inertial_number"], points["inertial_number_stderr"]
+    along = np.geomspace(0.5 * number.min(), number.max(), 200)
+    labels = {"macroscopic_friction": r"friction $\mu$", "packing_fraction": NU_LABEL}
+    for axes, (name, label) in zip(panels, labels.items(), strict=True):
+        error = points.get(f"{name}_stderr", np.zeros_like(number))
+        powers = {"one power law, free": (free[0][name]["exponent"][0],)} | {
+            rf"$c={c:g}$ with a correction $I$": (c, 1.0) for c in EXPONENTS
+        }
+        for (title, exponents), line in zip(powers.items(), ("-", "--", ":"), strict=True):
+            law = fit(number, number_error, points[name], error, *exponents)
+            terms = (a * along**p for a, p in zip(law.coefficients, exponents, strict=True))
+            axes.plot(along, law.offset + sum(terms), color="0.35", linestyle=line, linewidth=1, label=title)
+        for (title, chosen), style in zip(flows.items(), curve_styles(len(flows)), strict=True):
+            style |= {"linestyle": "none", "markersize": 4, "label": title}
+            bars = {"xerr": number_error[chosen], "yerr": error[chosen]}
+            axes.errorbar(number[chosen], points[name][chosen], **bars, elinewidth=0.8, **style)
+        axes.set(xscale="log", xlabel="inertial number $I$", ylabel=label)
+        label_log_axis(axes.xaxis)
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False)
+    return figure
+
+
+def measured() -> tuple[list[str], dict[str, np.ndarray]]:
+    """Commits of the two studies, and the averages of their flows whose status is ok."""
     studies = [json.loads((RESULTS / f"{name}.json").read_text()) for name in ("dense_rheology", "dense_flows")]
-    flows = [row for study in studies for row in study["points"] if row["status"] == 0]
-    points = {name: np.array([row[name] for row in flows]) for name in studies[0]["points"][0]}
+    flows = []
+    for study in studies:
+        grains = study["grains"] if "grains" in study else study["plan"]["grains"]
+        flows += [{**row, "grains": grains} for row in study["points"] if row["status"] == 0]
+    names = [*studies[0]["points"][0], "grains"]
+    return [study["hardware"]["commit"] for study in studies], {
+        name: np.array([row[name] for row in flows]) for name in names
+    }
+
+
+def run(output: Output) -> None:
+    """Fit, print a line for each fit, and write them as JSON and PNG."""
+    commits, points = measured()
     rows, free = corrected_fits(points), free_fits(points)
     for row in (*free, *rows):
         print(", ".join(f"{name} {value}" for name, value in row.items()))
@@ -141,8 +187,8 @@ def run(output: Output) -> None:
     ]
     critical = free[0]["packing_fraction"]["offset"][0]
     head = {
-        "studies": [study["hardware"]["commit"] for study in studies],
-        "points": len(flows),
+        "studies": commits,
+        "points": len(points["status"]),
         "largest_packing_fraction": float(points["packing_fraction"].max()),
         "smallest_inertial_number": float(points["inertial_number"].min()),
         "power_laws": free,
@@ -150,3 +196,4 @@ def run(output: Output) -> None:
         "friction_at_onset_of_all_fits": [min(onset), max(onset)],
     }
     output.write_rows("dense_limit", head, "rows", rows)
+    output.write_picture(draw(points, free), "dense_limit")

@@ -23,7 +23,6 @@ from benchmarks.output import Output
 from jaxgran.environment import usable_cores
 from jaxgran.inference.friction_law import CORRELATION, FrictionLaw, PowerLaw
 from jaxgran.maps.presets import PRESETS
-from jaxgran.plotting.friction import friction_figure
 from jaxgran.sampling.sample import error_correlation_of, estimates
 
 FULL = PRESETS["dense"]
@@ -40,11 +39,10 @@ PUBLISHED = {
 
 
 def run(output: Output) -> None:
-    """Map, fit, print the table of exponents, and write it with the figure of the friction law."""
+    """Map, fit, print the table of exponents, and write it."""
     plan = QUICK if output.quick else FULL
     data = jg.ratio_map(**plan, workers=usable_cores())
     rows = []
-    output.write_picture(friction_figure(data), "dense_rheology", dpi=200)
     for mixture, flows in (("uniform", data), ("bidisperse", bidisperse(plan, data))):
         for least in LOOSEST:
             chosen = flows.sel(packing_fraction=flows.packing_fraction >= least)

@@ -116,7 +116,7 @@ BENCHMARKS = (
         "dense_rheology",
         "Do dense flows obey one friction law of the inertial number, and with which exponents?",
         (20, 3),
-        ("dense_rheology.json", "dense_rheology.png"),
+        ("dense_rheology.json",),
     ),
     Benchmark(
         "dense_flows",
@@ -129,7 +129,7 @@ BENCHMARKS = (
         "dense_limit",
         "Are dense flows compatible with the exponents that are published for the jamming transition?",
         (0.1, 0.1),
-        ("dense_limit.json",),
+        ("dense_limit.json", "dense_limit.png"),
     ),
     Benchmark(
         "closure_study",
