@@ -28,6 +28,7 @@ from jaxgran.contact.problem import as_contacts
 from jaxgran.model.status import Status
 
 CAP = 20_000  # products with W of our own methods
+TIGHTEST = 1e-12  # tolerance that a projected method accepts
 _JUDGED = 1 + 1e-9  # of the tolerance: the residual is computed a second time, with another rounding
 
 
@@ -94,7 +95,8 @@ def residual_of(entry: Entry, impulses: np.ndarray) -> float:
 def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
     """A projected method, compiled for one of few shapes, with a tolerance and ``CAP`` in place of its own."""
     network, count = padded(entry.problem), len(entry.problem.approach)
-    call = partial(solved_network, network, replace(method, tolerance=tolerance, max_steps=CAP))
+    method = replace(method, tolerance=max(tolerance, TIGHTEST), max_steps=CAP)
+    call = partial(solved_network, network, method)
 
     def solve() -> Answer | None:
         solution = jax.block_until_ready(call())

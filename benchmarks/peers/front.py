@@ -67,6 +67,10 @@ def _time(seconds: float, sign: str) -> str:
     return "not reached" if sign == ">" else f"{'< ' if sign == '<' else ''}{seconds:.2g}"
 
 
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):,g}"
+
+
 def ratio(flow: dict, curve: str, cost: str) -> str:
     """Time of a curve over that of jaxgran, "~" where both have been run no cheaper.
 
@@ -77,8 +81,8 @@ def ratio(flow: dict, curve: str, cost: str) -> str:
     )
     last = [row for row in _rows(flow, curve) if "errors" in row][-1:]
     if our_sign != ">" and last and _misses(last[0], OBSERVABLES):
-        return f"> {last[0][cost] / ours:.2g}"
+        return f"> {_two_digits(last[0][cost] / ours)}"
     if ">" in (our_sign, sign):
         return "–"
     bounds = {("=", "="): "", ("<", "="): "< ", ("=", "<"): "> ", ("<", "<"): "~ "}
-    return f"{bounds[sign, our_sign]}{theirs / ours:.2g}" if curve != "jaxgran" else "1"
+    return f"{bounds[sign, our_sign]}{_two_digits(theirs / ours)}" if curve != "jaxgran" else "1"
