@@ -9,6 +9,7 @@ makes all errors smaller. Flows of several sizes say how averages approach those
     python -m benchmarks reference_map                 # two hours on two cores
     python -m benchmarks reference_map --seeds 4       # two seeds more
     python -m benchmarks reference_map --part sizes    # 9 loose flows of up to 25,600 grains, 12 dense ones
+    python -m benchmarks reference_map --part large    # one flow of 102,400 grains, half an hour
     python -m benchmarks reference_map --part coarse   # dt = 1e-3
     python -m benchmarks reference_map --quick         # a plane of 3 × 3 points, 64 and 100 grains, a minute
 """
@@ -23,7 +24,6 @@ from benchmarks.output import RESULTS, Output
 from jaxgran.environment import usable_cores
 from jaxgran.maps.results import write_dataset
 
-PARTS = ("plane", "sizes", "coarse")
 KEPT = RESULTS / ".reference_map"  # the maps of single seeds
 RESTITUTIONS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 LOOSE = (0.1, 0.2, 0.3, 0.4, 0.5, 0.56, 0.6, 0.65, 0.7)
@@ -51,6 +51,12 @@ def sizes(quick: bool) -> dict[str, dict[str, Any]]:
     return {"sizes_loose": loose | {"grains": grains}, "sizes_dense": dense | {"grains": grains[:3]}}
 
 
+def large(quick: bool) -> dict[str, dict[str, Any]]:
+    """The arguments of ``ratio_map`` for a flow of four times as many grains as those of ``sizes``."""
+    chosen = {"restitution": (0.7,), "packing_fraction": (0.6,), "timestep": 5e-4}
+    return {"large": chosen | {"grains": 512 if quick else 102_400}}
+
+
 def coarse(quick: bool) -> dict[str, dict[str, Any]]:
     """The arguments of ``ratio_map`` at dt = 1e-3, where grains are slow enough for it and clusters form."""
     alphas, nus = [a for a in RESTITUTIONS if a <= 0.7], [nu for nu in (*LOOSE, *DENSE) if 0.3 <= nu <= 0.79]
@@ -73,5 +79,5 @@ def run(output: Output, seeds: int = 2, part: str = "plane", folder: Path = KEPT
         merged.attrs["command"] = about["command"]
         write_dataset(merged, output.path("reference", ".nc"))
         return
-    for name, chosen in (sizes if part == "sizes" else coarse)(output.quick).items():
+    for name, chosen in {"sizes": sizes, "large": large, "coarse": coarse}[part](output.quick).items():
         write_dataset(made(name, **chosen), output.path("reference", f"_{name}.nc"))

@@ -70,13 +70,13 @@ BENCHMARKS = (
         "reference_map",
         "What are stresses, temperatures and the dissipation rate of large systems over the whole plane?",
         (120, 1),
-        ("reference.nc", *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "coarse"))),
+        ("reference.nc", *(f"reference_{name}.nc" for name in ("sizes_loose", "sizes_dense", "large", "coarse"))),
         (
             Option("--seeds", "number of seeds, those that are kept included", int),
             Option(
                 "--part",
-                "the plane, flows of several sizes, or a coarse time step",
-                choices=("plane", "sizes", "coarse"),
+                "the plane, flows of several sizes, a large one, or a coarse time step",
+                choices=("plane", "sizes", "large", "coarse"),
             ),
             Option("--folder", "where the maps that are done are kept", Path),
         ),

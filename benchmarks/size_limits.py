@@ -7,8 +7,9 @@ grow as ln N if β = 2. First each flow with ν ≤ 0.7 has a limit and an ampli
 
     x(N) = x∞ [1 − (a + b (1 − α)) exp(m (ν − 0.5)) w(ν) (N/1600)^(−s)],        w = min(1, (ν_w − ν)/0.1),
 
-where w ends the waves towards jamming. Standard errors are larger by the root of the reduced χ², as a profile of
-velocity that lasts longer than a sample is not in those of the flows.
+where w ends the waves towards jamming. A flow of 102,400 grains (``reference_map --part large``) is a test, not fitted.
+Standard errors are larger by the root of the reduced χ², as a profile of velocity that lasts longer than a sample
+is not in those of the flows.
 
     python -m benchmarks size_limits   # a second
 """
@@ -51,27 +52,35 @@ class Flow(NamedTuple):
 
 def run(output: Output) -> None:
     """Fit, print the tables of the page on the number of grains, and write them as JSON."""
-    rows = [*json.loads((RESULTS / "size_study.json").read_text())["flows"], *rows_of_maps()]
-    laws, limits = {}, []
+    rows = [
+        *json.loads((RESULTS / "size_study.json").read_text())["flows"],
+        *rows_of_maps("sizes_loose", "sizes_dense"),
+    ]
+    (large,) = rows_of_maps("large")
+    laws, limits, tests = {}, [], []
     for average in AVERAGES:
         flows = flows_of(rows, average)
         loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
         laws[average] = {"exponents": exponents(loose), "law": law_of(flows)}
+        tests.append({"average": average, **tested(large, flows, average, laws[average])})
         limits += [{"average": average, **one} for one in limits_of(loose, laws[average]["exponents"]["interval"])]
         print(average, rounded(laws[average], 4))
-    output.write_rows("size_limits", {"laws": rounded(laws, 5)}, "rows", rounded(limits, 5))
+        print(rounded(tests[-1], 4))
+    output.write_rows("size_limits", {"laws": rounded(laws, 5), "tests": rounded(tests, 5)}, "rows", rounded(limits, 5))
 
 
-def rows_of_maps() -> list[dict[str, Any]]:
-    """The points of the maps of several sizes, as rows of the study."""
+def rows_of_maps(*names: str) -> list[dict[str, Any]]:
+    """The points of maps of some sizes, as rows of the study."""
     rows = []
-    for name in ("loose", "dense"):
-        data = jg.open_map(RESULTS / f"reference_sizes_{name}.nc")
+    for name in names:
+        data = jg.open_map(RESULTS / f"reference_{name}.nc")
         chosen = [*AVERAGES, *(f"{average}_stderr" for average in AVERAGES)]
         frame = data.to_dataset()[chosen].to_dataframe().reset_index()
         for one in frame.to_dict("records"):
             row = {axis: one[axis] for axis in ("restitution", "packing_fraction", "grains")}
-            rows.append(row | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES} | {"source": name})
+            rows.append(
+                row | {x: [one[x], one[f"{x}_stderr"]] for x in AVERAGES} | {"source": name.removeprefix("sizes_")}
+            )
     return rows
 
 
@@ -130,6 +139,36 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def tested(row: dict[str, Any], flows: list[Flow], average: str, laws: dict[str, Any]) -> dict[str, Any]:
+    """What a flow with more grains than were fitted has over the largest fitted one, measured, and by both laws.
+
+    Every pair is a ratio less one and its standard error; that of the exponent is of the limit and amplitude of the
+    flow alone, at both ends of the interval of the exponent.
+    """
+    flow = next(
+        flow
+        for flow in flows
+        if [flow.restitution, flow.packing_fraction] == [row["restitution"], row["packing_fraction"]]
+        and flow.source == "loose"
+    )
+    value, error = row[average]
+    grains = np.array([row["grains"], flow.grains[-1]], float)
+    ratio = value / flow.values[-1]
+    spread = ratio * np.hypot(error / value, flow.stderrs[-1] / flow.values[-1])
+    ends = []
+    for s in laws["exponents"]["interval"]:
+        limit, amplitude, *_ = fitted(flow, flow.grains**-s)
+        large, largest = limit - amplitude * grains**-s
+        ends.append(large / largest - 1)
+    large, largest = 1 - SizeLaw(*laws["law"]["constants"]).missing(flow.restitution, flow.packing_fraction, grains)
+    return {
+        "grains": [int(n) for n in grains],
+        "measured": [ratio - 1, spread],
+        "by_exponent": sorted(ends),
+        "by_law": large / largest - 1,
+    }
 
 
 def missing_part(constants: np.ndarray, flow: Flow) -> np.ndarray:
