@@ -216,7 +216,7 @@ def draw(discs: list[dict], grains: list[dict]) -> Figure:
     flow = max((row["flow"] for row in grains), key=lambda flow: (flow[0], -flow[1]))
     panels = {
         "pressure": ("stresses agree", r"pressure $p$ ($m\dot\gamma^2$)"),
-        "collision_rate": ("collisions do not", r"collisions of a grain in a unit of strain"),
+        "collision_rate": ("collisions do not", "collisions per grain\nand unit of strain"),
     }
     sources = ((discs, r"event-driven, $t_\mathrm{c}$", "o:", "white"), (grains, r"jaxgran, $\Delta t$", "s-", "black"))
     for axes, (name, (title, label)) in zip(figure.subplots(1, 2), panels.items(), strict=True):

@@ -149,7 +149,7 @@ def draw(flows: list[dict]) -> Figure:
         axes.set_title(rf"$\alpha={flow['restitution']:g}$, $\nu={flow['packing_fraction']:g}$")
         axes.set(yscale="log", xlabel=r"strain $\dot\gamma t$", xlim=(0, strain[-1]))
     figure.axes[0].set_ylabel(r"$|\partial(\mathrm{state})/\partial\alpha|$ of a grain ($\sigma$, $\sigma\dot\gamma$)")
-    figure.axes[0].legend(loc="lower right")
+    figure.axes[0].legend(loc="upper left")
     return figure
 
 

@@ -211,7 +211,7 @@ def draw(rows: list[dict[str, Any]], length: int) -> Figure:
         speed.plot([row["tolerance"] for row in known], [row["speed"] for row in known], **style)
     speed.axhline(length - 1, color="0.6", linewidth=0.8, zorder=0)
     speed.axvline(DEFAULT, color="0.6", linewidth=0.8, linestyle=":")
-    speed.set(ylabel="speed of the front (diameters a step)", ylim=(0.3, 2 * length))
+    speed.set(ylabel="speed of the front ($\\sigma$ a step)", ylim=(0.3, 2 * length))
     speed.set(xscale="log", yscale="log", xlabel="tolerance of the contact solve", xlim=(0.5, 5e-7))
     speed.set_title("(b)", loc="left")
     speed.legend(loc="lower right")
