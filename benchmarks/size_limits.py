@@ -62,7 +62,7 @@ def run(output: Output) -> None:
         flows = flows_of(rows, average)
         loose = [flow for flow in flows if flow.packing_fraction <= LARGEST_FRACTION]
         laws[average] = {"exponents": exponents(loose), "law": law_of(flows)}
-        tests.append({"average": average, **tested(large, flows, average, laws[average])})
+        tests.append({"average": average, **compared_with_larger(large, flows, average, laws[average])})
         limits += [{"average": average, **one} for one in limits_of(loose, laws[average]["exponents"]["interval"])]
         print(average, rounded(laws[average], 4))
         print(rounded(tests[-1], 4))
@@ -141,7 +141,7 @@ def limits_of(flows: list[Flow], interval: list[float]) -> list[dict[str, Any]]:
     return found
 
 
-def tested(row: dict[str, Any], flows: list[Flow], average: str, laws: dict[str, Any]) -> dict[str, Any]:
+def compared_with_larger(row: dict[str, Any], flows: list[Flow], average: str, laws: dict[str, Any]) -> dict[str, Any]:
     """What a flow with more grains than were fitted has over the largest fitted one, measured, and by both laws.
 
     Every pair is a ratio less one and its standard error; that of the exponent is of the limit and amplitude of the

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from benchmarks.dense_limit import fit, ratio_exponent
-from benchmarks.size_limits import AVERAGES, Flow, exponents, flows_of, law_of, limits_of, missing_part
+from benchmarks.dense_limit import fit, free_fit, ratio_exponent
+from benchmarks.size_limits import (
+    AVERAGES,
+    Flow,
+    exponents,
+    flows_of,
+    law_of,
+    limits_of,
+    missing_part,
+    compared_with_larger,
+)
 
 GRAINS = (400, 1600, 6400, 25600)
 LAW = (0.45, 0.004, 0.1, 0.8, 0.82)  # s, a, b, m, ν_w
@@ -18,7 +27,8 @@ def study(noise: float, seed: int = 0) -> list[dict]:
             flow = Flow("", alpha, nu, np.array(GRAINS, float), np.array(()), np.array(()))
             for grains, missing in zip(GRAINS, missing_part(np.array(LAW), flow), strict=True):
                 values = {name: [2 * (1 - missing) * (1 + noise * rng.normal()), 2 * noise] for name in AVERAGES}
-                rows.append({"restitution": alpha, "packing_fraction": nu, "grains": grains} | values)
+                point = {"restitution": alpha, "packing_fraction": nu, "grains": grains, "source": "loose"}
+                rows.append(point | values)
     return rows
 
 
@@ -36,6 +46,36 @@ def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logar
     assert found["chi_squared"]["ln N"] > found["best"][1] + 50
     for flow, one in zip(flows, limits_of(flows, found["interval"]), strict=True):
         assert one["interval"][0] - 4e-3 < 2 < one["interval"][1] + 4e-3, flow
+
+
+def test_a_larger_flow_is_where_both_laws_say_if_it_obeys_them() -> None:
+    flows, grains = flows_of(study(1e-5), AVERAGES[0]), 102_400
+    large = Flow("", 0.3, 0.5, np.array([grains], float), np.array(()), np.array(()))
+    row = {"restitution": 0.3, "packing_fraction": 0.5, "grains": grains}
+    row[AVERAGES[0]] = [2 * (1 - missing_part(np.array(LAW), large)[0]), 2e-5]
+    laws = {"exponents": {"interval": [LAW[0] - 0.1, LAW[0] + 0.1]}, "law": {"constants": LAW}}
+    found = compared_with_larger(row, flows, AVERAGES[0], laws)
+    value, error = found["measured"]
+    assert abs(value - found["by_law"]) < 4 * error
+    assert found["by_exponent"][0] - 4 * error < value < found["by_exponent"][1] + 4 * error
+    assert found["grains"] == [102_400, 25_600]
+
+
+@pytest.mark.parametrize(
+    ("exponent", "amplitude", "critical"), [(0.35, 0.1, 0.845), (0.5, 0.2, 0.84), (0.81, 0.3, 0.83)]
+)
+def test_a_power_law_with_a_free_exponent_is_found(exponent: float, amplitude: float, critical: float) -> None:
+    """Within half a step of the exponents that are tried."""
+    number = np.geomspace(0.01, 0.2, 12)
+    points = {
+        "inertial_number": number,
+        "inertial_number_stderr": 0.01 * number,
+        "packing_fraction": critical - amplitude * number**exponent,
+    }
+    found = free_fit(points, "packing_fraction")
+    (value, error), (offset, offset_error) = found["exponent"], found["offset"]
+    assert abs(value - exponent) <= max(error, 0.0026)
+    assert abs(offset - critical) <= max(offset_error, 1e-4)
 
 
 def test_dense_fit_with_a_correction_finds_the_limit_within_its_error() -> None:
