@@ -7,12 +7,12 @@ from benchmarks.dense_limit import fit, free_fit, ratio_exponent
 from benchmarks.size_limits import (
     AVERAGES,
     Flow,
+    compared_with_larger,
     exponents,
     flows_of,
     law_of,
     limits_of,
     missing_part,
-    compared_with_larger,
 )
 
 GRAINS = (400, 1600, 6400, 25600)
