@@ -11,7 +11,7 @@ from jaxgran.plotting.drawing import ONE_COLUMN
 from jaxgran.reference.surface import coordinates
 from jaxgran.reference.table import FACTORS, Table, excess_from_surface
 
-NATURAL = 0.75  # packing fraction below which most natural flows are
+NATURAL = 0.75  # packing fraction above which most natural flows are, in the words of the paper
 LEVELS = (-0.5, -0.25, -0.1, -0.05, 0.05, 0.1, 0.25, 0.5)
 NEGLIGIBLE = 0.02  # a factor this close to one is not shaded
 LABELLED = {-0.5: 0.05, -0.25: 0.03, -0.1: 0.04, -0.05: 0.026}  # 1 − α of the label of a level
