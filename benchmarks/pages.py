@@ -208,6 +208,13 @@ def peers_ratio(flow: Mapping[str, Any]) -> str:
     return front.ratio(flow, "LAMMPS, 10 steps a contact", front.COST)
 
 
+def wave_exponent(row: Mapping[str, Any]) -> float:
+    """Exponent of the energy of waves across k, between wave numbers of 0.08 and 0.6/σ, in a row of ``size_study``."""
+    number, energy = (np.array(row["spectrum"][name]) for name in ("wave_number", "transverse"))
+    inside = (number > 0.08) & (number < 0.6)
+    return float(np.polyfit(np.log(number[inside]), np.log(energy[inside]), 1)[0])
+
+
 def output_of_where(restitution: float, packing_fraction: float) -> str:
     """The verdict and the averages that ``jaxgran where`` prints."""
     command = f"where --restitution {restitution} --packing-fraction {packing_fraction}"
@@ -238,7 +245,7 @@ for _functions in (
     (abs, max, at, found, flows_of, point, quotients, over, rms, ranked),
     (sig, percent, percent_pm, pm, duration, signed),
     (fewest_grains, shear_stress_ratio_at),
-    (peers_ratio, output_of_where, product_of, shares_of_clusters, differences_in_sigmas),
+    (peers_ratio, output_of_where, product_of, wave_exponent, shares_of_clusters, differences_in_sigmas),
 ):
     ENVIRONMENT.globals |= {one.__name__: one for one in _functions}
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, curve_styles, styled
+from jaxgran.plotting.drawing import LABEL_SIZE, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 
 LOOSE = 0.7  # packing fraction up to which a flow is drawn among the loose ones
 WAVE_FLOWS = ((0.1, 0.3), (0.2, 0.6), (0.5, 0.6), (0.8, 0.2), (0.8, 0.6), (0.95, 0.6))  # of the figure of waves
@@ -95,6 +95,7 @@ def draw_waves(rows: list[dict]) -> Figure:
     for axes, label in zip(panels, labels, strict=True):
         axes.set(xscale="log", yscale="log", xlabel=r"wave number $k$ ($1/\sigma$)", ylabel=label)
         axes.axhline(1, color="0.6", linewidth=0.8)
+    label_log_axis(panels[1].yaxis)
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=SMALL_SIZE, frameon=False)
     return figure
