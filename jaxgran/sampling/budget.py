@@ -50,10 +50,10 @@ class SizeLaw(NamedTuple):
 
 
 SIZE_LAWS: dict[str, SizeLaw] = {  # fits of ``benchmarks size_limits``
-    "pressure": SizeLaw(0.438, 0.00367, 0.1062, 0.788, 0.8215),
-    "shear_stress": SizeLaw(0.577, 0.00591, 0.0346, 3.767, 0.8071),
-    "granular_temperature": SizeLaw(0.2, 0.0202, 0.312, 0.975, 0.8193),
-    "local_granular_temperature": SizeLaw(0.747, 0.0, 0.0195, 2.931, 0.8132),
+    "pressure": SizeLaw(0.4175, 0.00494, 0.1151, 0.3665, 0.8193),
+    "shear_stress": SizeLaw(0.5639, 0.00744, 0.03257, 3.591, 0.8012),
+    "granular_temperature": SizeLaw(0.2314, 0.01633, 0.3066, 0.8507, 0.8096),
+    "local_granular_temperature": SizeLaw(0.7592, 0.0, 0.02069, 2.435, 0.8015),
 }
 SIZE_SPREAD = 0.5  # half-width of the 95 % interval of the missing part of one flow, over the law
 

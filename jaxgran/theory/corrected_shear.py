@@ -58,12 +58,12 @@ class CorrelationLaws:
 
 
 MEASURED_LAWS = CorrelationLaws(
-    length=np.array([0.2226, 0.02445, 1.461]),
-    length_stderr=np.array([0.0076, 0.003236, 0.0303]),
-    pairs=np.array([0.3711, 0.01574, 1.613]),
-    pairs_stderr=np.array([0.0239, 0.0008276, 0.01444]),
+    length=np.array([0.2226, 0.02442, 1.461]),
+    length_stderr=np.array([0.007562, 0.003219, 0.03018]),
+    pairs=np.array([0.373, 0.01559, 1.616]),
+    pairs_stderr=np.array([0.02397, 0.0008233, 0.01449]),
     jamming_fraction=np.array(0.8386),
-    scatter=np.array([0.1242, 0.1553, 0.1495]),
+    scatter=np.array([0.1243, 0.1553, 0.1494]),
     restitution_range=np.array([0.1, 0.95]),
     packing_fraction_range=np.array([0.1, 0.82]),
     fitted_to="294 flows of N = 6400 or 1600, dt = 1e-4",
