@@ -89,7 +89,7 @@ def size_error(
       The default number of grains, in a loose and in a dense flow:
 
       >>> [round(float(size_error(0.5, nu, 256)), 3) for nu in (0.6, 0.8)]
-      [0.215, 0.108]
+      [0.218, 0.099]
     """
     waves = (1 + SIZE_SPREAD) * SIZE_LAWS[average].missing(restitution, packing_fraction, grains)
     return waves + jamming_error(packing_fraction, grains)
