@@ -3,7 +3,8 @@
 A map refuses them: fewer grains often cannot be packed there, since the packing fraction at which they jam scatters.
 Every flow is packed, sheared from rest at dt = 1e-4 and at its own dt, and sampled, α = 0.2, midpoint rule; its energy
 is dissipated and supplied anew within a strain of some hundredths. It is written when it is done, so a study that was
-stopped goes on where it was; ``dense_limit`` fits these flows together with those of ``dense_rheology``.
+stopped goes on where it was, at the same commit. ``dense_limit`` fits these flows together with those of
+``dense_rheology``.
 
     python -m benchmarks dense_flows           # an hour on one core
     python -m benchmarks dense_flows --quick   # one flow of 256 grains, a minute
@@ -29,9 +30,11 @@ AVERAGES = ("inertial_number", "macroscopic_friction", "pressure", "granular_tem
 
 
 def run(output: Output) -> None:
-    """Measure the flows that the file does not have, print a line for each, and write them as JSON."""
+    """Measure the flows that a run of this commit has not written, print a line for each, and write them as JSON."""
     file = output.path("dense_flows", ".json")
-    rows = json.loads(file.read_text())["points"] if file.exists() else []
+    written = json.loads(file.read_text()) if file.exists() else {}
+    same = written.get("hardware") == output.hardware
+    rows = written["points"] if same else []
     grains, strain = (256, 1.0) if output.quick else (GRAINS, SAMPLED)
     head = {"restitution": RESTITUTION, "grains": grains, "prepared": PREPARED, "strain": strain}
     for nu, dt in QUICK if output.quick else FULL:
