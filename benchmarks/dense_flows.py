@@ -18,6 +18,7 @@ import jax
 
 import jaxgran as jg
 from benchmarks.output import Output, rounded
+from benchmarks.stability import unjudged
 from jaxgran.sampling.sample import estimates
 
 FULL = ((0.83, 5e-5), (0.832, 5e-5), (0.834, 2e-5), (0.836, 2e-5), (0.838, 1e-5))  # packing fraction, dt
@@ -47,7 +48,7 @@ def run(output: Output) -> None:
 def measured(nu: float, dt: float, grains: int, strain: float) -> dict[str, Any]:
     """The averages of one flow with their standard errors, and the worst status on the way to them."""
     start = time.perf_counter()
-    coarse, flow = (unjudged(jg.ShearFlow(grains, RESTITUTION, 0.5, x), nu) for x in (COARSE, dt))
+    coarse, flow = (unjudged(jg.ShearFlow(grains, RESTITUTION, 0.5, x), packing_fraction=nu) for x in (COARSE, dt))
     state, packed = jax.jit(jg.pack)(flow, jax.random.key(0))
     if not packed:
         raise RuntimeError(f"{grains} grains could not be packed at ν = {nu:g}.")
@@ -61,10 +62,3 @@ def measured(nu: float, dt: float, grains: int, strain: float) -> dict[str, Any]
     drift = float(sample.pressure / second.pressure) - 1
     row |= {"change_since_preparation": round(drift, 4), "seconds": round(time.perf_counter() - start)}
     return row | {"status": max(int(one.status) for one in (first, second, sample))}
-
-
-def unjudged(flow: jg.ShearFlow, nu: float) -> jg.ShearFlow:
-    """The flow at a packing fraction that is not checked: leaves of a pytree never are."""
-    leaves, structure = jax.tree_util.tree_flatten_with_path(flow)
-    numbers = [nu if path[-1].name == "packing_fraction" else value for path, value in leaves]
-    return jax.tree.unflatten(structure, numbers)

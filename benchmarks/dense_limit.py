@@ -27,11 +27,11 @@ from matplotlib.figure import Figure
 
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
+from jaxgran.inference.friction_law import fit_power_law
 from jaxgran.plotting.drawing import NU_LABEL, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 
 EXPONENTS = (0.40, 0.35)
 LOOSEST = (0.79, 0.81, 0.82)  # smallest packing fraction of a fit with a free exponent
-FREE = np.linspace(0.1, 1.4, 261)  # exponents that are tried
 ROUNDS = 30  # of the effective variance
 
 
@@ -69,27 +69,19 @@ def ratio_exponent(points: dict[str, np.ndarray], critical: float) -> tuple[floa
     return constants[1], np.sqrt(covariance[1, 1] * reduced)
 
 
-def free_fit(points: dict[str, np.ndarray], abscissa: str) -> dict[str, Any]:
-    """Offset and exponent of one power law of I, each with its standard error, and the reduced χ².
-
-    The error of the exponent is half the range in which χ² grows by one, or by its reduced value where that is larger;
-    that of the offset is half of its range there.
-    """
+def free_fit(points: dict[str, np.ndarray], ordinate: str) -> dict[str, Any]:
+    """Offset and exponent of one power law of I, each with its standard error, and the reduced χ²."""
     number, number_error = points["inertial_number"], points["inertial_number_stderr"]
-    error = points.get(f"{abscissa}_stderr", np.zeros_like(number))
-    fits = [fit(number, number_error, points[abscissa], error, exponent) for exponent in FREE]
-    freedom = len(number) - 3
-    chi_squared = np.array([one.reduced_chi_squared for one in fits]) * (len(number) - 2)
-    best = int(np.argmin(chi_squared))
-    reduced = chi_squared[best] / freedom
-    inside = chi_squared - chi_squared[best] <= max(1.0, reduced)
-    offsets = np.array([one.offset for one in fits])
+    exact = np.zeros_like(number)
+    error, sign = points.get(f"{ordinate}_stderr", exact), -1.0 if ordinate == "packing_fraction" else 1.0
+    law = fit_power_law(number, points[ordinate], number_error, error, exact, sign)
+    (offset, _, exponent), (offset_error, _, exponent_error) = law.parameters.tolist(), law.standard_errors.tolist()
     found = {
-        "offset": [offsets[best], np.ptp(offsets[inside]) / 2],
-        "exponent": [FREE[best], np.ptp(FREE[inside]) / 2],
-        "reduced_chi_squared": reduced,
+        "offset": [offset, offset_error],
+        "exponent": [exponent, exponent_error],
+        "reduced_chi_squared": law.chi_squared,
     }
-    return rounded({name: np.asarray(value, float).tolist() for name, value in found.items()}, 4)
+    return rounded(found, 4)
 
 
 def free_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:

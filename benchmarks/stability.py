@@ -95,18 +95,19 @@ def run(output: Output) -> list[dict]:
     return cells
 
 
-def unjudged(variant: str, alpha: float, nu: float, **numbers: float) -> jg.ShearFlow:
-    """A flow whose numbers are not judged, in the precision of a variant: leaves of a pytree never are."""
+def unjudged(flow: jg.ShearFlow, **numbers: float) -> jg.ShearFlow:
+    """The flow with other numbers that are not judged: leaves of a pytree never are."""
+    return jax.tree_util.tree_map_with_path(lambda path, value: numbers.get(path[-1].name, value), flow)
+
+
+def flow_of(variant: str, alpha: float, nu: float, **numbers: float) -> jg.ShearFlow:
+    """A flow whose numbers are not judged, in the precision of a variant."""
     activation, dtype = (
         VARIANTS[variant].get(name, x) for name, x in (("activation", "midpoint"), ("dtype", "float64"))
     )
-    numbers = {"restitution": alpha, "packing_fraction": nu} | numbers
-
-    def leaf(path, value) -> jax.Array:
-        return jnp.asarray(numbers.get(path[-1].name, value), dtype)
-
     flow = jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3, activation=activation)
-    return jax.tree_util.tree_map_with_path(leaf, flow)
+    flow = unjudged(flow, restitution=alpha, packing_fraction=nu, **numbers)
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), flow)
 
 
 def solver_of(variant: str) -> jg.ProjectedMethod:
@@ -122,18 +123,18 @@ def prepared(alpha: float, nu: float) -> tuple[jg.State, float]:
     The temperature of theory is a poor start where the flow is dense, so the time step follows the temperature.
     """
     for seed in range(10):
-        state, found = pack(unjudged("default", alpha, nu), jax.random.key(seed))
+        state, found = pack(flow_of("default", alpha, nu), jax.random.key(seed))
         if found:
             break
     masses = np.asarray(state.grains.masses)[:, None]
     velocities = np.random.default_rng(0).normal(size=state.velocities.shape) / np.sqrt(masses)
     velocities -= np.sum(masses * velocities, axis=0) / np.sum(masses)
-    theory = jax.tree.map(lambda x: x[0], predicted(stack([unjudged("default", alpha, nu)])))
+    theory = jax.tree.map(lambda x: x[0], predicted(stack([flow_of("default", alpha, nu)])))
     state = replace(state, velocities=jnp.asarray(velocities * np.sqrt(float(theory.granular_temperature))))
     temperatures = []
     for strain, crossing in PREPARATION:
         dt = crossing / np.sqrt(energy(state) / GRAINS)
-        flow = unjudged("default", alpha, nu, timestep=dt)
+        flow = flow_of("default", alpha, nu, timestep=dt)
         state, tally = advance(flow, state, jnp.int32(round(strain / dt)), solver=jg.BarzilaiBorwein(max_steps=500))
         temperatures.append(float(averages(tally, state.side**2, GRAINS, flow.shear_rate)["granular_temperature"]))
     return state, float(np.mean(temperatures[-8:]))
@@ -162,7 +163,7 @@ def cell(variant: str, alpha: float, nu: float, crossing: float, state: jg.State
     ============================  ==============  ===============================================================
     """
     dt = crossing / np.sqrt(temperature)
-    flow = unjudged(variant, alpha, nu, timestep=dt)
+    flow = flow_of(variant, alpha, nu, timestep=dt)
     precision = flow.timestep.dtype
     state = jax.tree.map(lambda x: x.astype(precision), state)
     total = int(np.clip(np.ceil(STRAIN / dt), FEWEST_STEPS, MOST_STEPS))

@@ -65,7 +65,7 @@ def test_a_larger_flow_is_where_both_laws_say_if_it_obeys_them() -> None:
     ("exponent", "amplitude", "critical"), [(0.35, 0.1, 0.845), (0.5, 0.2, 0.84), (0.81, 0.3, 0.83)]
 )
 def test_a_power_law_with_a_free_exponent_is_found(exponent: float, amplitude: float, critical: float) -> None:
-    """Within half a step of the exponents that are tried."""
+    """Exact points, which have no other law."""
     number = np.geomspace(0.01, 0.2, 12)
     points = {
         "inertial_number": number,

@@ -20,7 +20,7 @@ pack = jax.jit(stability.pack)
 def test_dense_flow_converges_or_is_flagged(packing_fraction: float) -> None:
     """Beside jamming at 0.8386: what is called ok is solved, hardly overlaps and is finite, and no energy appears."""
     state, _ = warm(0.0, packing_fraction)
-    flow = stability.unjudged("default", 0.0, packing_fraction, timestep=3e-4)
+    flow = stability.flow_of("default", 0.0, packing_fraction, timestep=3e-4)
     before = stability.energy(state)
     state, tally = stability.advance(flow, state, jnp.int32(300))
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves((state, tally)))
@@ -54,7 +54,7 @@ def warm(restitution: float, packing_fraction: float) -> tuple[State, float]:
 
 def collisions(variant: str, timestep: float) -> int:
     """How many of lone pairs, at speeds of 0.5 to 2 σγ̇ and gaps of 1e-5 σ, collide in the time in which all should."""
-    flow = stability.unjudged(variant, 0.9, 0.1, timestep=timestep)
+    flow = stability.flow_of(variant, 0.9, 0.1, timestep=timestep)
     dtype, random, gap, row = flow.timestep.dtype, np.random.default_rng(0), 1e-5, np.arange(PAIRS)
     angle, speed = random.uniform(0, 2 * np.pi, PAIRS), random.uniform(0.5, 2, PAIRS)[:, None]
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)

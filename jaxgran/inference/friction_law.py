@@ -166,12 +166,12 @@ def _fits(points: xr.Dataset) -> tuple[PowerLaw, PowerLaw]:
     fraction, exact = points.packing_fraction.values, np.zeros(points.sizes["point"])
     covariance = np.nan_to_num(points[CORRELATION].values) * number_error * friction_error
     return (
-        _fit(number, friction, number_error, friction_error, covariance, sign=1.0),
-        _fit(number, fraction, number_error, exact, exact, sign=-1.0),
+        fit_power_law(number, friction, number_error, friction_error, covariance, sign=1.0),
+        fit_power_law(number, fraction, number_error, exact, exact, sign=-1.0),
     )
 
 
-def _fit(
+def fit_power_law(
     x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, covariance_xy: np.ndarray, sign: float
 ) -> PowerLaw:
     """Return the law through points with errors in both coordinates; its coefficient has the given sign."""
