@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxgran as jg
-from benchmarks.event_driven import Law, averages, discs_of, sheared
+from benchmarks.independent.event_driven import Law, averages, discs_of, sheared
 from benchmarks.output import Output
 from benchmarks.validation import EVENT_DRIVEN, OBSERVABLES
 from jaxgran.environment import usable_cores

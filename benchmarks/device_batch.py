@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxgran as jg
-from benchmarks import rival_numba
+from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 from benchmarks.step_cost import rival_arguments
 from jaxgran.dynamics.engine import DEFAULT_NUMERICS, in_lockstep, select_engine
@@ -96,7 +96,7 @@ plain = jax.jit(lambda *arguments: replicated(_plain_replica, in_lockstep())(*ar
 
 def rivals(flow: jg.ShearFlow, states: list[jg.State], steps: int) -> None:
     for state in states:
-        rival_numba.advance(**rival_arguments(flow, state), steps=steps)
+        contact_dynamics.advance(**rival_arguments(flow, state), steps=steps)
 
 
 def paper_map() -> float:

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import jaxgran as jg
-from benchmarks.event_driven import Discs, Law, discs_of, sheared
+from benchmarks.independent.event_driven import Discs, Law, discs_of, sheared
 from benchmarks.output import Output
 from jaxgran.model.checks import InputError
 

@@ -27,8 +27,8 @@ from typing import NamedTuple
 import numpy as np
 
 import jaxgran as jg
-from benchmarks.event_driven import Law, averages, sheared
 from benchmarks.fit_coverage import fit_statistics
+from benchmarks.independent.event_driven import Law, averages, sheared
 from benchmarks.output import Output
 from benchmarks.peers import lammps, problem
 from benchmarks.tracked_discs import FRACTION, ROWS, discs_at_rest

@@ -20,7 +20,6 @@ import numpy as np
 import scipy  # its parts are loaded when they are used
 
 import jaxgran as jg
-from benchmarks.event_driven import Law, averages, discs_of, sheared
 from benchmarks.fit_coverage import (
     BETWEEN,
     CONTACT_DURATION,
@@ -31,6 +30,7 @@ from benchmarks.fit_coverage import (
     successive,
     with_noise,
 )
+from benchmarks.independent.event_driven import Law, averages, discs_of, sheared
 from benchmarks.output import Output
 
 RESTITUTIONS, FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.4, 0.6, 0.75, 0.8)

@@ -19,6 +19,7 @@ from jax import lax
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.timing import timed
+from jaxgran.model.control_flow import AXIS
 
 POINTS = ((0.9, 0.5), (0.5, 0.7), (0.3, 0.75))
 GRAINS, TIMESTEP, REPLICAS, STEPS, GRADIENT_STEPS = 64, 1e-3, 16, 200, 20
@@ -44,7 +45,7 @@ WAYS = {
     "lax.map": by_map(None),
     "lax.map, Jax": by_map(jg.Jax()),
     "vmap, Jax": by_vmap(jg.Jax()),
-    'vmap, axis name "replica", Jax': by_vmap(jg.Jax(), "replica"),
+    'vmap, axis name "replica", Jax': by_vmap(jg.Jax(), AXIS),
 }
 
 

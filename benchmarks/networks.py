@@ -109,7 +109,7 @@ def _advanced(state: jg.State, packing_fraction: jax.Array, restitution: jax.Arr
 
 @jax.jit
 def _network_now(state: jg.State) -> Contacts:
-    return contacts_now(_flow(state.grains.radii.size, jnp.asarray(0.8), jnp.asarray(0.0)), state)
+    return contacts_now(_flow(state.grains.radii.size, jnp.asarray(0.8), jnp.asarray(0.0)), state)[0]
 
 
 def static_packing(grains: int, seed: int) -> Network:

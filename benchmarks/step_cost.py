@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran as jg
-from benchmarks import rival_numba
+from benchmarks.independent import contact_dynamics
 from benchmarks.output import Output
 
 RESTITUTIONS, PACKING_FRACTIONS = (0.9, 0.5, 0.1), (0.56, 0.7, 0.8)
@@ -76,7 +76,7 @@ def compare(alpha: float, nu: float, dt: float, repeats: int) -> dict:
         start = time.perf_counter()
         state, tally = jax.block_until_ready(advance(flow, state, jnp.int32(steps)))
         middle = time.perf_counter()
-        *_, rival = rival_numba.advance(**rivals, steps=steps)
+        *_, rival = contact_dynamics.advance(**rivals, steps=steps)
         end = time.perf_counter()
         if repeat:
             ours.append((middle - start) / steps * 1e6)

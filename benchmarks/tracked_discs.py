@@ -14,7 +14,7 @@ from math import fsum, pi, sqrt
 
 import numpy as np
 
-from benchmarks.event_driven import Discs, Law, sheared
+from benchmarks.independent.event_driven import Discs, Law, sheared
 from benchmarks.output import Output
 
 RESTITUTION = 0.73

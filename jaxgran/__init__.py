@@ -24,7 +24,7 @@ Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis.
 ``sample``, ``advance``, ``snapshot_series`` and ``cooling`` take a batch directly, and so do ``prepare`` and ``heated``
 with a batch of keys. ``jax.vmap`` and ``jax.lax.map`` of them do the same. Leave ``engine`` out: on a processor the
 numba engine is then chosen, also under a plain ``vmap``, and nothing is faster there. A ``vmap`` with
-``axis_name="replica"`` takes the engine ``Jax`` in lockstep, which is for accelerators, and far slower on a processor.
+``axis_name="jaxgran_replica"`` takes the engine ``Jax`` in lockstep, for accelerators, far slower on a processor.
 
 Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pairs,)``, of contacts ``(contacts,)``.
 

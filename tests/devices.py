@@ -4,14 +4,18 @@ python devices.py START.npz OUTPUT.npz GRAINS [lockstep | COORDINATOR HOST]
 """
 
 import sys
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 
 start, output, grains, *host = sys.argv[1:]
 jax.config.update("jax_enable_x64", True)
+
+from jaxgran.dynamics import engine  # noqa: E402
+
 if host == ["lockstep"]:
-    jax.default_backend = lambda: "accelerator"
+    engine._device = lambda: SimpleNamespace(platform="accelerator")
 elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.event_driven import Discs, Law, sheared
+from benchmarks.independent.event_driven import Discs, Law, sheared
 from jaxgran.io.tracks import Tracks
 
 GRAINS, FRAMES, STRAIN, RESTITUTION = 64, 60, 0.3, 0.6

@@ -26,6 +26,8 @@ from jaxgran.dynamics.collision import contact_buffers, contacts_now
 from jaxgran.dynamics.jax_engine import advance_by_jax
 from jaxgran.dynamics.tally import TABLE
 from jaxgran.model.cell import displacement, remap_tilt
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
@@ -89,7 +91,8 @@ def test_no_steps_change_nothing(engine, engine_run, flowing):
 def test_network_of_a_state_is_that_of_the_overlaps_by_brute_force(run, flowing):
     flow = flow_of(0.75, activation="touching", timestep=5e-3)
     state, _ = run(flow, flowing(0.75), 100)
-    network = jax.jit(contacts_now)(flow, state)
+    network, status = jax.jit(contacts_now)(flow, state)
+    assert status == Status.ok
     gaps = gaps_of(state.positions, state.grains.radii, state.side, state.tilt)
     found = {(min(i, j), max(i, j)) for i, j in np.stack([network.i, network.j], axis=1)[np.asarray(network.used)]}
     assert found == set(zip(*np.nonzero(gaps <= 0), strict=True)) and len(found) > 3
@@ -164,7 +167,7 @@ def exact_advance(flow, state, steps):
 
 @pytest.fixture(scope="module")
 def traced_batch(replicas):
-    batch = jax.vmap(exact_advance, in_axes=(0, 0, None), axis_name="replica")
+    batch = jax.vmap(exact_advance, in_axes=(0, 0, None), axis_name="jaxgran_replica")
     return jax.jit(batch).trace(*replicas, jnp.int32(0))
 
 
@@ -234,3 +237,15 @@ def test_single_precision_stays_single(flowing):
     state, tally = jax.eval_shape(advance_by_jax, flow, solver, state, jnp.int32(3))
     numbers = [leaf.dtype for leaf in jax.tree.leaves((state, tally)) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     assert set(numbers) == {jnp.dtype("float32")}
+
+
+def test_a_cell_narrower_than_two_diameters_is_reported(engine_run):
+    """Two images of a disc may then touch the same disc."""
+    radii = np.full(GRAINS, 0.05)
+    radii[:2] = 3.65
+    places = np.stack([0.3 * np.arange(GRAINS) + 0.2, np.full(GRAINS, 9.5)], axis=1)
+    places[:2] = [[2.0, 3.0], [7.1, 3.0]]
+    grains = Grains(jnp.asarray(radii), jnp.asarray(4 * radii**2))
+    state = State(grains, jnp.asarray(places), jnp.zeros((GRAINS, 2)), jnp.asarray(10.2), jnp.asarray(0.0))
+    _, tally = engine_run(flow_of(0.8, shear_rate=0.0), state, 2)
+    assert tally.status >= Status.capacity

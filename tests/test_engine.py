@@ -92,7 +92,7 @@ IMPOSSIBLE = {
         lambda state: jax.vmap(lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba()), axis_name=AXIS)(
             jax.tree.map(lambda x: x[None], state)
         ),
-        "in a vmap with the axis name 'replica', not numba",
+        "in a vmap with the axis name 'jaxgran_replica', not numba",
     ),
     "every step": (
         lambda state: jg.advance(of(), state, STEPS, free_flight=False, engine=jg.Numba()),
@@ -198,4 +198,26 @@ def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
         "float32",
         "jax",
         "barzilai-borwein",
+    )
+
+
+def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypatch) -> None:
+    """As where a GPU is present and the user computes on the processor."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert not in_lockstep()
+        _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
+    assert np.all(np.asarray(tally.steps) == int(STEPS))
+
+
+def test_an_axis_of_the_user_is_not_taken_for_the_replicas_of_a_batch(flowing) -> None:
+    batch = jax.tree.map(lambda x: x[None], flowing(0.7))
+    run = jax.vmap(lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba())[1].steps, axis_name="replica")
+    assert run(batch) == float(STEPS)
+
+
+def test_an_advance_refuses_a_state_of_another_packing_fraction(flowing) -> None:
+    assert refusal(lambda: jg.advance(replace(of(), packing_fraction=0.6), flowing(0.7), STEPS)).startswith(
+        "packing_fraction must be 0.7, which the state has, not 0.6"
     )

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from oracles import gaps_of
 
-from benchmarks import event_driven
 from benchmarks.collapse import roots
-from benchmarks.event_driven import Discs, Law, averages, sheared
+from benchmarks.independent import event_driven
+from benchmarks.independent.event_driven import Discs, Law, averages, sheared
 
 ROUNDING = 1e-12
 

@@ -232,11 +232,12 @@ def test_gradient_of_a_run_is_that_of_finite_differences(tilting, derivative, fo
     np.testing.assert_allclose(forward(at, change), exact, rtol=1e-7, atol=1e-9)
 
 
-def test_events_that_do_not_suffice_are_reported(tilting, backward, events_of):
+def test_numbers_and_derivatives_are_nan_where_events_do_not_suffice(tilting, backward, events_of):
     """Where a few steps more have one event more than the loop is long."""
     steps = next(steps for steps in range(STEPS, 2 * STEPS) if events_of(steps) > events_of(STEPS))
-    (_, tally), _ = backward(parameters(*tilting), steps)
+    (_, tally), derivative = backward(parameters(*tilting), steps)
     assert tally.status == Status.capacity
+    assert np.isnan(tally.impulse) and np.isnan(derivative["restitution"])
 
 
 # What the derivative means

@@ -30,7 +30,7 @@ def mapped_search(positions, side, tilt, cutoff):
 @jax.jit
 def batched_search(positions, side, tilt, cutoff):
     capacity = PAIRS_PER_GRAIN * positions.shape[1]
-    return jax.vmap(lambda *replica: cell_list_pairs(*replica, capacity), axis_name="replica")(
+    return jax.vmap(lambda *replica: cell_list_pairs(*replica, capacity), axis_name="jaxgran_replica")(
         positions, side, tilt, cutoff
     )
 

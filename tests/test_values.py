@@ -134,3 +134,10 @@ def test_observed_tells_what_is_missing() -> None:
     with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
         with_observed({"x": np.ones((2, BLOCKS))}).observed()
     assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
+
+
+def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None:
+    states = replace(SERIES.state, grains=SERIES.state[0].grains)
+    assert np.shape(states.grains.radii) == (5,)
+    assert states[1] == SERIES.state[1]
+    assert states[1:3] == SERIES.state[1:3]

@@ -1,11 +1,16 @@
 """Velocity scales: which part of the granular temperature is local, and which stands in the longest waves."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flows import GRAINS, flow_of
 
+import jaxgran as jg
 from jaxgran.dynamics import velocity_scales
+from jaxgran.dynamics.velocity_scales import READ_AFTER
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
@@ -79,3 +84,27 @@ def test_few_grains_are_one_box():
     positions = jnp.asarray(np.random.default_rng(4).uniform(0, 5, (16, 2)))
     state = State(grains, positions, jnp.asarray(velocities), jnp.asarray(5.0), jnp.asarray(0.0))
     np.testing.assert_allclose(local_temperature(state), np.sum(np.var(velocities, axis=0)) / 2 * 16 / 15)
+
+
+def test_the_local_temperature_is_averaged_as_well_as_the_granular_temperature():
+    """In a dense dissipative flow, where both fluctuate alike; one reading a block had three times the error."""
+    flow = jg.ShearFlow(64, 0.2, 0.8, 1e-3)
+    state = jg.prepare(flow, jax.random.key(0))
+    _, sample = jg.sample(flow, state, 80.0)
+    errors = sample.errors()
+    local, granular = (
+        float(errors[name] / getattr(sample, name)) for name in ("local_granular_temperature", "granular_temperature")
+    )
+    assert 0.5 < local / granular < 1.6
+
+
+def test_readings_of_both_engines_are_taken_in_the_same_steps(packed, engines):
+    """Until every grain has collided twice as often as between two readings, in a dense and hardly sheared flow."""
+    rng, flow = np.random.default_rng(0), flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=1e-3)
+    state = replace(packed(0.7), velocities=jnp.asarray(rng.normal(size=(GRAINS, 2))))
+    (_, numba), (end, plain) = (engines[name](flow, state, 1400) for name in ("numba", "jax"))
+    assert numba.collisions == plain.collisions > READ_AFTER * GRAINS
+    for name in ("local_kinetic", "wave_kinetic"):
+        np.testing.assert_allclose(getattr(numba, name), getattr(plain, name), rtol=1e-4)
+    last = plain.duration * wave_temperature(end)
+    assert abs(plain.wave_kinetic - last) > 0.01 * last  # it is more than the last reading

@@ -111,7 +111,7 @@ def instants(points: tuple, sizes: tuple) -> Iterator[Made]:
 
 _packed = jax.jit(lambda flow, key: jg.pack(flow, key)[0])
 _advanced = jax.jit(lambda flow, state, steps: jg.advance(flow, state, steps)[0])
-_contacts = jax.jit(contacts_now)
+_contacts = jax.jit(lambda flow, state: contacts_now(flow, state)[0])
 
 
 def _steps(strain: float, timestep: float) -> jax.Array:

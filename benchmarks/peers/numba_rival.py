@@ -1,10 +1,10 @@
-"""The contact-dynamics loop of ``rival_numba.py`` as a peer: same time step and law as jaxgran, no code in common.
+"""The loop of ``independent.contact_dynamics`` as a peer: same time step and law as jaxgran, no code in common.
 
 The loop looks at every time step, but only at the parabola of each near pair's separation, and refreshes the pairs of
 discs that were hit alone. It has no simpler way than that, and none that leaves steps out.
 """
 
-from benchmarks import rival_numba
+from benchmarks.independent import contact_dynamics
 from benchmarks.peers.problem import Discs, Flow, Run, Stress
 
 TIMESTEPS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
@@ -23,7 +23,7 @@ def begin(discs: Discs, flow: Flow, curve: str, timestep: float, duration: float
 
     def advance() -> Stress:
         nonlocal now
-        positions, velocities, tilt, tally = rival_numba.advance(
+        positions, velocities, tilt, tally = contact_dynamics.advance(
             **now._asdict(),
             shear_rate=flow.shear_rate,
             restitution=flow.restitution,

@@ -58,7 +58,8 @@ def advance(
       free_flight: True jumps over steps without an approaching contact; False visits every step. The trajectory is the
         same.
       events: number of visited steps, static, for a loop of fixed length; ``steps + 1`` is always enough, and
-        ``count_events`` counts them. If they are too few, the status is ``capacity``. None visits as many as needed.
+        ``count_events`` counts them. If they are too few, the status is ``capacity``, and numbers and derivatives are
+        NaN. None visits as many as needed.
       moving_contacts: whether derivatives include the shift of the contacts in time, see
         ``dynamics.jax_engine``. Values do not change.
       solver: solves the contacts of each step. New numbers in it do not recompile.

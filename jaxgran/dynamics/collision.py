@@ -1,6 +1,7 @@
 """The contacts of one time step: their impulses, what these do to the grains, and what they add to the sums."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import diagonal, grain_impulses, loads_of_grains
 from jaxgran.contact.law import contact_terms
@@ -16,7 +17,7 @@ from jaxgran.contact.near_pairs import Frame, PairList, PairLists, bit_words, pa
 from jaxgran.contact.network import Contacts, PairMotion, contact_network, first_contact_time, is_contact
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import Solution, solve
-from jaxgran.dynamics.flight import pairs_now
+from jaxgran.dynamics.flight import closing_speed, pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
 from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
 from jaxgran.model.control_flow import switch_replica
@@ -73,14 +74,24 @@ class Touching(NamedTuple):
         return contact_network(self.contact, self.i, self.j, self.motion, grains)
 
 
-def contacts_now(flow: ShearFlow, state: State) -> Contacts:
-    """The contact network that the next time step of a flow would solve, in a buffer that holds any packing."""
-    lists = pair_lists(state.positions, state.grains, state.side, state.tilt)
+def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""]]:
+    """The contact network that the next time step of a flow would solve, in a buffer that holds any packing.
+
+    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the list of pairs, or has
+    more contacts than discs that hardly overlap.
+    """
+    grains, listed = state.grains, pair_lists(state.positions, state.grains, state.side, state.tilt)
+    lists = replace(listed, near=listed.outer)
     pairs = pairs_now(lists, state.velocities, flow.shear_rate)
     look_ahead = flow.activation_fraction * flow.timestep
     contact, _ = is_contact(pairs, lists.near.reach, look_ahead)
     touching = Touching(lists.near.i, lists.near.j, lists.near.reach, pairs, contact)
-    return touching.picked(MOST_CONTACTS * state.grains.radii.size, bit_words(contact)).network(state.grains)
+    room = MOST_CONTACTS * grains.radii.size
+    loss = closing_speed(flow, grains, state.velocities, lists.near.skin)
+    suffices = lists.near.skin >= loss * look_ahead
+    missing = ~suffices | lists.near.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
+    status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
+    return touching.picked(room, bit_words(contact)).network(grains), status
 
 
 class Impulses(NamedTuple):

@@ -184,7 +184,7 @@ def in_lockstep(engine: Engine | None = None) -> bool:
     The batch is then one array program and waits for its slowest replica. On a processor an automatic choice of the
     engine advances one replica after another, which is faster, also where it selects ``Jax``.
     """
-    return isinstance(engine, Jax) or jax.default_backend() != "cpu"
+    return isinstance(engine, Jax) or _device().platform != "cpu"
 
 
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:

@@ -23,12 +23,13 @@ class Carry(NamedTuple):
 
     lists: PairLists
     pairs: PairMotion
-    slack: Array  # what is left of the skin of the near list
+    slack: Array  # what is left of the skin of the near list; the look-ahead of a step needs some of it
     loss: Array  # bound on how fast any gap closes
     velocities: Array
     step: Array  # steps flown
     solved: Array  # whether the contacts of the present step have been dealt with
     sums: RunningSums
+    counted: Array  # collisions until the last reading of the velocity scales
 
 
 def pairs_now(lists: PairLists, velocities: Array, shear_rate: float | Array) -> PairMotion:
@@ -51,8 +52,14 @@ def closing_speed(flow: ShearFlow, grains: Grains, velocities: Array, skin: Arra
 
 
 def is_stale(now: Carry, flow: ShearFlow) -> Bool[Array, ""]:
-    """Whether the near list may miss a contact of the next step."""
-    return ~(now.slack >= now.loss * flow.timestep)
+    """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
+    return ~(now.slack >= now.loss * (1 + flow.activation_fraction) * flow.timestep)
+
+
+def steps_of_list(now: Carry, flow: ShearFlow) -> Float[Array, ""]:
+    """Number of steps for which the near list has every contact; no more than the longest flight."""
+    longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
+    return jnp.floor(jnp.minimum(now.slack / now.loss / flow.timestep - flow.activation_fraction, longest))
 
 
 def with_new_lists(now: Carry, flow: ShearFlow, grains: Grains, side: Array, stale: Array) -> Carry:

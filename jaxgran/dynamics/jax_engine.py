@@ -15,7 +15,7 @@ grains. Where a grain strikes a cluster, only the impulse that its own approach 
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,27 +27,35 @@ from jaxgran.contact.network import Contacts, PairMotion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
 from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_buffers, shifted
 from jaxgran.dynamics.flight import (
-    LONGEST_FLIGHT,
     Carry,
     add_flight,
     closing_speed,
     fly,
     is_stale,
+    steps_of_list,
     steps_to_contact,
     with_new_lists,
 )
 from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
-from jaxgran.dynamics.velocity_scales import local_temperature, wave_temperature
+from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
 from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
-from jaxgran.model.state import State, kinetic_energy, relative_momentum, require_state, status_if_finite
+from jaxgran.model.state import (
+    State,
+    kinetic_energy,
+    relative_momentum,
+    require_match,
+    require_state,
+    status_if_finite,
+)
 from jaxgran.model.status import Status
 
+T = TypeVar("T")
 NEEDS_EVENTS = (
     "derivatives in reverse mode (jax.grad, jax.vjp) need the length of the loop: take advance(flow, state, steps, "
     "events=int(count_events(flow, state, steps))), or forward mode (jax.jvp, jax.jacfwd), which needs nothing."
@@ -55,8 +63,9 @@ NEEDS_EVENTS = (
 
 
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
-    """Raise an InputError unless this is one flow, one state of its grains and a number of time steps."""
+    """Raise an InputError unless this is one flow, one state of it and a number of time steps."""
     require_state(flow, state)
+    require_match(flow, state)
     words = f"a whole number of 0 to {MAX_STEPS}"
     require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
 
@@ -79,10 +88,10 @@ def advance_by_jax(
     loop = _event_loop(flow, state, steps, free_flight, options)
     if events is None:
         end = loop.end()
-    else:
-        require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
-        end = loop.scanned(events)
-    return _ended(state, end, loop.unfinished)
+        return _ended(state, end, loop.unfinished)
+    require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
+    end = loop.scanned(events)
+    return _nan_where(loop.unfinished(end), _ended(state, end, loop.unfinished))
 
 
 def observe_by_jax(
@@ -96,6 +105,12 @@ def observe_by_jax(
     return *_ended(state, end, loop.unfinished), end.sums.user_sums.sums
 
 
+def _nan_where(invalid: Array, values: T) -> T:
+    """The values, with NaN in place of every real number where they are invalid, and in all of their derivatives."""
+    factor = jnp.where(invalid, jnp.nan, 1.0)
+    return jax.tree.map(lambda x: x * factor.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x, values)
+
+
 def _ended(state: State, end: Carry, unfinished: Callable) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
     short = jnp.where(unfinished(end), Status.capacity, Status.ok).astype(jnp.int32)
@@ -107,10 +122,8 @@ def ended(state: State, positions: Array, tilt: Array, velocities: Array, sums: 
     """The state and the tally of an advance that led from a state to these positions, tilt and velocities."""
     grains = state.grains
     end = State(grains, positions, velocities, state.side, tilt)
-    tally = sums.tally(
+    tally = sums.with_reading(readings(end)).tally(
         energy_change=kinetic_energy(grains, velocities) - kinetic_energy(grains, state.velocities),
-        local_kinetic=sums.duration * local_temperature(end),
-        wave_kinetic=sums.duration * wave_temperature(end),
         momentum_drift=relative_momentum(grains, velocities),
     )
     status = jnp.maximum(sums.status, status_if_finite(positions, velocities))
@@ -200,7 +213,7 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         lists, pairs, slack, loss = now.lists, now.pairs, now.slack, now.loss
         least = now.solved.astype(jnp.int32)
         jump = steps_to_contact(pairs, lists.near.reach, flow, least)
-        jump = jnp.minimum(jump, jnp.floor(jnp.minimum(slack / loss, jnp.divide(LONGEST_FLIGHT, shear_rate)) / dt))
+        jump = jnp.minimum(jump, steps_of_list(now, flow))
         jump = jnp.where(free_flight, jump, 0)
         remaining = steps - now.step
         jump = jnp.clip(jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining)
@@ -213,7 +226,9 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         lists, slack = replace(lists, frame=frame), slack - loss * flight
         pairs = pairs.moved(flight)
         step = now.step + jump
-        meets = go & (step < steps)
+        spare = slack - loss * flow.activation_fraction * dt
+        expired = spare < -16 * jnp.finfo(slack.dtype).eps * lists.near.skin
+        meets = go & (step < steps) & ~(expired & (jump > 0))  # a new list comes first
         observe_now = observer_at(lists, velocities)
         velocities, pairs, sums, shift = collide(
             flow, lists.near, grains, velocities, pairs, sums, meets, options, observe_now
@@ -221,15 +236,24 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
         if shift is not None:
             frame, velocities, pairs = shifted(shift, shear_rate, lists, velocities, pairs)
             lists = replace(lists, frame=frame)
-        status = jnp.where(
-            lists.near.overflow | (slack < -16 * jnp.finfo(slack.dtype).eps * lists.near.skin),
-            Status.capacity,
-            Status.ok,
-        )
+        status = jnp.where(lists.near.overflow | (expired & meets), Status.capacity, Status.ok)
         status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
         sums = sums._replace(status=jnp.maximum(sums.status, status))
         loss = closing_speed(flow, grains, velocities, lists.near.skin)
-        return where_active(go, Carry(lists, pairs, slack, loss, velocities, step, meets, sums), now)
+        sums, counted = with_readings(sums, now.counted, lists, velocities)
+        return where_active(go, Carry(lists, pairs, slack, loss, velocities, step, meets, sums, counted), now)
+
+    def with_readings(sums: RunningSums, counted: Array, lists: PairLists, velocities: Array) -> tuple:
+        """The sums with readings of the state, and the collisions until then, where it is time for some."""
+        due = sums.collisions - counted >= READ_AFTER * grains.radii.size / 2
+
+        def read() -> tuple:
+            positions, tilt = present(lists, side)
+            now = State(grains, positions, velocities, side, tilt)
+            return where_active(due, (sums.with_reading(readings(now)), sums.collisions), (sums, counted))
+
+        # The loop of a fixed length, for reverse mode, is too short for a second reading.
+        return lax.cond(any_replica(due), read, lambda: (sums, counted)) if options.buffers else (sums, counted)
 
     def stale(now: Carry) -> Array:
         return unfinished(now) & is_stale(now, flow)
@@ -245,7 +269,17 @@ def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, 
     if observe_now is not None:
         sums = sums._replace(user_sums=nothing_observed(observe_now, lists.near.reach.size, state.positions.dtype))
     loss = jnp.full_like(side, jnp.inf)  # there is no list yet
-    start = Carry(lists, pairs, lists.near.skin, loss, state.velocities, jnp.int32(0), jnp.bool_(False), sums)
+    start = Carry(
+        lists,
+        pairs,
+        lists.near.skin,
+        loss,
+        state.velocities,
+        jnp.int32(0),
+        jnp.bool_(False),
+        sums,
+        jnp.zeros_like(side),
+    )
     return EventLoop(start, event, listed, unfinished, stale)
 
 

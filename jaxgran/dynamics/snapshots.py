@@ -68,10 +68,12 @@ class Snapshot(Indexable):
 
 def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SOLVER) -> Snapshot:
     """The snapshot of a flow now: the contact network of the next step is solved, and nothing moves."""
-    network = contacts_now(flow, state)
+    network, status = contacts_now(flow, state)
     solution = solve(network, flow.grains, flow.shear_rate, solver, jnp.any(network.approach < 0))
     restitution = jnp.asarray(flow.restitution, state.side.dtype)
-    return snapshot_of(flow, state, network, (1 + restitution) * solution.impulses, solution.status)
+    return snapshot_of(
+        flow, state, network, (1 + restitution) * solution.impulses, jnp.maximum(status, solution.status)
+    )
 
 
 def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array) -> Snapshot:

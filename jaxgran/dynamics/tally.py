@@ -25,8 +25,8 @@ CONTACT = "contact"  # each contact of a solved network, by the law of a contact
 SOLVE = "solve"  # each solved network
 LARGEST = "largest"  # each solved network; the largest value counts
 AT_END = "end"  # the end of an advance
-INSTANT = "instant"  # the state at the end of an advance, which stands for its whole duration
-KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST)
+INSTANT = "instant"  # a reading of the state, which stands for the time since the last one, see ``velocity_scales``
+KINDS = (FLIGHT, CONTACT, SOLVE, LARGEST, INSTANT)
 _TENSOR = (2, 2)  # symmetric; running sums hold xx, xy, yy
 
 
@@ -79,10 +79,10 @@ class Tally:
     largest_overlap: Float[Array, "*b"] = _sum(LARGEST, "σ", "overlap of a contact")
     worst_residual: Float[Array, "*b"] = _sum(LARGEST, "–", "relative residual of a solve")
     local_kinetic: Float[Array, "*b"] = _sum(
-        INSTANT, "mσ²γ̇", "granular temperature relative to the mean velocity of a box, at the end, times the duration"
+        INSTANT, "mσ²γ̇", "granular temperature relative to the mean velocity of a box, times the time between readings"
     )
     wave_kinetic: Float[Array, "*b"] = _sum(
-        INSTANT, "mσ²γ̇", "granular temperature of the longest waves, at the end, times the duration"
+        INSTANT, "mσ²γ̇", "granular temperature of the longest waves, times the time between readings"
     )
     momentum_drift: Float[Array, "*b"] = _sum(AT_END, "–", "|Σ m c| over Σ m |c|, at the end", joined="largest")
     status: Int[Array, "*b"] = _sum(AT_END, "–", "status, the worst", joined="largest")
@@ -120,6 +120,7 @@ def _layout() -> dict[str, slice]:
                 size = 3 if row["shape"] == _TENSOR else int(np.prod(row["shape"], dtype=int))
                 places[name] = slice(begin, begin + size)
                 begin += size
+    places["read_until"] = slice(begin, begin + 1)  # the time of the last reading; no sum
     return places
 
 
@@ -134,29 +135,33 @@ def place_of(name: str) -> int:
 
 def span_of(kind: str) -> slice:
     """Where the running sums of one kind stand."""
-    places = [place for name, place in LAYOUT.items() if TABLE[name]["kind"] == kind]
+    places = [LAYOUT[name] for name, row in TABLE.items() if row["kind"] == kind]
     return slice(places[0].start, places[-1].stop)
 
 
 class RunningSums(NamedTuple):
     """What the time loop of an engine carries, until ``tally`` gives the sums their names.
 
-    =========  ===========  ========================================================================================
-    field      shape        meaning
-    =========  ===========  ========================================================================================
-    flight     (numbers,)   the sums of each kind, in the order of ``LAYOUT``
-    contact    (numbers,)
-    solve      (numbers,)
-    largest    (numbers,)
-    status     ()           the worst status
-    user_sums  pytree       sums of what a user's function observes, see ``observer``; () without one
-    =========  ===========  ========================================================================================
+    ==========  ===========  =======================================================================================
+    field       shape        meaning
+    ==========  ===========  =======================================================================================
+    flight      (numbers,)   the sums of each kind, in the order of ``LAYOUT``
+    contact     (numbers,)
+    solve       (numbers,)
+    largest     (numbers,)
+    instant     (numbers,)
+    read_until  ()           time of the last reading
+    status      ()           the worst status
+    user_sums   pytree       sums of what a user's function observes, see ``observer``; () without one
+    ==========  ===========  =======================================================================================
     """
 
     flight: Float[Array, " flight"]
     contact: Float[Array, " contact"]
     solve: Float[Array, " solve"]
     largest: Float[Array, " largest"]
+    instant: Float[Array, " instant"]
+    read_until: Float[Array, ""]
     status: Int[Array, ""]
     user_sums: Any = ()
 
@@ -169,6 +174,16 @@ class RunningSums(NamedTuple):
     def steps(self) -> Float[Array, ""]:
         """Time steps so far."""
         return self._named("steps")
+
+    @property
+    def collisions(self) -> Float[Array, ""]:
+        """Contacts that approached, so far."""
+        return self._named("collisions")
+
+    def with_reading(self, readings: Float[Array, " instant"]) -> "RunningSums":
+        """The sums with readings of the state now, which stand for the time since the last ones."""
+        instant = self.instant + (self.duration - self.read_until) * readings
+        return self._replace(instant=instant, read_until=self.duration)
 
     def tally(self, **ends: Array) -> Tally:
         """The tally; what is known only at the end of an advance is given by name, but the status."""
@@ -184,8 +199,7 @@ class RunningSums(NamedTuple):
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
     """The running sums of an engine that keeps them in one row."""
-    flight, contact, solve, largest = (numbers[span_of(kind)] for kind in KINDS)
-    return RunningSums(flight, contact, solve, largest, status)
+    return RunningSums(*(numbers[span_of(kind)] for kind in KINDS), numbers[place_of("read_until")], status)
 
 
 def empty_sums(dtype: jnp.dtype) -> RunningSums:

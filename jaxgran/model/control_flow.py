@@ -1,7 +1,7 @@
 """Real control flow for a batch of replicas.
 
 Under ``vmap`` a batched predicate turns ``lax.cond`` into a ``select``, which computes both branches. Reduced over the
-named axis ``"replica"``, the predicate is one scalar for the whole batch, and only one branch is computed. Outside a
+named axis ``AXIS``, the predicate is one scalar for the whole batch, and only one branch is computed. Outside a
 batch, and under ``lax.map``, there is no such axis: the functions below then return their argument unchanged.
 """
 
@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-AXIS = "replica"
+AXIS = "jaxgran_replica"  # a name that no axis of a user has
 T = TypeVar("T")
 
 
 def in_batch() -> bool:
-    """Whether the code that JAX traces runs under ``vmap(axis_name="replica")``."""
+    """Whether the code that JAX traces runs under ``vmap(axis_name="jaxgran_replica")``."""
     try:
         lax.axis_index(AXIS)
     except NameError:

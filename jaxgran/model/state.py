@@ -1,6 +1,7 @@
 """State: a sheared packing at one instant, the check of a state, and its energy and momentum."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +65,12 @@ class State(Indexable):
     @property
     def _axes(self) -> tuple[int, ...]:
         return np.shape(self.side)
+
+    def __getitem__(self, place: Any) -> Self:
+        axes, grains = self._axes, self.grains
+        if axes and np.ndim(grains.radii) == 1:  # the replicas share them
+            grains = jax.tree.map(lambda x: jnp.broadcast_to(x, (*axes, *x.shape)), grains)
+        return super(State, replace(self, grains=grains)).__getitem__(place)
 
 
 def require_state(flow: ShearFlow, state: State) -> None:

@@ -15,7 +15,7 @@ INPUTS = 10  # numbers of a flow and of its advance
 STATUS, TILT, SUSPENDED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
 RESULTS = NUMBERS + 4
 BETWEEN_LISTS, WITHIN_LIST = 1, 2  # where a suspended loop goes on
-SAVED = 16  # numbers of a suspended loop, behind its sums
+SAVED = 15  # numbers of a suspended loop, behind its sums
 WORDS, WORDS_PER_GRAIN = (
     1024 + 2 * NUMBERS + SAVED,
     187,

@@ -63,8 +63,10 @@ from jaxgran.dynamics.numba_engine.near_pairs import (
 )
 from jaxgran.dynamics.numba_engine.network import find_clusters, gather_kicks, make_network, solve_isolated
 from jaxgran.dynamics.numba_engine.records import record_contacts, record_flight
-from jaxgran.dynamics.numba_engine.sums import add_contacts, add_flight, add_solve
+from jaxgran.dynamics.numba_engine.sums import COLLISIONS, add_contacts, add_flight, add_solve
+from jaxgran.dynamics.numba_engine.velocity_scales import read_velocity_scales
 from jaxgran.dynamics.tally import NUMBERS
+from jaxgran.dynamics.velocity_scales import READ_AFTER
 
 residual_target, relative_residual = LAW["residual_target"], LAW["relative_residual"]
 
@@ -101,13 +103,16 @@ def advance_loop(
     if going_on > 0:
         for n in range(NUMBERS):
             results[n] = saved[n]
-        tilt, largest, done, solved, status = _advance_saved(saved[NUMBERS:])
+        tilt, largest, done, solved, status, counted = _advance_saved(saved[NUMBERS:])
     else:
         put_in_order(positions, side, tilt, order)
         largest, finite = _take_grains(positions, velocities, radii, masses, order.given, rate, grains)
         # steps until the last search; whether the contacts of the present step have been dealt with
         done, solved, status = 0, 0, OK if finite else NONFINITE
-    widest = max(side / 2 - largest, 1e-3)  # nearest images are unique
+        counted = 0.0  # collisions until the last reading of the velocity scales
+    widest = side / 2 - largest  # nearest images are unique
+    if widest < 0.0:
+        status, widest = max(status, CAPACITY), 0.0
     expected = math.sqrt(2 * _PAIRS_PER_GRAIN * side * side / (math.pi * count)) - 1.0
     usual = min(max(expected, _NARROWEST_SKIN), widest)
 
@@ -175,6 +180,9 @@ def advance_loop(
             if not finite:
                 status = NONFINITE
                 break
+            if results[COLLISIONS] - counted >= READ_AFTER * count / 2:
+                read_velocity_scales(t, tilt + rate * t, side, rate, grains, clusters.matrices, step_sums, results)
+                counted = results[COLLISIONS]
             loss_before, loss = loss, skin_loss(fastest, rate, largest + skin)
             slack -= (loss - loss_before) * ahead
             horizon = max(min(slack / loss, life - t), dt) + ahead
@@ -195,7 +203,7 @@ def advance_loop(
     if suspended > 0:
         for n in range(NUMBERS):
             saved[n] = results[n]
-        _save_advance(tilt, largest, done, solved, status, saved[NUMBERS:])
+        _save_advance(tilt, largest, done, solved, status, counted, saved[NUMBERS:])
     elif done > 0:
         _deliver(order.given, side, tilt, rate, grains, new_positions, new_velocities)
     else:  # as it was, to the bit
@@ -206,15 +214,15 @@ def advance_loop(
 
 
 @inline_njit
-def _save_advance(tilt, largest, done, solved, status, saved):
+def _save_advance(tilt, largest, done, solved, status, counted, saved):
     """Save the numbers of a suspended advance."""
-    saved[0], saved[1], saved[2], saved[3], saved[4] = tilt, largest, done, solved, status
+    saved[0], saved[1], saved[2], saved[3], saved[4], saved[14] = tilt, largest, done, solved, status, counted
 
 
 @inline_njit
 def _advance_saved(saved):
     """The numbers of ``_save_advance``."""
-    return saved[0], saved[1], int(saved[2]), int(saved[3]), int(saved[4])
+    return saved[0], saved[1], int(saved[2]), int(saved[3]), int(saved[4]), saved[14]
 
 
 @inline_njit

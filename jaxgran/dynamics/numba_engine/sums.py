@@ -23,6 +23,7 @@ _PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
 # Terms that fill the last eight, and are added to nothing: zeros in their place cost 3 to 6 % of a step.
 _PADS = _PADDED - _TERMS
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
+COLLISIONS = place_of("collisions")
 _SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
 _UNCONVERGED, _COUNTS = place_of("unconverged"), place_of("residual_counts")
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")

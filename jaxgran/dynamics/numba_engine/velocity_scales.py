@@ -1,0 +1,68 @@
+"""Readings of the velocity scales in the numba engine, as by ``dynamics.velocity_scales``."""
+
+import math
+
+import numpy as np
+
+from jaxgran.dynamics.numba_engine.compilation import njit
+from jaxgran.dynamics.numba_engine.layout import INVERSE_MASS, VX, VY, X, Y
+from jaxgran.dynamics.tally import place_of
+from jaxgran.dynamics.velocity_scales import BOX_GRAINS, WAVES
+
+_DURATION, _READ_UNTIL = place_of("duration"), place_of("read_until")
+_LOCAL, _WAVE = place_of("local_kinetic"), place_of("wave_kinetic")
+_AMPLITUDES = 4 * len(WAVES)  # real and imaginary parts of both components
+
+
+@njit
+def read_velocity_scales(t, tilt, side, rate, grains, boxes, amplitudes, results):
+    """Add a reading of the state at the time t since the search, which stands for the time since the last reading.
+
+    Args:
+      t, tilt, side, rate: the time, tilt and side of the cell then, and the shear rate.
+      grains: the grains.
+      boxes: (grains, 3) memory for the mass and the momentum of each box.
+      amplitudes: memory for ``_AMPLITUDES`` numbers.
+      results: the running sums.
+    """
+    motion, constants, count = grains.motion, grains.constants, grains.motion.shape[0]
+    across = max(1, int(np.rint(math.sqrt(count / BOX_GRAINS))))
+    tilt -= math.floor(tilt + 0.5)
+    for box in range(across * across):
+        boxes[box, 0] = boxes[box, 1] = boxes[box, 2] = 0.0
+    for n in range(_AMPLITUDES):
+        amplitudes[n] = 0.0
+    energy, total = 0.0, 0.0  # Σ m c² and Σ m
+    for g in range(count):
+        x, y = motion[g, X] + motion[g, VX] * t, motion[g, Y] + motion[g, VY] * t
+        cx, cy, mass = motion[g, VX] - rate * y, motion[g, VY], 1 / constants[g, INVERSE_MASS]
+        sx, sy = (x - tilt * y) / side, y / side
+        sx, sy = sx - math.floor(sx), sy - math.floor(sy)
+        px, py = mass * cx, mass * cy
+        energy += px * cx + py * cy
+        total += mass
+        box = across * min(int(sy * across), across - 1) + min(int(sx * across), across - 1)
+        boxes[box, 0] += mass
+        boxes[box, 1] += px
+        boxes[box, 2] += py
+        ca, sa = math.cos(2 * math.pi * sx), math.sin(2 * math.pi * sx)
+        cb, sb = math.cos(2 * math.pi * sy), math.sin(2 * math.pi * sy)
+        sum_cos, sum_sin = ca * cb - sa * sb, sa * cb + ca * sb
+        difference_cos, difference_sin = ca * cb + sa * sb, sa * cb - ca * sb
+        waves = (ca, sa, cb, sb, sum_cos, sum_sin, difference_cos, difference_sin)
+        for n in range(len(waves)):
+            amplitudes[2 * n] += waves[n] * px
+            amplitudes[2 * n + 1] += waves[n] * py
+    occupied = 0
+    for box in range(across * across):
+        mass, px, py = boxes[box, 0], boxes[box, 1], boxes[box, 2]
+        if mass > 0.0:
+            occupied += 1
+            energy -= (px * px + py * py) / mass
+    squares = 0.0
+    for n in range(_AMPLITUDES):
+        squares += amplitudes[n] * amplitudes[n]
+    since = results[_DURATION] - results[_READ_UNTIL]
+    results[_LOCAL] += since * energy / (2 * max(count - occupied, 1))
+    results[_WAVE] += since * 2 * squares / (_AMPLITUDES * total)
+    results[_READ_UNTIL] = results[_DURATION]
