@@ -99,24 +99,25 @@ def test_a_strain_without_a_step_for_each_snapshot_is_refused(flow, flowing, str
         snapshot_series(flow, flowing(0.78), strain, 5)
 
 
-@pytest.mark.parametrize(("packing_fraction", "temperature", "timestep"), [(0.5, 100.0, 0.05), (0.1, 2000.0, 0.1)])
+@pytest.mark.parametrize(("packing_fraction", "temperature", "timestep"), [(0.3, 250.0, 0.05), (0.1, 2000.0, 0.1)])
 def test_a_fast_coarse_flow_has_all_its_contacts_or_says_that_some_may_be_missing(
     packed, packing_fraction, temperature, timestep
 ) -> None:
     """A step looks θ·dt ahead, which may be further than the lists of pairs reach."""
-    rng, still = np.random.default_rng(0), packed(packing_fraction)
-    velocities = jnp.asarray(rng.normal(size=(GRAINS, 2)) * np.sqrt(temperature))
-    state = replace(still, velocities=velocities)
-    seen = jax.jit(snapshot)(ShearFlow(GRAINS, 0.5, packing_fraction, timestep), state, EXACT)
-    i, j = np.triu_indices(GRAINS, 1)
-    positions, radii = np.asarray(state.positions), np.asarray(state.grains.radii)
-    s = nearest_image(positions[i] - positions[j], float(state.side), float(state.tilt))
-    u = np.asarray(velocities)[i] - np.asarray(velocities)[j] + np.stack([s[:, 1], 0 * s[:, 1]], axis=1)
-    closing, speed = np.sum(s * u, axis=1), np.sum(u * u, axis=1)
-    time = np.where(closing < 0, np.minimum(-closing / speed, timestep / 2), timestep / 2)
-    meets = np.sum((s + time[:, None] * u) ** 2, axis=1) <= (radii[i] + radii[j]) ** 2
-    if temperature < 1000:
-        assert np.sum(meets) > 10
-        assert seen.status < Status.capacity and np.sum(seen.contacts.used) == np.sum(meets)
-    else:
-        assert seen.status == Status.capacity
+    still, statuses = packed(packing_fraction), []
+    flow = ShearFlow(GRAINS, 0.5, packing_fraction, timestep)
+    for seed in range(10):
+        velocities = np.random.default_rng(seed).normal(size=(GRAINS, 2)) * np.sqrt(temperature)
+        state = replace(still, velocities=jnp.asarray(velocities))
+        seen = jax.jit(snapshot)(flow, state, EXACT)
+        i, j = np.triu_indices(GRAINS, 1)
+        positions, radii = np.asarray(state.positions), np.asarray(state.grains.radii)
+        s = nearest_image(positions[i] - positions[j], float(state.side), float(state.tilt))
+        u = velocities[i] - velocities[j] + np.stack([s[:, 1], 0 * s[:, 1]], axis=1)
+        closing, speed = np.sum(s * u, axis=1), np.sum(u * u, axis=1)
+        time = np.where(closing < 0, np.minimum(-closing / speed, timestep / 2), timestep / 2)
+        meets = np.sum((s + time[:, None] * u) ** 2, axis=1) <= (radii[i] + radii[j]) ** 2
+        statuses.append(int(seen.status))
+        if seen.status < Status.infeasible:
+            assert np.sum(seen.contacts.used) == np.sum(meets)
+    assert (min(statuses) == Status.ok) == (temperature < 1000)
