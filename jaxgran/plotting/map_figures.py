@@ -92,13 +92,11 @@ def save_figures(
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
-    """Remove the pictures beside a dataset that show the map there was before: all but some, in whatever format."""
-    kept = {file.with_suffix("") for file in but}
-    for name in FIGURES:
-        for format in get_args(FileFormat):
-            file = path.with_name(f"{path.stem}_{name}.{format}")
-            if file.with_suffix("") not in kept and file.is_file():
-                file.unlink()
+    """Remove the pictures of a map that was beside a dataset before: all but some, in whatever format."""
+    names = {path.with_name(f"{path.stem}_{name}.{end}") for name in FIGURES for end in get_args(FileFormat)}
+    for file in names - {*but}:
+        if file.is_file():
+            file.unlink()
 
 
 def require_file(format: Any, dpi: Any) -> None:
