@@ -60,7 +60,7 @@ SMALL_MAP = (
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
 SAME += ("solver", "engine", "solver_requested", "engine_requested")
-PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters", "errors")}
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters")}
 FRAMES = ["--trajectory", "flow.gsd", "--frame-strain", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
