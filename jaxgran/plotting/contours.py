@@ -27,7 +27,7 @@ from jaxgran.plotting.interpolation import interpolated, refined_axes
 _EXCESS_COLOUR = "#00803c"
 _EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
 _LEAST_ROOM = 0.045  # inches from a label to the next contour, or half of those to the frame
-_LABEL_LENGTH = 0.42  # inches between the middles of two labels, which then do not touch whatever their directions
+_LETTER = 0.078  # inches, width of a letter of a label
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
@@ -72,7 +72,7 @@ def draw_levels(
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
     if labelled:
         texts = {value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()}
-        places = _label_places(axes, drawn, x, y)
+        places = _label_places(axes, drawn, x, y, [_LETTER * len(text) for text in texts.values()])
         for label in axes.clabel(
             drawn, fmt=texts, fontsize=SMALL_SIZE + 0.5, inline_spacing=2, manual=places, zorder=6
         ):
@@ -80,10 +80,13 @@ def draw_levels(
     return crossed
 
 
-def _label_places(axes: Axes, drawn: QuadContourSet, x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:
+def _label_places(
+    axes: Axes, drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, lengths: list[float]
+) -> list[tuple[float, float]]:
     """Return where each contour with room for a label has it: as far from the others and the frame as it can.
 
-    Lengths are in inches before the panel has its final size. Contours with more room have their labels first.
+    Lengths are in inches, before the panel has its final size. Contours with the least room have their labels first.
+    Middles of labels are as far apart as the mean of their lengths, so that they do not touch in whatever directions.
     """
     corner, scale = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
     scale = scale / (axes.bbox.size / axes.figure.dpi)
@@ -94,12 +97,12 @@ def _label_places(axes: Axes, drawn: QuadContourSet, x: np.ndarray, y: np.ndarra
         others = np.concatenate([np.full((1, 2), np.inf), *curves[:k], *curves[k + 1 :]])
         apart = np.linalg.norm(curve[:, None] - others, axis=-1).min(axis=1, initial=np.inf)
         clearances.append(np.minimum(apart, np.minimum(curve, end - curve).min(axis=1) / 2))
-    places = np.empty((0, 2))
-    for k in sorted(range(len(curves)), key=lambda k: -clearances[k].max(initial=0)):
-        from_labels = np.linalg.norm(curves[k][:, None] - places, axis=-1).min(axis=1, initial=np.inf)
-        clearance = np.where(from_labels > _LABEL_LENGTH, clearances[k], 0)
+    places, placed = np.empty((0, 2)), np.empty(0)
+    for k in sorted(range(len(curves)), key=lambda k: clearances[k].max(initial=0)):
+        between = np.linalg.norm(curves[k][:, None] - places, axis=-1) - (placed + lengths[k]) / 2
+        clearance = np.where(between.min(axis=1, initial=np.inf) > 0, clearances[k], 0)
         if clearance.max(initial=0) > _LEAST_ROOM:
-            places = np.vstack([places, curves[k][clearance.argmax()]])
+            places, placed = np.vstack([places, curves[k][clearance.argmax()]]), np.append(placed, lengths[k])
     return [tuple(place) for place in corner + scale * places]
 
 
