@@ -128,7 +128,8 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
             _write(path, "r+", frame, step)
         except OSError as error:
             path.unlink(missing_ok=True)
-            error.filename = str(path)
+            if error.errno:
+                error.filename = str(path)
             raise
     else:
         with atomic_write(path) as temporary:

@@ -89,7 +89,7 @@ def _label_places(
     Middles of labels are as far apart as the mean of their lengths, so that they do not touch in whatever directions.
     """
     corner, scale = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
-    scale = scale / (axes.bbox.size / axes.figure.dpi)
+    scale = scale / (np.array(axes.bbox.size) / axes.figure.dpi)
     end = np.array([np.ptp(x), np.ptp(y)]) / scale
     curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / scale for path in drawn.get_paths()]
     clearances = []

@@ -305,14 +305,15 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
             where = {"transform": axes.transAxes, "ha": "center"}
             axes.text(0.5, 0.6, "no measured values", fontsize=LABEL_SIZE, bbox=box, **where)
     caption = figure.supxlabel("", fontsize=SMALL_SIZE, gid=_CAPTION)
-    lines = [line for note in (*notes, _run_description(data.attrs)) if note for line in _wrapped(caption, note)]
+    described, width = (*notes, _run_description(data.attrs)), 0.97 * figure.bbox.width
+    lines = [line for note in described if note for line in _wrapped(caption, note, width)]
     caption.set_text("\n".join(lines))
     figure.set_figheight(figure.get_figheight() + _LINE_HEIGHT * max(0, len(lines) - _USUAL_LINES))
 
 
-def _wrapped(text: Text, words: str) -> list[str]:
-    """Return words in lines that fit the width of the figure, as the text would draw them; formulas stay whole."""
-    most, lines = 0.97 * text.get_figure().bbox.width, []
+def _wrapped(text: Text, words: str, most: float) -> list[str]:
+    """Return words in lines of at most so many pixels as the text would draw them; formulas stay whole."""
+    lines: list[str] = []
     for word in re.findall(r"(?:\$[^$]*\$|\S)+", words):
         text.set_text(f"{lines[-1]} {word}" if lines else word)
         if lines and text.get_window_extent().width <= most:
