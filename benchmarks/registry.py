@@ -110,7 +110,7 @@ BENCHMARKS = (
         "quick_map",
         "What does `jaxgran map` draw when it is given no option?",
         (0.5, 0.4),
-        ("quick_curves.png", "quick_errors.png"),
+        ("quick_curves.png",),
     ),
     Benchmark(
         "dense_rheology",

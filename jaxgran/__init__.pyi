@@ -39,7 +39,6 @@ from .model.status import Status
 from .page.document import Page
 from .page.explore import explore
 from .plotting.enskog_factors import enskog_factors
-from .plotting.errors import dominating_errors
 from .plotting.flow import flow_figure
 from .plotting.friction import friction_figure
 from .plotting.map_figures import save_figures
@@ -96,7 +95,6 @@ __all__ = [
     "contact_residuals",
     "cooling",
     "count_events",
-    "dominating_errors",
     "enskog_factors",
     "explore",
     "fields_at",

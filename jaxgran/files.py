@@ -21,7 +21,10 @@ _DIGEST = 32  # bytes at the start of a cache file: the SHA-256 hash of the rest
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block succeeds."""
+    """Yield the path of a temporary file beside ``path``, which replaces ``path`` if the block succeeds.
+
+    An OSError of the block names ``path``.
+    """
     temporary = path.with_name(f".{path.stem}-{secrets.token_hex(8)}{path.suffix}")
     try:
         yield temporary
@@ -29,8 +32,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         if os.name == "posix":  # on other systems a folder cannot be opened
             _sync(path.parent)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno and error.filename in (None, str(temporary)):
+            error.filename = str(path)
         raise
 
 

@@ -81,9 +81,6 @@ xr.Dataset({name: 100 * point[f"{name}_ci95"] / point[name] for name in names}).
 # %% [markdown]
 # The largest part decides what to do about it: more strain or seeds for sampling, more grains for size.
 
-# %%
-jg.dominating_errors(data)
-
 # %% [markdown]
 # ## Beside the reference map
 #

@@ -6,6 +6,8 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.inference.closure import LAWS, Closure, Law, predict
+from jaxgran.plotting.enskog_factors import PANELS
+from jaxgran.sampling.enskog_factors import RATES
 
 ALPHA, NU = (0.2, 0.35, 0.5, 0.65, 0.8), (0.5, 0.6, 0.65, 0.7, 0.75, 0.79)
 SCATTER = 0.02
@@ -17,6 +19,8 @@ TRUE = {
 }
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
+DIMS = ("packing_fraction", "restitution")
+STDERR = 0.02  # of every stress in a map of the theory, relative
 FRICTION, FRACTION = (0.10, 0.60, 0.40), (0.84, -0.25, 0.80)
 
 
@@ -143,3 +147,50 @@ def with_variables(data: xr.DataTree, *names: str) -> xr.DataTree:
     """Return a map with only the named variables, as ``NAME`` or ``GROUP/NAME``."""
     kept = {node.path: [x for x in node.data_vars if f"{node.path}/{x}".strip("/") in names] for node in data.subtree}
     return xr.DataTree.from_dict({path: data[path].to_dataset()[chosen] for path, chosen in kept.items()})
+
+
+def assumption_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the synthetic ln(binary/measured), linear in x = 1 − α and ν."""
+    return -0.5 * x - 0.8 * (nu - 0.3)
+
+
+def closure_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the synthetic ln(theory/binary), of both signs."""
+    return 1.5 * (x - 0.5) + 0.6 * (nu - 0.547)
+
+
+def factor_of(k: int, x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    """Return the logarithm of synthetic factor k of a stress; the first is within its error everywhere."""
+    return 0.5 * STDERR * (x - x) if k == 0 else (-1.0) ** k * (0.4 * k * x + 0.5 * (nu - 0.55))
+
+
+def share_of(x: np.ndarray, nu: np.ndarray) -> np.ndarray:
+    return 0.08 + 0.6 * x + 0.6 * (nu - 0.4)
+
+
+def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
+    """Return a synthetic map with stresses, what a theory predicts of them, and shares of clusters."""
+    data = ratio_dataset(alphas, nus)
+    x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
+    added = {}
+    for scale, name in ((3.0, "pressure"), (1.0, "shear_stress")):
+        measured = scale * np.exp(2.0 * nu) * np.ones_like(x)
+        binary = measured * np.exp(assumption_of(x, nu))
+        parts = {
+            name: measured,
+            f"stresses/kinetic_{name}": 0.3 * measured,
+            f"stresses/binary_{name}": binary - 0.3 * measured,
+        }
+        added |= {key: (DIMS, value) for key, value in parts.items()}
+        added |= {f"{key}_stderr": (DIMS, STDERR * value) for key, value in parts.items()}
+        added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
+    shown = {f"enskog_factor_{rate}_{factor}": k for rate in RATES for k, factor in enumerate(PANELS)}
+    for name, k in (shown | {"correlation_length_from_pressure": len(PANELS)}).items():
+        value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
+        added |= {f"theory/{name}": (DIMS, value), f"theory/{name}_stderr": (DIMS, STDERR * value)}
+    ratio = np.ones((*data.force_ratio.shape, 2, 2))
+    added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
+    added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}
+    for name in ("stresses/cluster_pressure_share", "stresses/cluster_shear_share"):
+        added |= {name: (DIMS, share_of(x, nu)), f"{name}_stderr": (DIMS, np.full((nus, alphas), 0.03))}
+    return data.assign(added)

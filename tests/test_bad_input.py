@@ -3,6 +3,8 @@
 import inspect
 import math
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from datetime import datetime
@@ -539,5 +541,42 @@ def test_a_file_system_that_fails_while_figures_are_drawn_is_one_sentence(tmp_pa
     ratio_dataset(alphas=2, nus=1).to_netcdf(tmp_path / "map.nc", engine="netcdf4")
     monkeypatch.setattr(os, "replace", full)
     outcome = jaxgran(tmp_path, "plot", "map.nc")
-    assert (outcome.status, outcome.err) == (1, "jaxgran: stopped by the file system, No space left on device.\n")
+    assert (outcome.status, outcome.err) == (
+        1,
+        "jaxgran: stopped by the file system, No space left on device: 'map_curves.png'.\n",
+    )
     assert files(tmp_path) == {"map.nc"}
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a system without a full device")
+@pytest.mark.parametrize("words", ["where --restitution 0.5 --packing-fraction 0.6", "--version", "--help"])
+def test_a_full_disk_under_the_output_is_one_sentence(words: str) -> None:
+    command = [sys.executable, "-m", "jaxgran", *words.split()]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    said = "jaxgran: stopped by the file system, No space left on device: 'standard output'.\n"
+    assert (done.returncode, done.stderr) == (1, said)
+
+
+def test_a_file_that_is_no_map_is_refused_in_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "text.nc").write_text("not a map")
+    outcome = jaxgran(tmp_path, "plot", "text.nc")
+    assert_one_sentence(outcome)
+    assert "'text.nc' is not a NetCDF file" in outcome.err and "memory" not in outcome.err
+
+
+def test_wrong_numbers_are_quoted_as_they_were_given(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, *RUN, "--diameters", "1,-1")
+    assert_one_sentence(outcome)
+    assert outcome.err.endswith("must be a list of positive numbers, not [1.0, -1.0].\n")
+
+
+@pytest.mark.parametrize("maps", [3, [3], [], "map.nc", None])
+def test_what_is_no_list_of_maps_is_not_merged(maps) -> None:
+    with pytest.raises(InputError, match="maps must be a list of at least one map or file, not"):
+        jg.merge_maps(maps)
+
+
+def test_shapes_that_do_not_broadcast_are_refused() -> None:
+    with pytest.raises(InputError, match=r"must have shapes that broadcast, not \(2,\) and \(3,\)"):
+        jg.validity([0.5, 0.6], [0.5, 0.6, 0.7])

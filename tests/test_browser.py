@@ -233,6 +233,7 @@ def test_controls_do_what_they_say(map_page) -> None:
     map_page.find_element("id", "choose-excess").click()
     assert trace(map_page, "plane", "excess 0.05") is None
     map_page.find_element("id", "choose-excess").click()
+    map_page.find_element("id", "choose-log").click()
     sizes = []
     for levels in (4, 25):
         set_control(map_page, "levels", levels)
@@ -240,6 +241,21 @@ def test_controls_do_what_they_say(map_page) -> None:
     assert sizes[0] > 2 * sizes[1]
     choose(map_page, observable=names(map_page).index("contact_force"))
     assert not map_page.find_element("id", "choose-quotient").is_enabled()  # nothing predicts it
+
+
+def test_contours_of_the_logarithmic_view_stand_at_numbers_that_can_be_read(map_page) -> None:
+    choose(map_page, observable=names(map_page).index("excess"))
+    map_page.find_element("id", "choose-log").click()
+    field = trace(map_page, "plane", "observable")
+    lines = map_page.execute_script("return element('plane').data.filter((one) => one.name === 'level')")
+    drawn = [line["contours"]["start"] for line in lines]
+    assert drawn == field["colorbar"]["tickvals"] and not field["contours"]["showlines"]
+    np.testing.assert_allclose(10.0 ** np.array(drawn), [float(text) for text in field["colorbar"]["ticktext"]])
+    cases = ([-2.1, 0.4], [-3.2, 2.1], [0.01, 0.04])
+    levels = map_page.execute_script("return arguments[0].map((span) => logLevels(span, 10))", cases)
+    expected = ([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2], [1e-3, 0.01, 0.1, 1, 10, 100], np.arange(1.03, 1.095, 0.01))
+    for found, numbers in zip(levels, expected, strict=True):
+        np.testing.assert_allclose(10.0 ** np.array(found), numbers)
 
 
 def test_bad_points_have_a_ring_and_points_without_a_value_a_cross(map_page) -> None:

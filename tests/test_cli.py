@@ -60,7 +60,7 @@ SMALL_MAP = (
 )
 SAME = ("grains", "seeds", "timestep", "strain", "equilibrate", "tolerance", "activation", "precision")
 SAME += ("solver", "engine", "solver_requested", "engine_requested")
-PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters", "errors")}
+PICTURES = {f"small_{name}.png" for name in ("curves", "contours", "theory", "factors", "clusters")}
 FRAMES = ["--trajectory", "flow.gsd", "--frame-strain", "0.1"]
 SMALL_RUN = ["run", "--restitution", "0.7", "--packing-fraction", "0.6", "--grains", "32", "--timestep", "auto"]
 SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
@@ -593,6 +593,43 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     command = "jaxgran map --restitution 0.5,0.9 --packing-fraction 0.6 --seeds 1 --output half.nc"
     assert "1 points missing; finished points are saved" in outcome.err
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
+
+
+@pytest.mark.parametrize("words", [(), ("--output", "flow.nc"), ("--error", "0.1")])
+def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(words, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
+    flow = (*FLOW.split(), "--quiet", *words)
+    outcome = jaxgran(tmp_path, *flow)
+    assert (outcome.status, outcome.out) == (130, "")
+    *_, last = outcome.err.splitlines()  # after what was chosen
+    assert last == "jaxgran: interrupted; nothing is saved."
+    as_json = jaxgran(tmp_path, *flow, "--json")
+    assert (as_json.status, as_json.err) == (130, outcome.err)
+    found = parsed(as_json.out)
+    assert found["status"]["value"] == "not_run" and found["force_ratio"]["value"] is None
+    assert not files(tmp_path)
+
+
+def test_a_map_without_a_value_prints_no_table_and_what_is_known_of_the_others(tmp_path: Path, monkeypatch) -> None:
+    write_few_variables(monkeypatch)
+    write_without_drawing(monkeypatch)
+    words = ("map", *POINTS, "--error", "0.3")
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
+    outcome = jaxgran(tmp_path, *words)
+    assert (outcome.status, outcome.out) == (130, "")
+    assert "relative errors" not in outcome.err and "nan" not in outcome.err and "resume" not in outcome.err
+    jammed = {(0, 0): Status.ok, (1, 0): Status.nonfinite}
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(jammed))
+    outcome = jaxgran(tmp_path, *words)
+    assert outcome.status == 3 and "nan" not in outcome.err + outcome.out
+    assert "at the worst point of the 1 points with an error; sampled strains of" in outcome.err
+
+
+@pytest.mark.parametrize("sizes", [(), ("--polydispersity", "0.1"), ("--diameters", "0.8,1.2")])
+def test_errors_by_laws_of_other_sizes_are_said_to_be_estimates(sizes, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
+    outcome = jaxgran(tmp_path, *FLOW.split(), *sizes)
+    assert ("laws measured at a polydispersity of 0.26" in outcome.out) == bool(sizes)
 
 
 def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch) -> None:

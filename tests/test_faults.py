@@ -141,7 +141,8 @@ def test_a_full_disc_is_one_sentence_and_the_map_goes_on_when_there_is_room(lab:
     done = lab.finish(lab.start("full.nc", fault="disc full"))
     assert done.returncode == 1
     *_, last = done.stderr.strip().splitlines()
-    assert last.startswith("jaxgran: stopped by the file system, File too large; finished batches are in ")
+    assert last.startswith("jaxgran: stopped by the file system, File too large: 'full.nc")
+    assert "; finished batches are in full.nc.unfinished: " in last
     assert last.endswith("add --resume.")
     lab.assert_whole_when_continued("full.nc")
 

@@ -69,6 +69,14 @@ def test_contours_lie_on_the_isolines(alphas: int, nus: int) -> None:
         assert np.abs(error).max() < 0.1 * cell**2  # linear interpolation is of second order
 
 
+def test_every_level_has_a_label_where_contours_crowd_below_jamming() -> None:
+    data = ratio_dataset(10, 12)
+    x, nu = 1.0 - data.restitution, data.packing_fraction
+    steep = 0.09 * (x**3 + 60.0 * x**2 * (nu / 0.8) ** 30) * np.exp(3.0 * nu * x)
+    lines = contour_lines(ratio_contours(data.assign(force_ratio=1.0 + steep)).axes[0], "black")
+    assert [line.labels for line in lines.values()] == [[f"{level:.2f}"] for level in EXCESS_LEVELS]
+
+
 def test_band_spans_one_standard_error() -> None:
     relative_error = 0.2
     figure = ratio_contours(ratio_dataset(10, 12, relative_error))

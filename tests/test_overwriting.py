@@ -126,14 +126,38 @@ def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
     assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
 
 
-def test_pictures_of_another_format_stay_if_they_show_the_same(finished: bytes, tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc", "--format", "svg").status == 0
-    (tmp_path / "jaxgran_map_timestep.pdf").touch()  # of a map with several time steps
+def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_path: Path) -> None:
+    names = ("jaxgran_map_timestep.pdf", "other_theory.pdf", "other_theory.svg")
+    for name in names:  # none of which is a picture of these maps
+        (tmp_path / name).write_bytes(b"by hand")
     assert jaxgran(tmp_path, "plot", "jaxgran_map.nc", "--format", "pdf").status == 0
-    shown = {f"jaxgran_map_{name}.{ending}" for name in ("curves", "clusters") for ending in ("png", "svg", "pdf")}
-    assert files(tmp_path) == {"jaxgran_map.nc", *shown}
-    assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
-    assert files(tmp_path) == {"jaxgran_map.nc", "jaxgran_map_curves.png", "jaxgran_map_clusters.png"}
+    assert jaxgran(tmp_path, *MAP, "--output", "other.nc").status == 0
+    assert jaxgran(tmp_path, *MAP).status == 0  # the same map once more
+    assert {(tmp_path / name).read_bytes() for name in names} == {b"by hand"}
+
+
+@pytest.mark.parametrize("command", ["map", "merge"])
+def test_a_new_map_replaces_no_file_by_a_figure(finished: bytes, command: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("jaxgran.maps.merge.merge_maps", lambda paths: open_map(paths[0]))
+    (tmp_path / "ratio_theory.png").write_bytes(b"by hand")
+    before = files(tmp_path)
+    words = MAP if command == "map" else ("merge", "jaxgran_map.nc")
+    outcome = jaxgran(tmp_path, *words, "--output", "ratio.nc")
+    assert_one_sentence(outcome)
+    assert "the figure 'ratio_theory.png' already exists; pass --overwrite to replace it" in outcome.err
+    assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
+    assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0
+    assert (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"  # a line of points has no such figure
+
+
+def test_an_interrupted_map_leaves_the_figures_that_are_there(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+    half = dict(list(BOTH.items())[:1])
+    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
+    (tmp_path / "jaxgran_map.nc").write_bytes(b"not a map")  # so that the half is written in its place
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
+    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 130
+    assert open_map(tmp_path / "jaxgran_map.nc").status.size == 2
+    assert pictures and files(tmp_path) >= pictures
 
 
 def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_path: Path) -> None:

@@ -40,7 +40,9 @@ def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(a
         reference = point[name].values[-1]
         np.testing.assert_allclose(container.lines[0].get_xydata(), np.stack([SIZES, point[name] / reference], -1))
         ends = np.array([segment[:, 1] for segment in container.lines[2][0].get_segments()])
-        np.testing.assert_allclose(np.diff(ends)[:, 0], 2 * point[f"{name}_stderr"] / reference)
+        relative = point[f"{name}_stderr"].values / point[name].values
+        of_both = np.sqrt(relative**2 + relative[-1] ** 2) * point[name].values / reference
+        np.testing.assert_allclose(np.diff(ends)[:, 0], 2 * np.where(np.arange(len(SIZES)) < 2, of_both, 0.0))
 
 
 def test_bad_status_and_missing_values_are_marked_at_their_number_of_grains() -> None:

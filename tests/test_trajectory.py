@@ -1,5 +1,7 @@
 """Trajectories come back bit for bit, and other programs see in them the cell, the grains and the contacts."""
 
+import os
+import signal
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -503,3 +505,21 @@ def test_a_place_that_does_not_do_is_refused_in_one_sentence(name: str, tmp_path
     (tmp_path / "folder.gsd").mkdir()
     with pytest.raises(InputError, match=r"^trajectory must be .*\.$"):
         check_trajectory(tmp_path / name)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no limit of the size of a file")
+def test_a_full_disk_removes_the_trajectory_and_is_named(seen, tmp_path: Path) -> None:
+    import resource
+
+    path, before = tmp_path / "flow.gsd", resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        write_frame(path, seen[TILTS[0]], 0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))
+        with pytest.raises(OSError, match="File too large") as failure:
+            for step in range(1, 100):
+                write_frame(path, seen[TILTS[0]], step)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert failure.value.filename == str(path) and not list(tmp_path.iterdir())

@@ -80,7 +80,7 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 WITHOUT_ARRAYS = """
     ContactNetwork ContactResiduals ContactSolution DelassusProblem FisherInformation TrackNoise Closure Cooling Fields
     Grains InputError JaxMdSpace RestitutionFit ShearFlow Snapshot State Status Tally Trajectory averages_against_grains
-    cluster_shares dominating_errors explore Page fit_closure friction_figure friction_law
+    cluster_shares explore Page fit_closure friction_figure friction_law
     ratio_against_timestep ratio_contours ratio_curves BarzilaiBorwein Jacobi JacobiCount JacobiDiagonal Nesterov
     ProjectedMethod Jax Numba Pallas Tracks merge_maps open_map read_tracks read_trajectory save_figures theory_errors
     enskog_factors write_trajectory Validity ConstitutiveLaw Rheology

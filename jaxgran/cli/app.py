@@ -34,7 +34,7 @@ from jaxgran.cli.terminal import (
 )
 from jaxgran.cli.where import WHERE_EXAMPLES, where_command
 from jaxgran.maps.interruption import is_interruption
-from jaxgran.model.checks import InputError
+from jaxgran.model.checks import InputError, short_repr
 
 EXAMPLES = {
     "Where binary collisions dominate, and where they do not": "jaxgran map",
@@ -135,7 +135,10 @@ def main() -> None:
 def _run() -> NoReturn:
     """Run the command that is given, and exit."""
     try:
-        status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
+        try:
+            status = app(sys.argv[1:] or ["--help"], prog_name="jaxgran", standalone_mode=False)
+        finally:
+            sys.stdout.flush()  # a full disk fails here, and not when Python ends
     except InputError as mistake:
         stop(sentence_of(mistake, _parameters()))
     except UsageError as mistake:
@@ -144,7 +147,8 @@ def _run() -> NoReturn:
         status = INTERRUPTED
     except OSError as error:
         notes = "".join(f"; {with_options(note, _parameters())}" for note in getattr(error, "__notes__", []))
-        stop(f"stopped by the file system, {error.strerror or error}{notes}.", NO_FILE)
+        file = "" if error.filename is None else f": {short_repr(str(error.filename))}"
+        stop(f"stopped by the file system, {error.strerror or error}{file}{notes}.", NO_FILE)
     except Exception as error:
         if not is_interruption(error):
             raise

@@ -11,7 +11,7 @@ from jaxgran.cli.measure import finish, print_budget, run_map
 from jaxgran.cli.tables import Table, print_table
 from jaxgran.cli.terminal import say_written
 from jaxgran.maps.parameters import Option
-from jaxgran.model.checks import refused
+from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.model.display import with_error
 
@@ -46,37 +46,67 @@ PLOT_OPTIONS = {
 def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: Any) -> None:
     preset = given.get("preset", "quick")
     output = given.setdefault("output", Path("jaxgran_map.nc" if preset == "quick" else f"jaxgran_map_{preset}.nc"))
-    data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
-    if written:
-        from jaxgran.plotting.map_figures import remove_pictures
-
-        remove_pictures(output)
     whole = "part" not in given  # the rest of a map is in other files
-    pictures = shown(data, output, format, draw=not interrupted) if whole else []
-    finish(data, [*([output] if written else []), *pictures], interrupted, can_resume=True)
+    overwrite, existed = given.get("overwrite", False), os.path.exists(output)
+    if whole and not overwrite:
+        require_new_figures(output, format)
+    data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
+    pictures = draw_beside(data, output, format, replaced=overwrite and existed) if whole and not interrupted else []
+    if whole:
+        print_tables(data)
+    finish(data, [*([output] if written else []), *pictures], interrupted, output)
 
 
-def shown(data, output: Path, format: FileFormat, draw: bool = True) -> list[Path]:
-    """Print the tables of a map, and draw its figures beside its file; their files."""
+def require_new_figures(output: Path, format: FileFormat) -> None:
+    """Raise an InputError if the figures of a map that is not there yet would replace files."""
+    names = []
+    if not os.path.exists(output):
+        with suppress(OSError, ValueError):  # a folder that cannot be read is refused later
+            names = [name for name in os.listdir(output.parent) if name.startswith(f"{output.stem}_")]
+    if names:
+        from jaxgran.plotting.map_figures import FIGURES
+
+        for name in sorted({f"{output.stem}_{figure}.{format}" for figure in FIGURES} & {*names}):
+            raise InputError(
+                f"the figure {short_repr(str(output.with_name(name)))} already exists; pass `overwrite=True` to "
+                "replace it.",
+                field="output",
+            )
+
+
+def draw_beside(data, output: Path, format: FileFormat, replaced: bool) -> list[Path]:
+    """Draw the figures of a map beside its file, then remove those of a map that it replaced; the files drawn."""
+    from jaxgran.plotting.map_figures import remove_pictures, save_figures
+
+    pictures = save_figures(data, output.with_suffix(""), format)
+    if replaced:
+        remove_pictures(output, but=pictures)
+    return pictures
+
+
+def print_tables(data) -> None:
+    """Print the ratios of a map and its errors, for the parts that have a value."""
+    import numpy as np
+
     from jaxgran.maps.schema import parts, shear_stress_ratio
-    from jaxgran.plotting.map_figures import save_figures
 
-    pictures = save_figures(data, output.with_suffix(""), format) if draw else []
     for part in parts(data):
+        if not np.isfinite(part.force_ratio).any():
+            continue
         print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
         print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
     if "grains" in data.dims:
         for part in parts(data.isel(grains=-1)):
-            print_table(_large_system_table(part))
+            if np.isfinite(part.force_ratio).any():
+                print_table(_large_system_table(part))
     print_budget(data)
-    return pictures
 
 
 def run_plot_command(
     file: Path, output: Path | None = None, format: FileFormat = "png", dpi: int = 200, caption: bool = True
 ) -> None:
     from jaxgran.maps.results import open_map
-    from jaxgran.plotting.map_figures import remove_pictures, require_file, save_figures
+    from jaxgran.plotting.map_figures import require_file, save_figures
 
     require_file(format, dpi)
     data = open_map(file)
@@ -85,9 +115,7 @@ def run_plot_command(
         folder.mkdir(parents=True, exist_ok=True)
     if not os.path.isdir(folder) or not os.access(folder, os.W_OK):
         raise refused("output", str(folder), "must be a folder that can be made and written to")
-    pictures = save_figures(data, folder / file.stem, format, dpi, caption)
-    remove_pictures(folder / file.name, but=pictures)
-    say_written(pictures)
+    say_written(save_figures(data, folder / file.stem, format, dpi, caption))
 
 
 map_command = command(MAP_OPTIONS, run_map_command)

@@ -18,6 +18,7 @@ from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import options
 from jaxgran.model.checks import refused
 
+_LAW_SIZES = 0.26  # polydispersity of the flows that the laws of the errors were fitted to
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 
 
@@ -88,24 +89,39 @@ def _load(module: str) -> None:
 
 def _say_imprecise(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
+    import numpy as np
+
     from jaxgran.maps.schema import relative_ci95
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
         return
-    worst = max(float(relative_ci95(data, name)["total"].max()) for name in ERROR_OBSERVABLES)
-    strain = data["seeds/strain"]
+    errors = np.stack([relative_ci95(data, name)["total"] for name in ERROR_OBSERVABLES])
+    known = np.isfinite(errors).all(axis=0)
+    if not known.any():
+        return
+    strain = data["seeds/strain"].where(data["seeds/strain"] > 0)
+    lost = f" of the {known.sum()} points with an error" if not known.all() else ""
     say(
-        f"relative errors: {data.attrs['error']:g} requested, {worst:.2g} at the worst point; sampled strains of "
-        f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
+        f"relative errors: {data.attrs['error']:g} requested, {errors[:, known].max():.2g} at the worst point{lost}; "
+        f"sampled strains of {float(strain.min()):g} to {float(strain.max()):g} per seed"
     )
 
 
 def print_budget(data) -> None:
-    """Print the parts of the error: those of each point, or their median and largest over a map."""
+    """Print the parts of the error where any is known: those of each point, or their median and largest over a map."""
+    import numpy as np
+
     from jaxgran.maps.schema import relative_ci95
 
+    if not np.isfinite(data.force_ratio).any():
+        return
     title = f"Relative error, 95 %, of a large system{'' if data.status.size == 1 else ': median (largest)'}"
+    if "diameters" in data.attrs or data.attrs.get("polydispersity", _LAW_SIZES) != _LAW_SIZES:
+        title += (
+            f"\nall but sampling by laws measured at a polydispersity of {_LAW_SIZES:g}: "
+            "the sizes here differ, and these parts are rough estimates"
+        )
     table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "total"))
     for name in _BUDGETED:
         parts = relative_ci95(data, name)
@@ -135,8 +151,11 @@ def _say_retried(data) -> None:
         say(f"retried with half the time step: {retried} replicas, see sample_timestep in the group seeds.")
 
 
-def finish(data, written: list[Path], interrupted: bool, can_resume: bool) -> None:
-    """Print what was written and what went wrong, and exit with the matching status."""
+def finish(data, written: list[Path], interrupted: bool, output: Path | None = None) -> None:
+    """Print what was written and what went wrong, and exit with the matching status.
+
+    A map that was interrupted goes on from the folder beside its output, if there is one.
+    """
     from jaxgran.maps.status_report import bad_points, format, format_short
 
     say_written(written)
@@ -147,10 +166,13 @@ def finish(data, written: list[Path], interrupted: bool, can_resume: bool) -> No
     if short:
         say(with_options(format_short(data, short), options("map")))
     if interrupted:
-        missing = len(bad.get("not_run", []))
-        started = can_resume and bool((data["seeds/status"] >= 0).any())
-        saved = "; finished points are saved" if started or written else ""
-        resume = " --resume" if can_resume and "--resume" not in data.attrs["command"] else ""
-        stop_interrupted(f"interrupted with {missing} points missing{saved}. Continue: {data.attrs['command']}{resume}")
+        missing = "" if data.status.size == 1 else f" with {len(bad.get('not_run', []))} points missing"
+        saved = "nothing is saved."
+        if output is not None and os.path.isdir(f"{output}.unfinished"):
+            resume = "" if "--resume" in data.attrs["command"] else " --resume"
+            saved = f"finished points are saved. Continue: {data.attrs['command']}{resume}"
+        elif written:
+            saved = "finished points are saved."
+        stop_interrupted(f"interrupted{missing}; {saved}")
     if bad:
         stop(with_options(format(data, bad), options("map")), BAD_STATUS)

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from jaxgran.cli.arguments import OVERWRITE, command
-from jaxgran.cli.map import MAP_OPTIONS, shown
+from jaxgran.cli.map import MAP_OPTIONS, draw_beside, print_tables, require_new_figures
 from jaxgran.cli.measure import command_line, finish
 from jaxgran.cli.terminal import configured_jax, require_device
 from jaxgran.maps.parameters import Option, option
@@ -28,18 +28,21 @@ def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, 
     from jaxgran.io.atomic import require_place
     from jaxgran.maps.merge import merge_maps
     from jaxgran.maps.results import write_dataset
-    from jaxgran.plotting.map_figures import remove_pictures
 
     require_place(output, "output", ".nc")
-    if os.path.exists(output) and not overwrite:
+    existed = os.path.exists(output)
+    if existed and not overwrite:
         raise InputError(
             f"output {short_repr(str(output))} already exists; pass `overwrite=True` to replace it.", field="output"
         )
+    if not overwrite:
+        require_new_figures(output, format)
     data = merge_maps(files)
     data.attrs["command"] = command_line()
     write_dataset(data, output)
-    remove_pictures(output)
-    finish(data, [output, *shown(data, output, format)], interrupted=False, can_resume=False)
+    pictures = draw_beside(data, output, format, replaced=existed)
+    print_tables(data)
+    finish(data, [output, *pictures], interrupted=False)
 
 
 merge_command = command(

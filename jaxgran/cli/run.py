@@ -95,7 +95,7 @@ def run_run_command(
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
     if json:
         print_json(_entries(data))
-    else:
+    elif bool(data.force_ratio.notnull().any()):
         print_table(_summary_table(data, all))
         print_budget(data)
     if recorder is not None and recorder.frames:
@@ -107,8 +107,7 @@ def run_run_command(
         if film is not None and page is not None:
             film.page().save(page)
             say(f"wrote {page}: {len(film.frames.scenes)} frames")
-    can_resume = output is not None and record is None
-    finish(data, [output] if output is not None and written else [], interrupted, can_resume)
+    finish(data, [output] if output is not None and written else [], interrupted, output)
 
 
 run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "packing_fraction"))
@@ -174,7 +173,7 @@ def _write_movie(movie: Path, frames, quiet: bool) -> None:
 def _entries(data) -> dict[str, Entry]:
     """The parameters of one flow, its averages, its shear-stress ratio, and what kinetic theory predicts."""
     from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
-    from jaxgran.model.status import Status
+    from jaxgran.maps.status_report import bad_points
     from jaxgran.sampling.observables import OBSERVABLES
 
     point = flattened(data).isel(packing_fraction=0, restitution=0)
@@ -185,7 +184,7 @@ def _entries(data) -> dict[str, Entry]:
         "strain": Entry(point["seeds/strain"].sum().values, "sampled strain of all seeds"),
         "engine": Entry(data.attrs["engine"], "program that advanced the flow", None),
         "solver": Entry(data.attrs["solver"], "method of the contact solve", None),
-        "status": Entry(Status(int(point.status)).name, "worst status", None),
+        "status": Entry(next(iter(bad_points(data)), "ok"), "worst status", None),
     }
     for name, one in OBSERVABLES.items():
         path = path_of(name)

@@ -80,13 +80,21 @@ def outlive_readers() -> None:
 
 
 class _Outliving(FileIO):
-    """A pipe that discards output once its reader has gone."""
+    """A pipe or a file that discards output once its reader has gone, or once it has failed with an OSError."""
+
+    _failed = False
 
     def write(self, content: Any) -> int:
+        if self._failed:
+            return len(content)
         try:
             return super().write(content)
         except BrokenPipeError:
             return len(content)
+        except OSError as error:
+            self._failed = True
+            error.filename = "standard output" if self.fileno() == 1 else "standard error"
+            raise
 
 
 def say(sentence: str) -> None:

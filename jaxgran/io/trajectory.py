@@ -116,12 +116,21 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
     """Append a frame to a trajectory; step 0 starts a new file, replacing an old one.
 
     Args:
-      path: GSD file, complete after every frame.
+      path: GSD file, complete after every frame. It is removed where the file system fails to take a frame.
       frame: one snapshot of the flow; or a series of every time step from the frame on, whose forces are averaged.
       step: time steps since the first frame.
+
+    Raises:
+      OSError: with the name of the file.
     """
     if step:
-        _write(path, "r+", frame, step)
+        try:
+            _write(path, "r+", frame, step)
+        except OSError as error:
+            path.unlink(missing_ok=True)
+            if error.errno:
+                error.filename = str(path)
+            raise
     else:
         with atomic_write(path) as temporary:
             _write(temporary, "x", frame, 0)

@@ -40,13 +40,16 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
       >>> merged["seeds"].sizes["seed"]
       2
     """
+    from xarray import DataTree
+
     from jaxgran.maps.dataset import map_dataset
     from jaxgran.maps.own_observables import identity_of, label_units, sums_by_name, units_of
     from jaxgran.maps.results import choices_of, open_map
     from jaxgran.maps.settings import MapSettings
     from jaxgran.maps.sums import replicas_of
 
-    if isinstance(maps, (str, os.PathLike)) or not len(maps):
+    accepted = (str, os.PathLike, DataTree)
+    if not isinstance(maps, (list, tuple)) or not maps or not all(isinstance(one, accepted) for one in maps):
         raise InputError(f"maps must be a list of at least one map or file, not {short_repr(maps)}.")
     names = [short_repr(str(one)) if isinstance(one, (str, os.PathLike)) else f"map {k}" for k, one in enumerate(maps)]
     opened = [open_map(one) if isinstance(one, (str, os.PathLike)) else one for one in maps]

@@ -53,7 +53,7 @@ def open_map(path: str | Path) -> xr.DataTree:
     try:
         data = xr.load_datatree(_whole(Path(path)), engine="netcdf4")
     except Exception as error:  # an incomplete file may fail in any way
-        why = " ".join(str(error).split()).rstrip(".")
+        why = " ".join(str(error).split()).replace(": '<xarray-in-memory-read>'", "").rstrip(".")
         raise InputError(f"{short_repr(str(path))} is not a NetCDF file that can be read: {why}.") from None
     problem = what_lacks(data, *RATIO, "status")
     if problem:

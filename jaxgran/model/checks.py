@@ -61,13 +61,15 @@ def two_digits(value: float, up: bool) -> str:
 
 
 _SHORT_REPR = Repr()
+_FEW = 100  # numbers of an array that is quoted as a list
 _SHORT_REPR.maxother = _SHORT_REPR.maxstring = 100
 
 
 def short_repr(value: Any) -> str:
     """A value as one short line, for an error message."""
     try:
-        return " ".join(_SHORT_REPR.repr(value).split())
+        few = isinstance(value, (np.ndarray, np.generic)) and value.size < _FEW
+        return " ".join(_SHORT_REPR.repr(value.tolist() if few else value).split())
     except ValueError:  # Python refuses to print an integer of thousands of digits
         return f"this {type(value).__name__}"
 

@@ -24,14 +24,17 @@ function roundLevels(values, count) {
   return { start, end: levels.at(-1) ?? start, size, levels };
 }
 
-// Ticks at 1, 2 and 5 in each decade between the smallest and the largest logarithm, or at 1 if these are too many.
-function logTicks(logarithms) {
+// The logarithms of levels that can be read off: of 1, 2 and 5 in each decade, of 1 alone if these are more than asked
+// for, or of round levels if these are too few.
+function logLevels(logarithms, count) {
   const low = Math.min(...logarithms), high = Math.max(...logarithms);
-  const digits = high - low > 3 ? [1] : [1, 2, 5];
   const decades = Array.from({ length: Math.ceil(high) - Math.floor(low) + 1 }, (_, k) => Math.floor(low) + k);
-  const ticks = decades.flatMap((decade) => digits.map((digit) => decade + Math.log10(digit)));
-  const within = ticks.filter((tick) => tick >= low - 1e-9 && tick <= high + 1e-9);
-  return within.length ? within : [low, high];
+  const within = (digits) => decades.flatMap((decade) => digits.map((digit) => decade + Math.log10(digit)))
+    .filter((level) => level >= low - 1e-9 && level <= high + 1e-9);
+  const [every, powers] = [within([1, 2, 5]), within([1])];
+  if (every.length > 2 && every.length <= count) return every;
+  if (powers.length > 1) return powers;
+  return roundLevels([10 ** low, 10 ** high], count).levels.filter((level) => level > 0).map(Math.log10);
 }
 
 // A field between the points of the map, bilinearly; null where a point without a value would count.
@@ -70,7 +73,7 @@ function planeTraces(view, levelCount, excessLevels) {
   const z = value.map((row) => row.map((v) => (!shown(v) || (log && v <= 0) ? null : log ? Math.log10(v) : v)));
   const known = flat(z).filter((v) => v !== null);
   const levels = roundLevels(known, levelCount);
-  const ticks = log ? logTicks(known) : levels.levels;
+  const ticks = log && known.length ? logLevels(known, levelCount) : levels.levels;
   const bar = {
     title: { text: escaped(view.label), side: "right" }, tickvals: ticks, ticktext: ticks.map((tick) => numberText(log ? 10 ** tick : tick, 3)),
     thickness: 14, outlinewidth: 0, len: 1, xpad: excessLevels ? 36 : 10, // the levels of the excess stand before it
@@ -89,11 +92,11 @@ function planeTraces(view, levelCount, excessLevels) {
   }));
   const traces = [];
   if (isPlane && known.length) {
-    traces.push({
-      type: "contour", x, y, z, ...colours, hoverinfo: "skip", name: "observable", connectgaps: false,
-      contours: { start: levels.start, end: levels.end, size: levels.size, coloring: "fill", showlabels: !log, labelfont: { size: 11, color: "#345" } },
-      line: { color: "rgba(40,60,80,0.55)", width: 0.8 },
-    });
+    const field = { type: "contour", x, y, z, hoverinfo: "skip", connectgaps: false, line: { color: "rgba(40,60,80,0.55)", width: 0.8 } };
+    const filled = { start: levels.start, end: levels.end, size: levels.size, coloring: "fill", showlabels: true, labelfont: { size: 11, color: "#345" } };
+    traces.push({ ...field, ...colours, name: "observable", contours: log ? { coloring: "heatmap", showlines: false } : filled });
+    // Levels of one contour trace have equal steps, and these have not.
+    if (log) traces.push(...ticks.map((tick) => ({ ...field, showscale: false, name: "level", contours: { start: tick, end: tick, size: 1, coloring: "none" } })));
     if (excessLevels) traces.push(...excessTraces(view.excess, x, y, excessLevels));
   }
   const dots = isPlane ? { size: 7, color: "#223", line: { color: "white", width: 1 } }

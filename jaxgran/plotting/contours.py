@@ -26,6 +26,8 @@ from jaxgran.plotting.interpolation import interpolated, refined_axes
 
 _EXCESS_COLOUR = "#00803c"
 _EXCESS_STYLE: dict[str, Any] = {"alpha": 0.75, "zorder": 2.5}
+_LEAST_ROOM = 0.045  # inches from a label to the next contour, or half of those to the frame
+_LETTER = 0.078  # inches, width of a letter of a label
 _LINEAR_BELOW = 0.01  # excess below which its contour variable is linear, above which it is logarithmic
 _DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": "0.25", "markersize": 2, "markeredgewidth": 0}
 _CROSS: dict[str, Any] = {"linestyle": "none", "marker": "x", "color": "0.25", "markersize": 5}
@@ -57,12 +59,11 @@ def draw_levels(
     field: np.ma.MaskedArray,
     levels: Mapping[_Key, float],
     labelled: bool = True,
-    room: float = 0.0,
     **styles: Any,
 ) -> list[_Key]:
     """Draw the contours of a field at increasing values, with their keys as labels; return the keys of those drawn.
 
-    A contour that is nowhere farther from the others than `room`, a share of the plane, has no label.
+    A contour has no label if it is everywhere too close to others, to the frame or to another label.
     """
     low, high = (field.min(), field.max()) if field.count() else (0.0, 0.0)
     crossed = [key for key, value in levels.items() if low < value < high]
@@ -71,7 +72,7 @@ def draw_levels(
     drawn = axes.contour(x, y, field, list(levels.values()), **styles)
     if labelled:
         texts = {value: key if isinstance(key, str) else f"{key:.2f}" for key, value in levels.items()}
-        places = _label_places(drawn, x, y, room)
+        places = _label_places(axes, drawn, x, y, [_LETTER * len(text) for text in texts.values()])
         for label in axes.clabel(
             drawn, fmt=texts, fontsize=SMALL_SIZE + 0.5, inline_spacing=2, manual=places, zorder=6
         ):
@@ -79,18 +80,30 @@ def draw_levels(
     return crossed
 
 
-def _label_places(drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, room: float) -> list[tuple[float, float]]:
-    """Return the point of each contour that is farthest from the others and the frame, if that is more than `room`."""
-    corner, size = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
-    curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / size for path in drawn.get_paths()]
-    places = []
+def _label_places(
+    axes: Axes, drawn: QuadContourSet, x: np.ndarray, y: np.ndarray, lengths: list[float]
+) -> list[tuple[float, float]]:
+    """Return where each contour with room for a label has it: as far from the others and the frame as it can.
+
+    Lengths are in inches, before the panel has its final size. Contours with the least room have their labels first.
+    Middles of labels are as far apart as the mean of their lengths, so that they do not touch in whatever directions.
+    """
+    corner, scale = np.array([x.min(), y.min()]), np.array([np.ptp(x), np.ptp(y)])
+    scale = scale / (np.array(axes.bbox.size) / axes.figure.dpi)
+    end = np.array([np.ptp(x), np.ptp(y)]) / scale
+    curves = [(np.asarray(path.vertices) - corner)[:: 1 + len(path) // 200] / scale for path in drawn.get_paths()]
+    clearances = []
     for k, curve in enumerate(curves):
         others = np.concatenate([np.full((1, 2), np.inf), *curves[:k], *curves[k + 1 :]])
-        apart = np.linalg.norm(curve[:, None] - others, axis=-1).min(axis=1)
-        clearance = np.minimum(apart, np.minimum(curve, 1 - curve).min(axis=1) / 2)
-        if len(curve) and clearance.max() > room:
-            places.append(tuple(corner + size * curve[clearance.argmax()]))
-    return places
+        apart = np.linalg.norm(curve[:, None] - others, axis=-1).min(axis=1, initial=np.inf)
+        clearances.append(np.minimum(apart, np.minimum(curve, end - curve).min(axis=1) / 2))
+    places, placed = np.empty((0, 2)), np.empty(0)
+    for k in sorted(range(len(curves)), key=lambda k: clearances[k].max(initial=0)):
+        between = np.linalg.norm(curves[k][:, None] - places, axis=-1) - (placed + lengths[k]) / 2
+        clearance = np.where(between.min(axis=1, initial=np.inf) > 0, clearances[k], 0)
+        if clearance.max(initial=0) > _LEAST_ROOM:
+            places, placed = np.vstack([places, curves[k][clearance.argmax()]]), np.append(placed, lengths[k])
+    return [tuple(place) for place in corner + scale * places]
 
 
 def draw_plane(axes: Axes, data: xr.Dataset, field: np.ma.MaskedArray, measured: np.ndarray) -> None:

@@ -7,7 +7,7 @@ all look, and ``styled`` gives it to a function that draws. No plotting state re
 from __future__ import annotations
 
 import os
-import textwrap
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -24,6 +24,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from jaxgran.files import atomic_write
@@ -65,6 +66,8 @@ RATIO_LABEL = r"force ratio $\langle F\rangle/\langle F_{\mathrm{bc}}\rangle$"
 P = ParamSpec("P")
 R = TypeVar("R")
 _CAPTION = "caption"  # id of the text under the axes
+_USUAL_LINES = 3  # of a caption; a figure with more is higher
+_LINE_HEIGHT = 0.13  # inches
 _MANY_DECADES = 200  # largest over smallest value at and above which only powers of ten have numbers
 _NARROW = 4  # largest over smallest value at and below which numbers have equal steps
 _LEAST_PLAIN = 1e-3  # smallest number that is written without a power of ten
@@ -251,14 +254,17 @@ def empty_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def label_log_axis(axis: Axis) -> None:
+def label_log_axis(axis: Axis, most: int = 9) -> None:
     """Put numbers at 1, 2 and 5 of each decade of a logarithmic axis, at powers of ten, or at equal steps.
 
-    Powers of ten are those of several decades, equal steps those of a small part of one.
+    Powers of ten are those of several decades, and where 1, 2 and 5 are more than `most` numbers; equal steps are those
+    of a small part of a decade.
     """
     low, high = axis.get_view_interval()
     every = LogFormatterSciNotation(minor_thresholds=(np.inf, np.inf))
-    in_a_decade = (1, 2, 5) if high < _MANY_DECADES * low else (1,)
+    numbers = np.outer(10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high))), (1, 2, 5))
+    fit = ((low <= numbers) & (numbers <= high)).sum() <= most
+    in_a_decade = (1, 2, 5) if fit and high < _MANY_DECADES * low else (1,)
     axis.set_major_locator(LogLocator(subs=in_a_decade, numticks=9) if high > _NARROW * low else MaxNLocator(4))
     axis.set_major_formatter(every if low < _LEAST_PLAIN else StrMethodFormatter("{x:g}"))
     axis.set_minor_formatter(NullFormatter())
@@ -275,7 +281,7 @@ def status_note(data: xr.Dataset) -> str:
     """Return a line that counts the points of each status that is not `ok`; empty if there are none."""
     counts = Counter(name for name in _status_names(data).flat if name != "ok")
     words = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in counts.most_common())
-    return textwrap.fill(f"Status not ok: {words}", width=75) if counts else ""
+    return f"Status not ok: {words}" if counts else ""
 
 
 def missing_note(measured: np.ndarray, how_drawn: str = "") -> str:
@@ -298,8 +304,23 @@ def finish(figure: Figure, data: xr.Dataset, measured: np.ndarray, notes: Sequen
             box = {"facecolor": "white", "edgecolor": "none"}
             where = {"transform": axes.transAxes, "ha": "center"}
             axes.text(0.5, 0.6, "no measured values", fontsize=LABEL_SIZE, bbox=box, **where)
-    caption = "\n".join(line for line in (_run_description(data.attrs), *notes) if line)
-    figure.supxlabel(caption, fontsize=SMALL_SIZE, gid=_CAPTION)
+    caption = figure.supxlabel("", fontsize=SMALL_SIZE, gid=_CAPTION)
+    described, width = (*notes, _run_description(data.attrs)), 0.97 * figure.bbox.width
+    lines = [line for note in described if note for line in _wrapped(caption, note, width)]
+    caption.set_text("\n".join(lines))
+    figure.set_figheight(figure.get_figheight() + _LINE_HEIGHT * max(0, len(lines) - _USUAL_LINES))
+
+
+def _wrapped(text: Text, words: str, most: float) -> list[str]:
+    """Return words in lines of at most so many pixels as the text would draw them; formulas stay whole."""
+    lines: list[str] = []
+    for word in re.findall(r"(?:\$[^$]*\$|\S)+", words):
+        text.set_text(f"{lines[-1]} {word}" if lines else word)
+        if lines and text.get_window_extent().width <= most:
+            lines[-1] = text.get_text()
+        else:
+            lines.append(word)
+    return lines
 
 
 def _run_description(attrs: dict) -> str:

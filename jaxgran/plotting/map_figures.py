@@ -14,7 +14,6 @@ from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
 from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
-from jaxgran.plotting.errors import dominating_errors, has_errors
 from jaxgran.plotting.friction import friction_figure, has_friction_law
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
@@ -36,7 +35,6 @@ FIGURES = {
     "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
     "factors": MapFigure(enskog_factors, lambda data: is_plane(data) and has_factors(data)),
     "clusters": MapFigure(cluster_shares, has_clusters),
-    "errors": MapFigure(dominating_errors, lambda data: is_plane(data) and has_errors(data)),
     "rheology": MapFigure(friction_figure, has_friction_law),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
@@ -60,7 +58,6 @@ def save_figures(
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the predictions of the theory
     `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
-    `{stem}_errors.png`      `dominating_errors`         a plane, and the error budget of its points
     `{stem}_rheology.png`    `friction_figure`           enough dense points for
                                                          :func:`jaxgran.inference.friction_law.friction_law`
     =======================  ==========================  ===============================================================
@@ -92,13 +89,11 @@ def save_figures(
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:
-    """Remove the pictures beside a dataset that show the map there was before: all but some, in whatever format."""
-    kept = {file.with_suffix("") for file in but}
-    for name in FIGURES:
-        for format in get_args(FileFormat):
-            file = path.with_name(f"{path.stem}_{name}.{format}")
-            if file.with_suffix("") not in kept and file.is_file():
-                file.unlink()
+    """Remove the pictures of a map that was beside a dataset before: all but some, in whatever format."""
+    names = {path.with_name(f"{path.stem}_{name}.{end}") for name in FIGURES for end in get_args(FileFormat)}
+    for file in names - {*but}:
+        if file.is_file():
+            file.unlink()
 
 
 def require_file(format: Any, dpi: Any) -> None:

@@ -206,7 +206,7 @@ def ratio_against_timestep(data: MapData) -> Figure:
     for axes in grid[max(0, len(panels) - columns) : len(panels)]:
         axes.tick_params(labelbottom=True)
         axes.set_xlabel(r"time step $\dot{\gamma}\,\mathrm{d}t$", fontsize=LABEL_SIZE)
-    _set_timestep_scale(grid[0], data.timestep.values)
+    _set_timestep_scale(grid[0], data.timestep.values, most=9 if columns == 1 else 3)
     figure.supylabel(RATIO_LABEL, fontsize=LABEL_SIZE)
     add_curve_legend(figure, data, handles, title)
     measured = np.isfinite(data.force_ratio.values)
@@ -265,13 +265,13 @@ def point_panels(data: xr.Dataset) -> tuple[list[tuple[str, list[tuple[str, xr.D
     return panels, ALPHA_TITLE
 
 
-def _set_timestep_scale(axes: Axes, timesteps: np.ndarray) -> None:
-    """Make the time-step axis logarithmic."""
+def _set_timestep_scale(axes: Axes, timesteps: np.ndarray, most: int) -> None:
+    """Make the time-step axis logarithmic, with at most so many numbers."""
     axes.set_xscale("log")
     low, high = timesteps.min(), timesteps.max()
     margin = (high / low) ** 0.06
     axes.set_xlim(low / margin, high * margin)
-    label_log_axis(axes.xaxis)
+    label_log_axis(axes.xaxis, most)
 
 
 # ------------------------------------------------------------------------------------------- contours

@@ -29,7 +29,8 @@ from jaxgran.plotting.drawing import (
 )
 from jaxgran.plotting.ratio import MOST_TOGETHER, point_panels
 
-_MOST_NUMBERS = 5  # at the axis of N, or one more
+_MOST_NUMBERS = 3  # at the axis of N
+_MOST_ROWS = 6  # packing fractions with panels of their own
 _QUANTITIES = {
     "pressure": r"pressure $p$",
     "shear_stress": r"shear stress $\tau$",
@@ -42,16 +43,16 @@ def averages_against_grains(data: MapData) -> Figure:
     """Return pressure, shear stress, granular temperature and force ratio against the number of grains.
 
     Each average is divided by its value at the largest number of grains N. Every restitution and packing fraction has a
-    curve. Up to eight curves share the panels. With more, each packing fraction has a row of panels, with at most eight
-    restitutions, evenly chosen.
+    curve. Up to eight curves share the panels. With more, each packing fraction has a row of panels: at most six of
+    these, and eight restitutions, evenly chosen.
 
     Args:
       data: a map with a dimension `grains`, with `force_ratio` and any of `pressure`, `shear_stress` and
         `granular_temperature`, their `_stderr`, and `status`. The shortest of several time steps is drawn.
 
     Returns:
-      Error bars are one standard error of the value at each N; a point whose status is not `ok` is an open symbol in a
-      ring.
+      Error bars are one standard error of the quotient, from those of both values; the last quotient is one, without an
+      error. A point whose status is not `ok` is an open symbol in a ring.
 
     Raises:
       InputError: (a ValueError) fewer than two numbers of grains.
@@ -60,7 +61,7 @@ def averages_against_grains(data: MapData) -> Figure:
     sizes = data.sizes.get("grains", 1)
     if sizes < 2:
         raise InputError(f"this figure needs at least two numbers of grains, and this map has {sizes}.")
-    data, left_out = _with_few_restitutions(finest(ordered(data, *_QUANTITIES), "timestep"))
+    data, left_out = _thinned(finest(ordered(data, *_QUANTITIES), "timestep"))
     names = [name for name in _QUANTITIES if name in data and f"{name}_stderr" in data]
     panels, title = point_panels(data)
     figure = empty_figure(TWO_COLUMNS, height=3.0 if len(panels) == 1 else 0.8 + 1.5 * len(panels))
@@ -86,21 +87,25 @@ def averages_against_grains(data: MapData) -> Figure:
     return figure
 
 
-def _with_few_restitutions(data: xr.Dataset) -> tuple[xr.Dataset, str]:
-    """Return a map with at most eight restitutions, and a line that tells how many there were if some are left out."""
-    count = data.sizes["restitution"]
-    if count <= MOST_TOGETHER:
-        return data, ""
-    chosen = np.linspace(0, count - 1, MOST_TOGETHER).round().astype(int)
-    return data.isel(restitution=chosen), f"{MOST_TOGETHER} of {count} restitutions"
+def _thinned(data: xr.Dataset) -> tuple[xr.Dataset, str]:
+    """Return a map whose curves fit the figure, and a line that tells of what there were more."""
+    words = []
+    for name, most in (("restitution", MOST_TOGETHER), ("packing_fraction", _MOST_ROWS)):
+        count = data.sizes[name]
+        if data.sizes["restitution"] * data.sizes["packing_fraction"] > MOST_TOGETHER and count > most:
+            data = data.isel({name: np.linspace(0, count - 1, most).round().astype(int)})
+            words.append(f"{most} of {count} {name.replace('_', ' ')}s")
+    return data, ", ".join(words)
 
 
 def _draw_curve(axes: Axes, curve: xr.Dataset, name: str, style: dict) -> None:
     """Draw one average over its value at the largest number of grains, with error bars and suspect points."""
-    reference = curve[name].values[-1]
+    value, stderr = curve[name].values, curve[f"{name}_stderr"].values
     with np.errstate(divide="ignore", invalid="ignore"):
-        value, stderr = curve[name].values / reference, curve[f"{name}_stderr"].values / abs(reference)
-    draw_points(axes, curve.grains.values, value, suspect(curve), style, yerr=stderr)
+        ratio, relative = value / value[-1], stderr / abs(value)
+    error = abs(ratio) * np.hypot(relative, relative[-1])
+    error[-1] = 0.0  # of a value over itself
+    draw_points(axes, curve.grains.values, ratio, suspect(curve), style, yerr=error)
 
 
 def _set_size_scale(axes: Axes, grains: np.ndarray) -> None:

@@ -191,7 +191,7 @@ def draw_errors(axes: Axes, data: xr.Dataset, value: np.ndarray, error: np.ndarr
         dots.set_linewidth(0.0)
     dashes = ["-" if level > 0.0 else "--" for level in ERROR_LEVELS.values()]
     style = {"colors": "black", "linewidths": 0.9, "linestyles": dashes, "zorder": 3}
-    draw_levels(axes, x, y, field, ERROR_LEVELS, room=0.025, **style)
+    draw_levels(axes, x, y, field, ERROR_LEVELS, **style)
     draw_plane(axes, data, field, np.isfinite(value))
     return hidden
 
@@ -218,7 +218,8 @@ def cluster_shares(data: MapData) -> Figure:
     shares = {"pressure": "stresses/cluster_pressure_share", "shear stress": "stresses/cluster_shear_share"}
     measured = np.isfinite(data["stresses/cluster_pressure_share"].values)
     plane = is_plane(data)
-    figure = empty_figure(TWO_COLUMNS if plane else ONE_COLUMN, height=3.8)
+    entries = data.sizes["restitution"] + data.sizes["packing_fraction"]
+    figure = empty_figure(TWO_COLUMNS if plane else ONE_COLUMN, height=max(3.8, 1.1 + 0.15 * entries))
     axes = figure.subplot_mosaic("pm;sm" if plane else "p;s", width_ratios=(1.0, 1.15) if plane else None)
     axes["s"].sharex(axes["p"])
     for name, (quantity, share) in zip("ps", shares.items(), strict=True):

@@ -52,12 +52,16 @@ def over_range(table: Table, evaluate: Callable[[Any, Any], Any], restitution: A
       α, ν and the pytree. NaN where JAX traces a value that is outside the range.
 
     Raises:
-      InputError: a value is outside the range, or JAX traces it in single precision.
+      InputError: a value is outside the range, shapes do not broadcast, or JAX traces a value in single precision.
     """
     values, xp = (restitution, packing_fraction), module_of(restitution, packing_fraction)
     if xp is np:
         values = [_checked(name, value, *table.range(name)) for name, value in zip(PLANE, values, strict=True)]
-    alpha, nu = xp.broadcast_arrays(*(xp.asarray(x, float) for x in values))
+    try:
+        alpha, nu = xp.broadcast_arrays(*(xp.asarray(x, float) for x in values))
+    except ValueError:
+        shapes = " and ".join(f"{np.shape(x)}" for x in values)
+        raise InputError(f"restitution and packing_fraction must have shapes that broadcast, not {shapes}.") from None
     (first, last), (loosest, densest) = (table.range(name) for name in PLANE)
     inside = (first <= alpha) & (alpha <= last) & (loosest <= nu) & (nu <= densest)
     middle = (first + last) / 2, (loosest + densest) / 2

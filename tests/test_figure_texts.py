@@ -1,0 +1,102 @@
+"""Every figure of a map can be read: no text leaves the canvas, and none lies on another one."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+import xarray as xr
+from made_up_maps import theory_dataset, with_grains, with_timesteps
+from matplotlib.backend_bases import RendererBase
+from matplotlib.figure import Figure
+from matplotlib.path import Path
+from matplotlib.text import Text
+
+from jaxgran.plotting.map_figures import FIGURES
+
+GAP = np.array([1.0, -1.0])  # points between texts, beside and above each other: boxes are higher than their letters
+
+
+def with_faults(data: xr.Dataset) -> xr.Dataset:
+    """The map with a point of each bad status, the last of which have no value."""
+    data = data.copy(deep=True)
+    for k in range(1, 7):
+        data.status[k % data.sizes["packing_fraction"], k % data.sizes["restitution"]] = k
+    return data.assign({name: data[name].where(data.status < 5) for name in data if name != "status"})
+
+
+def with_errors(data: xr.Dataset, share: float) -> xr.Dataset:
+    """The map with standard errors that are this share of its excess and its averages."""
+    stderrs = {name: share * abs(data[name.removesuffix("_stderr")]) for name in map(str, data) if "_stderr" in name}
+    return data.assign(stderrs | {"force_ratio_stderr": share * (data.force_ratio - 1.0)})
+
+
+MAPS = {
+    "quick": theory_dataset(5, 6),
+    "paper": theory_dataset(10, 12),
+    "one column": theory_dataset(1, 6),
+    "twelve curves": with_faults(theory_dataset(12, 3)),
+    "errors of 300 %": with_errors(theory_dataset(5, 6), 3.0),
+}
+
+
+def drawn_texts(figure: Figure) -> dict[Text, Path]:
+    """The texts that are drawn, each with the rectangle around it, turned as the text is, in pixels."""
+    texts: list[Text] = []
+
+    def note(self: Text, renderer: RendererBase) -> None:
+        if self.get_visible() and self.get_text().strip():
+            texts.append(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Text, "draw", note)
+        figure.draw_without_rendering()
+    return {text: box_of(text) for text in texts}
+
+
+def box_of(text: Text) -> Path:
+    """The corners of the rectangle around a text: that of the upright text, turned about its centre."""
+    around, angle = text.get_window_extent(), np.radians(text.get_rotation())
+    turned = text.get_transform_rotates_text()
+    text.set(rotation=0, transform_rotates_text=False)
+    size = np.array(text.get_window_extent().size)
+    text.set(rotation=np.degrees(angle), transform_rotates_text=turned)
+    middle = np.array([around.x0 + around.x1, around.y0 + around.y1]) / 2
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2 * (size + GAP * text.figure.dpi / 72)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return Path([*(middle + corners @ turn), middle], closed=True)
+
+
+def unreadable(figure: Figure) -> list[str]:
+    """The texts that leave the canvas, and the pairs that overlap."""
+    boxes, (width, height) = drawn_texts(figure), figure.bbox.size
+    problems = [
+        f"{text.get_text()!r} leaves the canvas"
+        for text in boxes
+        if not ((text.get_window_extent().min >= 0) & (text.get_window_extent().max <= (width, height))).all()
+    ]
+    return problems + [
+        f"{one.get_text()!r} on {other.get_text()!r}"
+        for one, other in combinations(boxes, 2)
+        if boxes[one].intersects_path(boxes[other], filled=True)
+    ]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("kind", MAPS)
+def test_every_text_is_inside_the_canvas_and_on_no_other_text(kind: str, name: str) -> None:
+    data = MAPS[kind]
+    if name in ("timestep", "size"):
+        data = with_timesteps(with_grains(data, 64, 256, 1024, 4096), 1e-3, 3e-4, 1e-4)
+    if not FIGURES[name].is_possible(data):
+        pytest.skip("this map has no such figure")
+    figure = FIGURES[name].draw(data)
+    assert len(drawn_texts(figure)) > 10
+    assert unreadable(figure) == []
+
+
+def test_texts_on_each_other_and_outside_are_found() -> None:
+    figure = Figure((3, 2))
+    figure.text(0.5, 0.5, "one", rotation=40)
+    figure.text(0.52, 0.52, "two")
+    figure.text(0.9, 0.1, "outside the canvas")
+    assert unreadable(figure) == ["'outside the canvas' leaves the canvas", "'one' on 'two'"]
