@@ -39,19 +39,32 @@ def file_lock(path: Path) -> Iterator[None]:
     """Let one process at a time enter the block for a file; the lock is released even if the process dies."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        lock = path.with_suffix(".lock").open("w")
-    except OSError:  # the folder is not writable, so there will be no file to wait for
-        yield
-        return
-    with lock:
+    name, locked = path.with_suffix(".lock"), False
+    while not locked:
+        try:
+            lock = name.open("w")
+        except OSError:  # the folder is not writable, so there will be no file to wait for
+            yield
+            return
         if fcntl is not None:
             fcntl.flock(lock, fcntl.LOCK_EX)
+        locked = fcntl is None or same_file(lock.fileno(), name)  # or the one before removed this file: the next one
+        if not locked:
+            lock.close()
+    with lock:
         try:
             yield
         finally:
             with suppress(OSError):
-                path.with_suffix(".lock").unlink()
+                name.unlink()
+
+
+def same_file(handle: int, path: Path) -> bool:
+    """Whether an open file is the one that has this name now, and not one that was removed since."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False
 
 
 def read_cached(path: Path) -> bytes | None:

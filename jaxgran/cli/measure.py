@@ -88,13 +88,17 @@ def _load(module: str) -> None:
 
 def _say_imprecise(data) -> None:
     """Print the largest relative error beside the requested one, and the sampled strains."""
+    import numpy as np
+
     from jaxgran.maps.schema import relative_ci95
     from jaxgran.sampling.sample import ERROR_OBSERVABLES
 
     if "error" not in data.attrs:
         return
-    worst = max(float(relative_ci95(data, name)["total"].max()) for name in ERROR_OBSERVABLES)
-    strain = data["seeds/strain"]
+    errors = np.stack([relative_ci95(data, name)["total"] for name in ERROR_OBSERVABLES])
+    if not np.isfinite(errors).any():
+        return
+    worst, strain = float(errors[np.isfinite(errors)].max()), data["seeds/strain"]
     say(
         f"relative errors: {data.attrs['error']:g} requested, {worst:.2g} at the worst point; sampled strains of "
         f"{float(strain.min()):g} to {float(strain.max()):g} per seed"
@@ -103,9 +107,13 @@ def _say_imprecise(data) -> None:
 
 def print_budget(data) -> None:
     """Print the parts of the error: those of each point, or their median and largest over a map."""
+    import numpy as np
+
     from jaxgran.maps.schema import relative_ci95
 
     title = f"Relative error, 95 %, of a large system{'' if data.status.size == 1 else ': median (largest)'}"
+    if "comment" in data.force_ratio_ci95.attrs:
+        title += f"\n{data.force_ratio_ci95.attrs['comment']}"
     table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "total"))
     for name in _BUDGETED:
         parts = relative_ci95(data, name)
@@ -113,7 +121,8 @@ def print_budget(data) -> None:
         cells = [_percent(part) for part in ordered]
         cells[1] = "at its dt" if name == "force_ratio" else cells[1]
         table.rows.append([name.replace("_", " "), *cells])
-    print_table(table)
+    if np.isfinite(data.force_ratio).any():
+        print_table(table)
 
 
 def _percent(part) -> str:
@@ -127,21 +136,12 @@ def _percent(part) -> str:
     return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
 
 
-def _say_retried(data) -> None:
-    """Print how many replicas failed and were run again with half the time step."""
-    timestep = next(data[name] for name in ("point_timestep", "timestep") if name in data.coords)
-    retried = int((data["seeds/sample_timestep"] < 0.75 * timestep).sum())
-    if retried:
-        say(f"retried with half the time step: {retried} replicas, see sample_timestep in the group seeds.")
-
-
 def finish(data, written: list[Path], interrupted: bool, can_resume: bool) -> None:
     """Print what was written and what went wrong, and exit with the matching status."""
     from jaxgran.maps.status_report import bad_points, format, format_short
 
     say_written(written)
     _say_imprecise(data)
-    _say_retried(data)
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:
