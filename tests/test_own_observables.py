@@ -162,11 +162,19 @@ def test_what_a_function_computes_counts_and_not_its_place() -> None:
     assert identity_of(MapSettings(**MAP)) is None
 
 
-@pytest.mark.parametrize("where", [jax.jit, lambda f: lambda: jax.lax.cond(True, f, f), lambda f: jax.jit(jax.jit(f))])
-def test_constants_of_what_a_function_calls_count(where) -> None:
+CALLS = {
+    "jit": jax.jit,
+    "jit in jit": lambda f: jax.jit(jax.jit(f)),
+    "branch": lambda f: lambda: jax.lax.cond(True, f, f),
+    "loop": lambda f: lambda: jax.lax.fori_loop(0, 2, lambda _, x: x + f(), jnp.zeros(2000)),
+}
+
+
+@pytest.mark.parametrize("where", CALLS)
+def test_constants_of_what_a_function_calls_count(where: str) -> None:
     def of(constant) -> str | None:
         table = jnp.asarray(constant)
-        inner = where(lambda: 2 * table)
+        inner = CALLS[where](lambda: 2 * table)
         return identity_of(MapSettings(**MAP, observe=lambda _: {"a": inner()}))
 
     constant = np.random.default_rng(0).normal(size=2000)  # longer than what is printed

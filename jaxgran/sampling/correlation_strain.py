@@ -52,4 +52,6 @@ def flow_correlation_strain(
 
 def length_status(strain: ArrayLike, correlation_strain: ArrayLike) -> Any:
     """``short_sample`` where a sampled strain is below ``FEWEST_CORRELATION_STRAINS``, otherwise ``ok``."""
-    return (strain < FEWEST_CORRELATION_STRAINS * correlation_strain) * Status.short_sample.value
+    xp = jnp if isinstance(strain, jax.Array) else np
+    short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
+    return xp.where(short, Status.short_sample.value, Status.ok.value)
