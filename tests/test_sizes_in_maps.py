@@ -116,7 +116,7 @@ def test_a_polydispersity_beside_diameters_is_refused_and_that_of_a_file_replace
 
 @pytest.mark.parametrize("sizes", [{}, {"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}])
 def test_intervals_of_other_sizes_say_with_which_sizes_their_laws_were_measured(sizes: dict, capsys) -> None:
-    settings = MapSettings(**{**MAP, **sizes})
+    settings = MapSettings(**{**MAP, "restitution": (0.9,), "packing_fraction": (0.6,), **sizes})
     replica = random_replica(np.random.default_rng(0), settings)
     data = map_dataset(settings, {(0, 0): replica}, {})
     print_budget(data)
