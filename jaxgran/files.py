@@ -39,24 +39,24 @@ def file_lock(path: Path) -> Iterator[None]:
     """Let one process at a time enter the block for a file; the lock is released even if the process dies."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-    name, locked = path.with_suffix(".lock"), False
-    while not locked:
+    name = path.with_suffix(".lock")
+    while True:
         try:
             lock = name.open("w")
         except OSError:  # the folder is not writable, so there will be no file to wait for
             yield
             return
-        if fcntl is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        locked = fcntl is None or same_file(lock.fileno(), name)  # or the one before removed this file: the next one
-        if not locked:
-            lock.close()
-    with lock:
-        try:
-            yield
-        finally:
-            with suppress(OSError):
-                name.unlink()
+        with lock:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not same_file(lock.fileno(), name):  # its owner has removed it: lock the one that is there now
+                    continue
+            try:
+                yield
+            finally:
+                with suppress(OSError):
+                    name.unlink()
+            return
 
 
 def same_file(handle: int, path: Path) -> bool:

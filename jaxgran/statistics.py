@@ -219,33 +219,38 @@ def _joined(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=_MOST_BLOCKS)
-def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eigenvectors (times, blocks, modes), eigenvalues (times, white, modes) and logarithm of the prior."""
+def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvectors (times, blocks, modes) and eigenvalues (times, white, modes)."""
     lag = np.abs(np.subtract.outer(np.arange(blocks), np.arange(blocks)))
     values, vectors = np.linalg.eigh(np.exp(-lag / _TIMES[:, None, None]))
     eigenvalues = (1 - _WHITE_SHARES[:, None]) * values[:, None] + _WHITE_SHARES[:, None]
-    prior = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
-    return vectors, eigenvalues, np.repeat(prior, len(_WHITE_SHARES))
+    return vectors, eigenvalues
+
+
+def _prior() -> np.ndarray:
+    """Logarithm of the prior (models,): times, and the shares of white noise of each."""
+    return np.repeat(np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2)), len(_WHITE_SHARES))
 
 
 def _posterior(seeds: Sequence[np.ndarray]) -> _Posterior:
     """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see ``standard_errors``."""
     count = seeds[0].shape[1]
     freedom = sum(map(len, seeds)) - 1
-    information, weighted, square, determinant = 0.0, 0.0, 0.0, 0.0
+    information = weighted = square = determinant = np.zeros(1)
+    prior = _prior()
     for blocks in sorted({len(seed) for seed in seeds}):
         series = np.stack([seed for seed in seeds if len(seed) == blocks])
-        vectors, eigenvalues, prior = _correlation_models(blocks)
+        vectors, eigenvalues = _correlation_models(blocks)
         models, number = len(prior), len(series)
         flat = series.transpose(1, 0, 2).reshape(blocks, -1)
         modes = vectors.swapaxes(1, 2) @ flat  # (times, modes, seeds * n)
         ones = vectors.sum(axis=1)[:, None]
         squares = (modes**2).reshape(len(modes), blocks, number, count).sum(axis=2)
         sums = modes.reshape(len(modes), blocks, number, count).sum(axis=2)
-        information += number * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
-        weighted += ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
-        square += ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
-        determinant += number * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
+        information = information + number * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
+        weighted = weighted + ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
+        square = square + ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
+        determinant = determinant + number * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
     shift = weighted / information
     residual = np.maximum(square - weighted * shift, np.finfo(float).tiny)
     log_weight = prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2

@@ -56,8 +56,9 @@ def run_on_cluster(
                     if version != here[name]:
                         different = f"{name.removeprefix('version_')} {version!r}, not {here[name]!r}"
                         raise InputError(f"workers must have the versions of this process, and one has {different}.")
-                for name, value in there.items() if made is not None else ():
-                    made.setdefault(name, {})[value] = None
+                if made is not None:
+                    for name, value in there.items():
+                        made.setdefault(name, {})[value] = None
                 yield futures[future], result
             except KilledWorker:
                 yield futures[future], None

@@ -40,7 +40,7 @@ def flow_correlation_strain(
       Strain, of the shape of the arguments, of JAX where the averages are. Measured correlations are 0.2 to 3 times
       this. Where an average is not a positive number, it is that of the contact network.
     """
-    xp = jnp if isinstance(averages["pressure"], jax.Array) else np
+    xp: Any = jnp if isinstance(averages["pressure"], jax.Array) else np
     temperature, pressure, shear_stress = (
         xp.asarray(averages[name], float) for name in ("granular_temperature", "pressure", "shear_stress")
     )
@@ -50,7 +50,7 @@ def flow_correlation_strain(
     return xp.maximum(RELAXATION_STRAIN, xp.fmax(*(xp.where(xp.isfinite(x), x, 0.0) for x in (heating, waves))))
 
 
-def length_status(strain: ArrayLike, correlation_strain: ArrayLike) -> Any:
+def length_status(strain: Any, correlation_strain: Any) -> Any:
     """``short_sample`` where a sampled strain is below ``FEWEST_CORRELATION_STRAINS``, otherwise ``ok``."""
     xp = jnp if isinstance(strain, jax.Array) else np
     short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain

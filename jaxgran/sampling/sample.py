@@ -391,10 +391,9 @@ def _sample_with_callback(
         measured = _sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe)
         state, part = waited(measured)
         parts.append(part)
-        measured = _with_length(_joined(parts), state)
-        if callback(state, measured):
+        if callback(state, _with_length(_joined(parts), state)):
             break
-    return state, measured
+    return state, _with_length(_joined(parts), state)
 
 
 def _with_length(measured: Sample, state: State) -> Sample:
