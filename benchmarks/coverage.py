@@ -8,11 +8,16 @@ eight; its first two, four and six are judged too, all in 32 blocks. The correla
 The repeats are divided at random into groups of seeds. The truth is the value from all R repeats. It shares the k seeds
 of a group, so a deviation from it is divided by √(1 - k/R).
 
+With an error, nine points are sampled until it is reached, 40 times by four seeds each, and the same is asked of these
+intervals: a sample that ends when its estimated error is small may be one that underestimates it.
+
     python -m benchmarks coverage           # about 6 minutes on a core
+    python -m benchmarks coverage --error 0.05  # about 20 minutes on a core
     python -m benchmarks coverage --quick   # two flows of 64 grains, under a minute
 """
 
 import time
+import warnings
 from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple
@@ -24,10 +29,12 @@ from matplotlib.figure import Figure
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.dynamics.tally import Tally
+from jaxgran.maps.status_report import BadPoints
+from jaxgran.model.status import Status
 from jaxgran.plotting.drawing import LABEL_SIZE, TWO_COLUMNS, styled
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
-from jaxgran.sampling.sample import BLOCKS
+from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES
 from jaxgran.statistics import standard_errors
 
 OBSERVABLES = ("force_ratio", "pressure", "shear_stress", "granular_temperature")
@@ -36,6 +43,8 @@ STRAINS = (2, 4, 6, 8)  # sampled, in correlation strains
 PREPARED = 5  # correlation strains before the sample
 PILOT = 4.0  # strain of the sample that gives the correlation strain of a flow
 NORMAL_QUANTILE = 1.96
+ERROR_PLANE = (0.2, 0.5, 0.8), (0.3, 0.6, 0.75)  # restitutions, packing fractions
+ERROR_SEEDS = 4
 HOLDS = (0.92, 0.98)  # accepted shares of intervals
 
 
@@ -54,8 +63,11 @@ FULL = Plan((*DILUTE, *DENSE), 256, 1e-3, 64)
 QUICK = Plan(((0.8, 0.6), (0.8, 0.8)), 64, 1e-3, 8)
 
 
-def run(output: Output) -> None:
-    """Judge the flows, print a table, and write ``coverage`` as JSON and PNG."""
+def run(output: Output, error: float | None = None) -> None:
+    """Judge the flows, print a table, and write ``coverage`` as JSON and PNG; or judge an error."""
+    if error is not None:
+        judge_error(output, error)
+        return
     plan, rng, start = QUICK if output.quick else FULL, np.random.default_rng(0), time.perf_counter()
     rows = []
     for flow in plan.flows:
@@ -97,6 +109,47 @@ def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> 
                     "covered": round(float(np.mean(np.abs(deviations) < NORMAL_QUANTILE * errors)), 4),
                     "width": round(float(np.mean(errors / true)), 4),
                 }
+
+
+def judge_error(output: Output, error: float) -> None:
+    """Repeat a map with a requested error, print how often its intervals hold, and write ``coverage_error``."""
+    count, grains, start = (3, 64, time.perf_counter()) if output.quick else (40, 256, time.perf_counter())
+    given = {"grains": grains, "timestep": 1e-3, "tolerance": 1e-4, "error": error, "seeds": ERROR_SEEDS}
+    maps = []
+    for repeat in range(count):
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", BadPoints
+            )  # the share of those that reached their longest strain is printed
+            maps.append(jg.ratio_map(*ERROR_PLANE, **given, first_seed=ERROR_SEEDS * repeat))
+        print(f"repeat {repeat + 1} of {count}: {time.perf_counter() - start:.0f} s", flush=True)
+    strain = np.stack([one["seeds/strain"].sum("seed") for one in maps])
+    limited = np.mean([one["seeds/status"] == Status.strain_limit for one in maps])
+    rows = []
+    for name in ERROR_OBSERVABLES:
+        values, errors = (np.stack([one[f"{name}{end}"] for one in maps]) for end in ("", "_stderr"))
+        truth = np.sum(strain * values, axis=0) / np.sum(strain, axis=0)
+        deviations = np.abs(values - truth) / np.sqrt(1 - 1 / count)
+        for nu, alpha in np.ndindex(truth.shape):
+            place = (slice(None), nu, alpha)
+            inside = deviations[place] < NORMAL_QUANTILE * errors[place]
+            rows.append(
+                {
+                    "restitution": ERROR_PLANE[0][alpha],
+                    "packing_fraction": ERROR_PLANE[1][nu],
+                    "observable": name,
+                    "covered": float(np.mean(inside)),
+                    "width": float(np.mean(errors[place]) / np.std(values[place], ddof=1)),
+                    "relative_interval": float(np.mean(NORMAL_QUANTILE * errors[place] / truth[nu, alpha])),
+                    "strain": float(np.mean(strain[place])),
+                }
+            )
+    for name in ERROR_OBSERVABLES:
+        covered = [row["covered"] for row in rows if row["observable"] == name]
+        print(f"{name}: {np.mean(covered):.3f} of the intervals [{min(covered):.2f} at a point]")
+    print(f"{np.mean([row['covered'] for row in rows]):.3f} of all; {limited:.1%} of the seeds at their longest strain")
+    head = {"error": error, "grains": grains, "seeds": ERROR_SEEDS, "repeats": count, "limited": float(limited)}
+    output.write_rows("coverage_error", head | {"seconds": time.perf_counter() - start}, "rows", rows)
 
 
 def repeats(plan: Plan, alpha: float, nu: float) -> tuple[float, jg.Sample]:

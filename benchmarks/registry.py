@@ -277,6 +277,7 @@ BENCHMARKS = (
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
         (6, 0.5),
         ("coverage.json", "coverage.png"),
+        options=(Option("--error", "judge samples that end at this error, into coverage_error.json", float),),
         one_core=True,
     ),
     Benchmark(

@@ -44,19 +44,32 @@ def file_lock(path: Path) -> Iterator[None]:
     """Let one process at a time enter the block for a file; the lock is released even if the process dies."""
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        lock = path.with_suffix(".lock").open("w")
-    except OSError:  # the folder is not writable, so there will be no file to wait for
-        yield
-        return
-    with lock:
-        if fcntl is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+    name = path.with_suffix(".lock")
+    while True:
         try:
+            lock = name.open("w")
+        except OSError:  # the folder is not writable, so there will be no file to wait for
             yield
-        finally:
-            with suppress(OSError):
-                path.with_suffix(".lock").unlink()
+            return
+        with lock:
+            if fcntl is not None:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                if not same_file(lock.fileno(), name):  # its owner has removed it: lock the one that is there now
+                    continue
+            try:
+                yield
+            finally:
+                with suppress(OSError):
+                    name.unlink()
+            return
+
+
+def same_file(handle: int, path: Path) -> bool:
+    """Whether an open file is the one that has this name now, and not one that was removed since."""
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except OSError:
+        return False
 
 
 def read_cached(path: Path) -> bytes | None:

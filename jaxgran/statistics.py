@@ -5,7 +5,7 @@ each seed is several correlation times long. ``jackknife`` assumes that merged b
 underestimates errors when few merged blocks are.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ _EXPECTED_TIME = 2.5  # blocks, beyond which the prior of the correlation time f
 _LEVEL = 0.95  # of an interval of 1.96 standard errors
 _NORMAL_QUANTILE = 1.959964
 _NEWTON_STEPS = 4
+_ROUNDING = 64 * np.finfo(float).eps  # of an estimate, to a scatter of the blocks that is none
 _MOST_FREEDOM = 2000  # degrees of freedom beyond which Student's distribution counts as Gaussian
 Estimates = dict[str, np.ndarray]
 
@@ -37,7 +38,9 @@ class _Posterior(NamedTuple):
     freedom: int
 
 
-def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[Estimates, Estimates]:
+def standard_errors(
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
+) -> tuple[Estimates, Estimates]:
     """Estimates from the sums over all blocks of all seeds, and their standard errors.
 
     The error is the half-width of the 95 % interval divided by 1.96, so ±1.96 errors is a 95 % interval even if few
@@ -54,16 +57,20 @@ def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> 
     from 0.2 to 20 blocks and three values of w, around the plain mean. The prior is t^(1/4) / (1 + (t/2.5)²) in ln t
     and flat in w.
 
+    Blocks of shorter seeds are merged until they last about as long as those of the longest, so that one correlation
+    time holds for all, see ``merged_blocks``.
+
     With 32 blocks per seed, intervals for sheared flows have their nominal coverage if a seed is at least eight
     correlation strains long, and for most flows from four (``python -m benchmarks coverage``).
 
     Args:
       estimate: maps a pytree of sums with any leading axes to by_name estimates with the same leading axes.
       sums: pytree of arrays of shape (seeds, blocks, ...), in any units.
+      lengths: (seeds,) durations in any unit; None where all are equal.
 
     Returns:
-      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN for fewer than two blocks,
-      and zero if all blocks are equal.
+      Estimates and standard errors, without the axes of seeds and blocks. The error is NaN where it cannot be known:
+      for fewer than two blocks, and where all blocks are equal.
 
     Examples:
       Eight blocks with a trend. Independent blocks would have an error of 0.87.
@@ -73,23 +80,40 @@ def standard_errors(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> 
       >>> float(value["mean"]), round(float(error["mean"]), 1)
       (4.5, 2.4)
     """
-    whole, influence, scale, by_name = _influences(estimate, sums)
-    if influence.shape[0] * influence.shape[1] < 2:
+    whole, influence, scale, by_name = _influences(estimate, sums, lengths)
+    if sum(map(len, influence)) < 2:
         return by_name(whole), by_name(np.full_like(whole, np.nan))
     return by_name(whole), by_name(scale * _half_width(_posterior(influence)) / _NORMAL_QUANTILE)
 
 
-def error_correlation(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> np.ndarray:
+def merged_blocks(lengths: np.ndarray | None, seeds: int, blocks: int) -> np.ndarray:
+    """Numbers of blocks (seeds,) that last about as long as those of the longest seed, at most ``blocks``.
+
+    Where a seed is 1/n of the longest, n of its blocks are one. Seeds of up to 1.5 times the length count as equal.
+
+    Examples:
+      >>> merged_blocks(np.array([8.0, 32.0, 9.0]), 3, 32).tolist()
+      [8, 32, 8]
+    """
+    if lengths is None or not np.isfinite(lengths).all():
+        return np.full(seeds, blocks)
+    merge = np.rint(np.max(lengths) / np.maximum(lengths, np.finfo(float).tiny))
+    return np.maximum(1, blocks // np.maximum(1, merge)).astype(int)
+
+
+def error_correlation(
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
+) -> np.ndarray:
     """Correlation matrix (n, n) of the errors of n scalar estimates, from the influences of the blocks.
 
     Args:
-      estimate, sums: as in ``standard_errors``.
+      estimate, sums, lengths: as in ``standard_errors``.
 
     Returns:
       The matrix in the order of the estimates; NaN for an estimate that does not vary.
     """
-    _, influence, _, _ = _influences(estimate, sums)
-    flat = influence.reshape(-1, influence.shape[-1])
+    _, influence, _, _ = _influences(estimate, sums, lengths)
+    flat = np.concatenate(influence)
     with np.errstate(invalid="ignore"):
         unit = flat / np.sqrt(np.sum(flat**2, axis=0))
     return unit.T @ unit
@@ -125,7 +149,9 @@ def jackknife(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> tuple[
     return by_name(flat[0]), by_name(np.fmax.reduce(spreads))
 
 
-def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) -> Estimates:
+def correlation_length(
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None = None
+) -> Estimates:
     """Statistical inefficiency: the number of successive blocks that count as one independent sample, at least one.
 
     g = 1 + 2 Σ (1 − k/B) ρ_k, where ρ_k is the autocorrelation at lag k of the jackknife influences of the B blocks of
@@ -134,14 +160,15 @@ def correlation_length(estimate: Callable[[Any], Mapping[str, Any]], sums: Any) 
     not many times longer than g underestimates it: 32 blocks give 3 instead of 4, and 4.6 instead of 9.
 
     Args:
-      estimate, sums: as in ``jackknife``.
+      estimate, sums, lengths: as in ``standard_errors``.
 
     Returns:
-      g of each estimate, in blocks; NaN for fewer than four blocks per seed.
+      g of each estimate, in blocks of ``merged_blocks``; NaN for fewer than four blocks in the longest seed.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_merged(x, 1)), sums)))
-    return by_name(_inefficiency(flat.reshape(seeds, blocks, -1)))
+    counts = merged_blocks(lengths, seeds, blocks)
+    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _all_but_one(_joined(x, counts)), sums)))
+    return by_name(_inefficiency(np.split(flat, np.cumsum(counts)[:-1])))
 
 
 def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, float]:
@@ -163,52 +190,69 @@ def drift(series: np.ndarray, least_correlation: float = 0.0) -> tuple[float, fl
 
 
 def _influences(
-    estimate: Callable[[Any], Mapping[str, Any]], sums: Any
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Callable[[np.ndarray], Estimates]]:
-    """Estimates (n,), influences of at most ``_MOST_BLOCKS`` blocks a seed (seeds, blocks, n), scale, ``by_name``.
+    estimate: Callable[[Any], Mapping[str, Any]], sums: Any, lengths: np.ndarray | None
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray, Callable[[np.ndarray], Estimates]]:
+    """Estimates (n,), influences of the blocks of each seed (blocks, n), their scale, and ``by_name``.
 
     The influence of a block is (B - 1) times the mean of the leave-one-out estimates minus the one without the block,
-    for B blocks in all, divided by the scale (its root mean square).
+    for B blocks in all, divided by the scale (its root mean square, NaN for rounding only). A seed has at most
+    ``_MOST_BLOCKS`` blocks.
     """
     seeds, blocks = jax.tree.leaves(sums)[0].shape[:2]
-    fewer = min(blocks, _MOST_BLOCKS)
-    first = np.arange(fewer) * blocks // fewer
-    merged = jax.tree.map(lambda x: np.add.reduceat(x, first, axis=1), sums)
-    merges = [1] if seeds * fewer > 1 else []
-    flat, by_name = _flat(estimate(jax.tree.map(lambda x: _whole_and_parts(x, merges), merged)))
-    without = flat[1:].astype(float) if merges else np.full(flat.shape, np.nan)
-    influence = (seeds * fewer - 1) * (without.mean(axis=0) - without)
+    counts = merged_blocks(lengths, seeds, min(blocks, _MOST_BLOCKS))
+    total = int(counts.sum())
+    parts = jax.tree.map(lambda x: _joined(x, counts), sums)
+    rows = [lambda x: x.sum(axis=0)[None], *([_all_but_one] if total > 1 else [])]
+    flat, by_name = _flat(estimate(jax.tree.map(lambda x: np.concatenate([row(x) for row in rows]), parts)))
+    without = flat[1:].astype(float) if total > 1 else np.full(flat.shape, np.nan)
+    influence = (total - 1) * (without.mean(axis=0) - without)
     scale = np.sqrt(np.mean(influence**2, axis=0))
     influence = influence / np.where(scale > 0, scale, 1)
-    return flat[0], influence.reshape(seeds, fewer, -1), scale, by_name
+    scale = np.where(scale > _ROUNDING * total * np.abs(flat[0]), scale, np.nan)
+    return flat[0], np.split(influence, np.cumsum(counts)[:-1]), scale, by_name
+
+
+def _joined(x: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """The blocks (seeds, blocks, ...) of all seeds, (Σ counts, ...), those of a seed merged to its number of them."""
+    firsts = (np.arange(count) * x.shape[1] // count for count in counts)
+    return np.concatenate([np.add.reduceat(seed, first, axis=0) for seed, first in zip(x, firsts, strict=True)])
 
 
 @lru_cache(maxsize=_MOST_BLOCKS)
-def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Eigenvectors (times, blocks, modes), eigenvalues (times, white, modes) and logarithm of the prior."""
+def _correlation_models(blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvectors (times, blocks, modes) and eigenvalues (times, white, modes)."""
     lag = np.abs(np.subtract.outer(np.arange(blocks), np.arange(blocks)))
     values, vectors = np.linalg.eigh(np.exp(-lag / _TIMES[:, None, None]))
     eigenvalues = (1 - _WHITE_SHARES[:, None]) * values[:, None] + _WHITE_SHARES[:, None]
-    prior = np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2))
-    return vectors, eigenvalues, np.repeat(prior, len(_WHITE_SHARES))
+    return vectors, eigenvalues
 
 
-def _posterior(series: np.ndarray) -> _Posterior:
-    """Posterior of the means of n series (seeds, blocks, n) with plain mean zero; see ``standard_errors``."""
-    seeds, blocks, count = series.shape
-    vectors, eigenvalues, prior = _correlation_models(blocks)
-    models, freedom = len(prior), seeds * blocks - 1
-    flat = series.transpose(1, 0, 2).reshape(blocks, -1)
-    modes = vectors.swapaxes(1, 2) @ flat  # (times, modes, seeds * n)
-    ones = vectors.sum(axis=1)[:, None]
-    squares = (modes**2).reshape(len(modes), blocks, seeds, count).sum(axis=2)
-    sums = modes.reshape(len(modes), blocks, seeds, count).sum(axis=2)
-    information = seeds * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
-    weighted = ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
-    square = ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
+def _prior() -> np.ndarray:
+    """Logarithm of the prior (models,): times, and the shares of white noise of each."""
+    return np.repeat(np.log(_TIMES**0.25 / (1 + (_TIMES / _EXPECTED_TIME) ** 2)), len(_WHITE_SHARES))
+
+
+def _posterior(seeds: Sequence[np.ndarray]) -> _Posterior:
+    """Posterior of n means from series (blocks, n) of plain mean zero, one a seed; see ``standard_errors``."""
+    count = seeds[0].shape[1]
+    freedom = sum(map(len, seeds)) - 1
+    information = weighted = square = determinant = np.zeros(1)
+    prior = _prior()
+    for blocks in sorted({len(seed) for seed in seeds}):
+        series = np.stack([seed for seed in seeds if len(seed) == blocks])
+        vectors, eigenvalues = _correlation_models(blocks)
+        models, number = len(prior), len(series)
+        flat = series.transpose(1, 0, 2).reshape(blocks, -1)
+        modes = vectors.swapaxes(1, 2) @ flat  # (times, modes, seeds * n)
+        ones = vectors.sum(axis=1)[:, None]
+        squares = (modes**2).reshape(len(modes), blocks, number, count).sum(axis=2)
+        sums = modes.reshape(len(modes), blocks, number, count).sum(axis=2)
+        information = information + number * (ones**2 / eigenvalues).sum(axis=2).reshape(models, 1)  # 1'R⁻¹1
+        weighted = weighted + ((ones / eigenvalues) @ sums).reshape(models, count)  # 1'R⁻¹x
+        square = square + ((1 / eigenvalues) @ squares).reshape(models, count)  # x'R⁻¹x
+        determinant = determinant + number * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
     shift = weighted / information
     residual = np.maximum(square - weighted * shift, np.finfo(float).tiny)
-    determinant = seeds * np.log(eigenvalues).sum(axis=2).reshape(models, 1)
     log_weight = prior[:, None] - (determinant + np.log(information) + freedom * np.log(residual)) / 2
     weight = np.exp(log_weight - log_weight.max(axis=0))
     return _Posterior(weight / weight.sum(axis=0), shift, np.sqrt(residual / (freedom * information)), freedom)
@@ -284,13 +328,17 @@ def _flat(estimates: Mapping[str, Any]) -> tuple[np.ndarray, Callable[[np.ndarra
     return np.concatenate([x.reshape(rows, -1) for x in arrays.values()], axis=1), by_name
 
 
-def _inefficiency(series: np.ndarray) -> np.ndarray:
-    """Statistical inefficiency (n,) of n series (seeds, blocks, n)."""
-    blocks = series.shape[1]
+def _inefficiency(seeds: Sequence[np.ndarray]) -> np.ndarray:
+    """Statistical inefficiency (n,) of n series (blocks, n), one a seed."""
+    blocks = max(map(len, seeds))
     if blocks < 4:
-        return np.full(series.shape[2], np.nan)
-    deviations = series - series.mean(axis=(0, 1))
-    products = [np.mean(deviations[:, : blocks - k] * deviations[:, k:], axis=(0, 1)) for k in range(blocks // 2)]
+        return np.full(seeds[0].shape[1], np.nan)
+    mean = np.concatenate(seeds).mean(axis=0)
+    deviations = [seed - mean for seed in seeds]
+    products = [
+        np.concatenate([x[: len(x) - k] * x[k:] for x in deviations if len(x) > k]).mean(axis=0)
+        for k in range(blocks // 2)
+    ]
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = np.stack(products) / products[0]
     weighted = correlation * (1 - np.arange(len(products)) / blocks)[:, None]

@@ -62,7 +62,7 @@ def in_a_process(folder: Path, *arguments: str) -> Outcome:
 def made_up_replicas(statuses: dict[tuple[int, int], Status], end: type[BaseException] | None = None) -> Callable:
     """A stand-in for the sweep that yields replicas with given statuses and then perhaps stops with an exception."""
 
-    def replicas(settings, workers, report, checkpoint, scheduler, record) -> Iterator:
+    def replicas(settings, workers, report, checkpoint, scheduler, record, made) -> Iterator:
         rng = np.random.default_rng(0)
         for key, status in statuses.items():
             report(Advance([key], [1e-3], [100.0]))

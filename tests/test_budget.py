@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxgran.sampling.budget import BUDGET, SIZE_LAWS, error_budget, fewest_grains, size_error
+from jaxgran.sampling.budget import BUDGET, SHARES, SIZE_LAWS, error_budget, fewest_grains, size_error
 from jaxgran.sampling.timestep import stress_error
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -62,3 +62,7 @@ def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> 
     assert tuple(SIZE_LAWS[average]) == pytest.approx(found["constants"], rel=2e-3, abs=1e-4)
     assert found["differences"] > 80
     assert found["within"] >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / found["differences"])
+
+
+def test_shares_of_an_error_add_up_to_it():
+    assert sum(share**2 for share in SHARES.values()) == pytest.approx(1, rel=1e-12)

@@ -49,6 +49,13 @@ def cut_off(output: Path) -> dict[Key, Replica]:
     return run.done
 
 
+def journal_of(output: Path, key: Key, settings: MapSettings = SETTINGS) -> Path:
+    """The file for the journal of a batch, as another run of these settings names it."""
+    run = Checkpoint(output.with_name("another.nc"), settings, resume=False)
+    run.close(finished=True)
+    return output.with_name("map.nc.unfinished") / run.journal_path([key]).name
+
+
 def test_what_is_kept_comes_back_bit_for_bit(output: Path) -> None:
     kept = cut_off(output)
     resumed = Checkpoint(output, SETTINGS, resume=True)
@@ -86,7 +93,7 @@ def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch)
 def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(output: Path, how: str) -> None:
     cut_off(output)
     folder = output.with_name("map.nc.unfinished")
-    journal = folder / "journal-3-0.nc"
+    journal = journal_of(output, (3, 0))
     write_arrays(journal, {"keys": np.array([[3, 0]])}, {})
     for file in (journal, folder / "map.nc"):
         whole = bytearray(file.read_bytes())
@@ -95,7 +102,7 @@ def test_a_damaged_file_is_one_sentence_and_a_damaged_journal_is_removed(output:
         file.write_bytes({"torn": bytes(whole[:middle]), "flipped": bytes(whole), "empty": b""}[how])
         if file == journal:
             resumed = Checkpoint(output, SETTINGS, resume=True)
-            assert resumed.journals() == [] and resumed.damaged == ["journal-3-0.nc"] and not journal.exists()
+            assert resumed.journals() == [] and resumed.damaged == [journal.name] and not journal.exists()
             resumed.close(finished=False)
     with pytest.raises(InputError, match="damaged: remove the folder") as refused:
         Checkpoint(output, SETTINGS, resume=True)
@@ -111,7 +118,9 @@ def test_a_batch_is_under_way_until_it_is_written(output: Path) -> None:
     run._next_write = np.inf  # as after a write that took long
     run.add(first)
     left = [path.name for path in sorted(run.folder.glob("journal-*"))]
-    assert left == ["journal-0-0.nc", "journal-1-0.nc"]  # a process that is killed now continues both
+    assert left == [
+        run.journal_path(list(batch)).name for batch in (first, second)
+    ]  # a process that is killed now continues both
     assert run.journals() == [list(second)]
     run.add(second)
     run.close(finished=False)
@@ -119,6 +128,22 @@ def test_a_batch_is_under_way_until_it_is_written(output: Path) -> None:
     assert_same_bits(resumed.done, first | second)
     assert resumed.journals() == []
     resumed.close(finished=True)
+
+
+def test_a_late_worker_of_another_map_writes_into_no_file_of_this_one(output: Path) -> None:
+    run = Checkpoint(output, SETTINGS, resume=False)
+    late = journal_of(output, (0, 0), replace(SETTINGS, solver=LOOSE))
+    write_arrays(late, {"keys": np.array([[0, 0]])}, {})
+    assert late != run.journal_path([(0, 0)]) and run.journals() == []
+    run.close(finished=True)
+    assert list(output.parent.iterdir()) == []
+
+
+def test_a_map_of_other_sources_is_not_continued(output: Path, monkeypatch) -> None:
+    cut_off(output)
+    monkeypatch.setattr("jaxgran.maps.provenance.sources_digest", lambda: "other")
+    with refused("has code_digest "):
+        Checkpoint(output, SETTINGS, resume=True)
 
 
 def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> None:

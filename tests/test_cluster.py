@@ -9,7 +9,8 @@ import jax
 import pytest
 from synthetic import refused
 
-from jaxgran.maps.cluster import run_on_cluster
+from jaxgran.maps.cluster import Provenance, run_on_cluster
+from jaxgran.maps.provenance import made_with
 from jaxgran.maps.results import open_map
 
 MAP = "--restitution 0.5,0.9 --packing-fraction 0.6 --grains 16 --seeds 1 --timestep 1e-3 --equilibrate 0 --strain 0.32"
@@ -36,3 +37,44 @@ def test_a_scheduler_that_does_not_answer_is_one_sentence(address: str, monkeypa
     monkeypatch.setattr("jaxgran.maps.cluster._PATIENCE", "0.5s")
     with refused("no scheduler answers"):
         next(run_on_cluster(address, print, [()]))
+
+
+class Done:
+    """A future of a cluster, and the cluster that has just this one."""
+
+    def __init__(self, result) -> None:
+        self.result, self.loop = lambda: result, None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        pass
+
+    def submit(self, *_, **__) -> "Done":
+        return self
+
+    def release(self) -> None:
+        pass
+
+
+def outcome_of(worker: dict[str, str], monkeypatch) -> tuple[list, Provenance]:
+    """What comes from a cluster whose worker computes with this."""
+    distributed = pytest.importorskip("dask.distributed")
+    monkeypatch.setattr(distributed, "Client", lambda *_, **__: Done((worker, "result")))
+    monkeypatch.setattr(distributed, "as_completed", lambda futures, loop: futures)
+    made: Provenance = {}
+    return list(run_on_cluster("tcp://x", print, [()], made)), made
+
+
+def test_provenance_is_that_of_the_workers(monkeypatch) -> None:
+    worker = made_with() | {"device": "gpu: one", "platform": "Linux, 1 cores"}
+    outcome, made = outcome_of(worker, monkeypatch)
+    assert outcome == [(0, "result")]
+    assert {name: list(values) for name, values in made.items()} == {name: [value] for name, value in worker.items()}
+
+
+@pytest.mark.parametrize("name", ["code_digest", "version_jax"])
+def test_a_worker_of_another_version_is_refused(name: str, monkeypatch) -> None:
+    with refused("workers must have the versions of this process, and one has .* 'other', not "):
+        outcome_of(made_with() | {name: "other"}, monkeypatch)

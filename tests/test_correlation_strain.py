@@ -1,9 +1,14 @@
 """The correlation strain of a flow: the longer of heating by the shear and of a sound wave across the cell."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from synthetic import random_tally
+from test_statistics import ar1
 
 from jaxgran.sampling.correlation_strain import RELAXATION_STRAIN, flow_correlation_strain
+from jaxgran.sampling.sample import Sample, correlation_strains
 
 
 def correlation_strain(temperature=1.0, pressure=1.0, shear_stress=1.0, grains=400, side=20.0, shear_rate=1.0):
@@ -27,3 +32,17 @@ def test_correlation_strain_is_never_below_that_of_the_contact_network():
     np.testing.assert_array_equal(
         correlation_strain(temperature=np.full(2, np.nan), pressure=np.nan), RELAXATION_STRAIN
     )
+
+
+def test_correlation_strain_of_seeds_of_unequal_length_is_that_of_their_flow():
+    """A temperature that is correlated over 40 units of strain, so that 80 are one sample."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(20):
+        seeds = []
+        for length in (1, 1, 1, 8):
+            series = 10 + ar1(rng, (1, 256 * length), np.exp(-1 / 40)).reshape(256, -1).mean(axis=1)
+            moment = length * series[:, None, None] * np.eye(2)
+            tally = replace(random_tally(rng, 256), duration=np.full(256, float(length)), kinetic_moment=moment)
+            seeds.append(Sample(tally, np.float64(100.0), np.float64(1.0), 100))
+        found.append(correlation_strains(seeds)["granular_temperature"])
+    assert np.mean(found) == pytest.approx(80, rel=0.25)  # 8 % standard error; a short series shows less

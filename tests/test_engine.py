@@ -193,7 +193,7 @@ def test_a_dataset_names_what_ran_and_what_was_asked_for(asked: dict, engine: st
 def test_in_single_precision_a_map_is_of_the_engine_jax() -> None:
     with jax.enable_x64(False):
         data = map_dataset(SETTINGS, {}, {})
-        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine=jg.Numba()))
+        assert "in float32, not numba" in refusal(lambda: replace(SETTINGS, engine=jg.Numba()).require_engine())
     assert (data.attrs["precision"], data.attrs["engine"], data.attrs["solver"]) == (
         "float32",
         "jax",

@@ -232,3 +232,9 @@ def test_one_elastic_replica_leaves_the_others_alone():
     disturbed = np.where(np.arange(restitutions.size) == 5, 1.0, restitutions)
     before, after = (numbers(batched(moments)(alpha, packing_fractions)) for alpha in (restitutions, disturbed))
     np.testing.assert_array_equal(np.delete(after, 5, axis=1), np.delete(before, 5, axis=1))
+
+
+def test_moments_that_newtons_method_does_not_find_are_not_finite() -> None:
+    """So close to one, rounding of the restitution leaves no root: steps stay above the tolerance."""
+    assert np.isnan(numbers(moments(1 - 1e-12, 0.5))).all()
+    assert np.isfinite(numbers(moments(1 - 1e-6, 0.5))).all()

@@ -176,3 +176,25 @@ def test_sizes_of_ones_own_belong_to_no_polydispersity(state) -> None:
         side = jnp.sqrt(jnp.pi * jnp.sum(radii**2) / 0.6)
         own = replace(state, grains=Grains(radii, 4 * radii**2), side=side)
         require_match(FLOWS[0], own)
+
+
+def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(state) -> None:
+    """Alone, compiled, in a batch, as replicas of ``vmap`` and block by block; its strain compiles nothing anew."""
+    few = 0.32
+    taken = [
+        sample(FLOWS[0], state, few),
+        jax.jit(lambda state: sample(FLOWS[0], state, few))(state),
+        sample(FLOWS[0], state, few, callback=lambda *_: False),
+    ]
+    assert [int(one.status) for _, one in taken] == [Status.short_sample] * 3
+    both = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), state)
+    assert np.all(np.asarray(sample(FLOWS[0], both, few)[1].status) == Status.short_sample)
+    assert np.all(jax.vmap(lambda one: sample(FLOWS[0], one, few)[1].status)(both) == Status.short_sample)
+    compiled = _sample._cache_size()
+    _, long = sample(FLOWS[0], state, 40.0)
+    assert long.status == Status.ok and _sample._cache_size() == compiled
+
+
+def test_spread_of_the_largest_of_one_block_is_unknown() -> None:
+    one = Sample(random_tally(np.random.default_rng(2), 1), np.float64(100.0), np.float64(1.0), GRAINS)
+    assert np.isnan(one.errors()["max_overlap"]) and np.isnan(one.errors()["pressure"])

@@ -3,8 +3,10 @@
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -13,6 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_instant, random_replica, refused
 
+from jaxgran.contact.projected_methods import BarzilaiBorwein
+from jaxgran.dynamics.engine import Numba
 from jaxgran.maps.batches import points_of_part, predicted_cost
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.merge import merge_maps
@@ -88,12 +92,18 @@ def earlier(data: xr.DataTree) -> xr.DataTree:
     return data
 
 
+def other_sources(data: xr.DataTree) -> xr.DataTree:
+    data.attrs["code_digest"] = "other"
+    return data
+
+
 REFUSED: dict[str, Any] = {
     "grains is 64 in map 0 and 128 in map 1": lambda x: [of_seeds(x, 0, 1), of_seeds({}, 1, 1, grains=128)],
     "map 0 and map 1 have seed 1 of point 0": lambda x: [of_seeds(x, 0, 2), of_seeds(x, 1, 2)],
     "seed 1 is missing": lambda x: [of_seeds(x, 0, 1), of_seeds(x, 2, 1)],
     "by their number of seeds": lambda x: [of_seeds(x, 0, 1, error=0.1), of_seeds(x, 1, 1, error=0.1)],
     "version_jax is '0.1' in map 0": lambda x: [earlier(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
+    "code_digest is 'other' in map 0": lambda x: [other_sources(of_seeds(x, 0, 1)), of_seeds(x, 1, 1)],
     "must have the group sums": lambda x: [of_seeds({}, 0, 1)],
     "a list of at least one map": lambda _: [],
     "a list of at least one map or file, not 'map.nc'": lambda _: "map.nc",
@@ -156,3 +166,40 @@ def test_a_map_of_a_users_observable_is_merged_with_its_function() -> None:
     for other in (None, lambda _: {"a": 1.0}):
         with pytest.raises(InputError, match="observe must be the function of the maps, which is normals, side: "):
             merge_maps(maps, observe=other)
+
+
+def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in_single(replicas) -> None:
+    parts, whole = [of_seeds(replicas, 0, 1), of_seeds(replicas, 1, 2)], of_seeds(replicas, 0, 3)
+    with jax.enable_x64(False):
+        merged = merge_maps(parts)
+    assert_one_run(merged, whole, but=("solver", "engine"))
+    assert merged["theory"].pressure.dtype == np.float64
+
+
+def test_maps_of_an_engine_are_merged_where_it_cannot_run(replicas, monkeypatch) -> None:
+    parts = [of_seeds(replicas, 0, 1, engine=Numba()), of_seeds(replicas, 1, 2, engine=Numba())]
+    whole = of_seeds(replicas, 0, 3, engine=Numba())
+    monkeypatch.setattr("jaxgran.dynamics.engine._device", lambda: SimpleNamespace(platform="gpu"))
+    assert_one_run(merge_maps(parts), whole)
+
+
+class Own(BarzilaiBorwein):
+    """A method of the user's."""
+
+
+def test_maps_of_a_users_solver_are_merged_with_it(replicas) -> None:
+    solver = Own(tolerance=1e-3)
+    parts = [of_seeds(replicas, 0, 1, solver=solver), of_seeds(replicas, 1, 2, solver=solver)]
+    assert_one_run(merge_maps(parts, solver=solver), of_seeds(replicas, 0, 3, solver=solver))
+    for other in (None, Own(), BarzilaiBorwein(tolerance=1e-3)):
+        with refused("solver must be that of the maps, which is .*Own"):
+            merge_maps(parts, solver=other)
+
+
+def test_statuses_of_a_map_are_read_by_the_names_that_it_has(replicas) -> None:
+    data = of_seeds(replicas, 0, 3)
+    status = data["seeds"].status
+    renumbered = status.copy(data=np.where(status >= 2, status + 10, status))
+    renumbered.attrs["flag_values"] = np.where(status.flag_values >= 2, status.flag_values + 10, status.flag_values)
+    data["seeds"]["status"] = renumbered
+    assert_one_run(merge_maps([data]), of_seeds(replicas, 0, 3))

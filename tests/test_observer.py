@@ -11,12 +11,15 @@ from synthetic import refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import observed_advance
-from jaxgran.dynamics.advance import advance
+from jaxgran.dynamics.advance import advance, call_numba
 from jaxgran.dynamics.engine import Jax, Numerics
+from jaxgran.dynamics.numba_engine.layout import record_numbers
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.sampling.sample import BLOCKS, sample
 
 STRAIN = 0.32
@@ -92,7 +95,7 @@ def test_error_of_a_ratio_is_that_of_the_ratio(observed) -> None:
 
 def test_records_that_fill_their_room_go_on_in_the_next(observed, flowing, monkeypatch) -> None:
     """With room for three, the numba engine is suspended after every other step with contacts, and takes none twice."""
-    monkeypatch.setattr(observed_advance, "_ROOM", 3)
+    monkeypatch.setattr(observed_advance, "_MOST_ROOM", 3)
     steps = jnp.int32(320)
     observing = jax.jit(lambda state: advance_observed(FLOW, Numerics(), state, steps, all_of_step))
     state, tally, own = observing(flowing(0.7))
@@ -165,3 +168,31 @@ def test_what_cannot_be_observed_is_refused_in_one_sentence(flowing, changed: di
 def test_callback_is_refused_under_a_transformation(flowing) -> None:
     with pytest.raises(InputError, match="callback must be None for a batch, and where"):
         jax.jit(lambda state: sample(FLOW, state, STRAIN, callback=print))(flowing(0.7))
+
+
+@pytest.mark.parametrize("grains", [256, 10_000, 170_000, 10**6])
+def test_records_of_a_call_are_within_a_number_of_bytes_or_the_fewest(grains: int) -> None:
+    records = observed_advance.records_of_call(grains)
+    assert records >= 2 and (records == 2 or 8 * records * record_numbers(grains) <= 2**26)
+    call = jax.eval_shape(
+        lambda: call_numba(replace(FLOW, grains=grains), BarzilaiBorwein(), _shapes(grains), 1, records)
+    )
+    assert call.records.shape == (records, record_numbers(grains))
+
+
+def _shapes(grains: int) -> State:
+    return State(Grains(*jnp.ones((2, grains))), *jnp.zeros((2, grains, 2)), jnp.ones(()), jnp.zeros(()))
+
+
+def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monkeypatch) -> None:
+    monkeypatch.setattr(observed_advance, "_MOST_BYTES", 1)
+    _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
+    jax.tree.map(np.testing.assert_array_equal, own.observed_sums, observed[1].observed_sums)
+
+
+@pytest.mark.parametrize("engine", [None, Jax()])
+@pytest.mark.parametrize("nothing", [None, {}, ()])
+def test_a_function_that_returns_nothing_is_refused_before_anything_runs(flowing, nothing, engine, monkeypatch) -> None:
+    monkeypatch.setattr("jaxgran.sampling.sample.waited", lambda _: pytest.fail("it ran"))
+    with refused("observe must return at least one number, not"):
+        sample(FLOW, flowing(0.7), STRAIN, observe=lambda _: nothing, engine=engine)

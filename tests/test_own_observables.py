@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -161,6 +162,27 @@ def test_what_a_function_computes_counts_and_not_its_place() -> None:
     assert identity_of(MapSettings(**MAP)) is None
 
 
+CALLS = {
+    "jit": jax.jit,
+    "jit in jit": lambda f: jax.jit(jax.jit(f)),
+    "branch": lambda f: lambda: jax.lax.cond(True, f, f),
+    "loop": lambda f: lambda: jax.lax.fori_loop(0, 2, lambda _, x: x + f(), jnp.zeros(2000)),
+}
+
+
+@pytest.mark.parametrize("where", CALLS)
+def test_constants_of_what_a_function_calls_count(where: str) -> None:
+    def of(constant) -> str | None:
+        table = jnp.asarray(constant)
+        inner = CALLS[where](lambda: 2 * table)
+        return identity_of(MapSettings(**MAP, observe=lambda _: {"a": inner()}))
+
+    constant = np.random.default_rng(0).normal(size=2000)  # longer than what is printed
+    changed = constant.copy()
+    changed[1000] += 1
+    assert of(constant) == of(constant.copy()) != of(changed)
+
+
 REFUSED = {
     words: function
     for function, words in [
@@ -182,9 +204,9 @@ def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None
 
 def test_an_engine_that_cannot_observe_is_refused() -> None:
     with pytest.raises(InputError, match="not pallas"):
-        MapSettings(**MAP, engine=Pallas(), observe=observe)
+        ratio_map(**MAP, engine=Pallas(), observe=observe)
     with pytest.raises(InputError, match="with the solver jacobi, not numba"):
-        MapSettings(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)
+        ratio_map(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)
 
 
 def test_no_name_of_a_map_is_free() -> None:

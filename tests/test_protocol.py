@@ -278,10 +278,11 @@ def test_sample_grows_until_its_error_is_small_and_each_replica_for_itself(batch
     _, short = sample_batch(batch, 0.64)
     errors = [relative_error(replica(short, k)) for k in (0, 1)]
     target = np.mean(errors) if abs(np.subtract(*errors)) > 1e-3 else min(errors) * 0.9
-    _, grown = sample_batch(batch, 0.64, error=float(target))
+    end, grown = sample_batch(batch, 0.64, error=float(target))
     strains = np.asarray(grown.tally.duration).sum(axis=1)
     for k in (0, 1):
         reached = relative_error(replica(grown, k)) <= target
+        assert reached or end.status[k] >= Status.strain_limit
         assert np.isclose(strains[k], 0.64) == (errors[k] <= target)
         assert reached or np.isclose(strains[k], 2.56)
         _, alone = sample_batch(jax.tree.map(lambda x, k=k: x[k : k + 1], batch), 0.64, error=float(target))
@@ -312,6 +313,18 @@ def test_a_sample_lasts_six_memories_and_one_of_less_than_four_says_so(batch, mo
     np.testing.assert_allclose(np.sum(long.tally.duration, axis=1), [1.2, 2.4])
     end, _ = sample_batch(ready, 1.0)
     assert (end.status[0] == Status.short_sample, end.status[1] >= Status.short_sample) == (False, True)
+
+
+def test_a_sample_for_an_error_is_at_least_twice_as_long_and_its_longest_strain_says_so(batch, monkeypatch) -> None:
+    monkeypatch.setattr(steady_state, "LEAST_SAMPLE", 0.32)
+    monkeypatch.setattr(steady_state, "LONGEST_STRAIN", 0.64)
+    monkeypatch.setattr(steady_state, "LONGEST_CORRELATION_STRAINS", 0)
+    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    ready = batch._replace(status=np.zeros(2, int), correlation_strain=np.full(2, 0.01))
+    for error, status in ((1e9, Status.ok), (1e-9, Status.strain_limit)):
+        end, measured = sample_batch(ready, None, error=error)
+        np.testing.assert_allclose(np.sum(measured.tally.duration, axis=1), 0.64)
+        np.testing.assert_array_equal(np.maximum(measured.status, status), end.status)
 
 
 def test_a_preparation_shorter_than_the_correlation_strain_is_not_steady(batch) -> None:

@@ -12,7 +12,7 @@ import xarray as xr
 from flows import in_batches
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_replica
+from synthetic import random_replica, refused
 
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
@@ -126,45 +126,51 @@ def test_results_do_not_depend_on_the_number_of_workers(settings, results) -> No
     assert_every_step_is_reported(told)
 
 
-@pytest.mark.parametrize("second", [Status.ok, Status.nonfinite])
-def test_a_replica_that_came_to_nothing_is_tried_once_more_with_half_the_time_steps(
-    settings, second: Status, monkeypatch
-) -> None:
-    """The others of its batch keep their numbers, and the worse of two failures is not taken. A jammed one is left."""
+@pytest.mark.parametrize("bad", [Status.capacity, Status.nonfinite, Status.infeasible])
+def test_a_replica_that_came_to_nothing_keeps_its_status_and_is_in_no_average(settings, bad, monkeypatch) -> None:
+    """Of another time step its force ratio would be another, so it is not run again with a shorter one."""
     rng, calls = np.random.default_rng(0), []
     task = [(0, 0), (0, 1), (1, 0), (1, 1)]
 
-    def measured(_, keys, advance, refinement: int = 1):
-        calls.append((list(keys), refinement))
-        statuses = {(0, 1): Status.capacity if refinement == 1 else second, (1, 1): Status.infeasible}
-        return [(key, random_replica(rng, settings, statuses.get(key, Status.ok))) for key in keys]
+    def measured(_, keys, advance, record=None):
+        calls.append(list(keys))
+        return [(key, random_replica(rng, settings, bad if key == (0, 1) else Status.ok)) for key in keys]
 
     monkeypatch.setattr(run_replicas_module, "_measured", measured)
     done = dict(run_replicas_module._run_task(settings, task))
-    assert calls == [(task, 1), ([(0, 1)], 2)]
-    assert list(done) == task
-    assert [done[key].status for key in task] == [0, min(second, Status.capacity), 0, Status.infeasible]
+    assert calls == [task] and [done[key].status for key in task] == [0, bad, 0, 0]
+    data = map_dataset(settings, done, {})
+    assert float(data.force_ratio.values.ravel()[0]) == pytest.approx(float(done[0, 0].sample.force_ratio))
 
 
-def test_refined_replica_has_half_the_time_step_and_another_start(settings, results) -> None:
-    (key, refined), *_ = run_replicas_module._measured(
-        settings, [(0, 0)], run_replicas_module.advance_batch, refinement=2
-    )
-    assert float(refined.sample.tally.duration.sum() / refined.sample.tally.steps.sum()) == pytest.approx(5e-4)
-    assert refined.sample.pressure != results[key].sample.pressure
-    data = map_dataset(settings, {**results, key: refined}, {})
-    np.testing.assert_allclose(data["seeds/sample_timestep"].values.ravel(), [5e-4, 1e-3, 1e-3, 1e-3], rtol=1e-9)
+def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None:
+    """Sixty replicas are sampled in batches of four without one."""
+    many, sizes = replace(settings, seeds=30), []
+
+    def measured(settings, keys, advance, record):
+        record(lambda *_: sizes.append(len(keys)))()
+        return [(key, random_replica(np.random.default_rng(0), settings)) for key in keys]
+
+    monkeypatch.setattr(run_replicas_module, "_measured", measured)
+    done = dict(run_replicas_module.run_replicas(many, record=lambda advance: advance))
+    assert sizes == [1] * 60 and len(done) == 60
+
+
+@pytest.mark.parametrize("name", ["seeds", "precision", "engine", "wall_time_seconds", "code_digest", "output"])
+def test_attributes_of_the_users_do_not_replace_those_of_the_map(name: str) -> None:
+    with refused(f"attributes must have names that a map does not have, not '{name}'"):
+        ratio_map(**SETTINGS, attributes={name: 7})
 
 
 def test_a_batch_that_does_not_fit_into_the_memory_is_halved(settings, results, tmp_path, monkeypatch) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
     measured, largest, sizes = run_replicas_module._measured, 1, []
 
-    def bounded(settings, task, advance, refinement: int = 1):
+    def bounded(settings, task, advance, record=None):
         sizes.append(len(task))
         if len(task) > largest:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 1 byte.")
-        return measured(settings, task, advance, refinement)
+        return measured(settings, task, advance)
 
     monkeypatch.setattr(run_replicas_module, "_measured", bounded)
     tasks = [(0, 0), (0, 1), (1, 0), (1, 1)]

@@ -51,7 +51,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("mistake", "accepted"), MISTAKES, ids=lambda x: str(x) if isinstance(x, dict) else "")
 def test_a_mistake_is_one_sentence_with_the_accepted_range(mistake: dict[str, Any], accepted: str) -> None:
     with pytest.raises(ValueError, match=accepted) as caught:
-        MapSettings(**{**GOOD, **mistake})
+        MapSettings(**{**GOOD, **mistake}).require_engine()
     assert isinstance(caught.value, InputError)
     assert one_sentence(str(caught.value))
     assert next(iter(mistake)) in str(caught.value)

@@ -88,13 +88,18 @@ def _flags() -> str:
 @cache
 def _origin() -> str:
     """What every program depends on: sources of this package, versions, processor, XLA flags."""
+    lines = [sources_digest(), *(f"{name} {version(name)}" for name in _PACKAGES)]
+    return "\n".join([*lines, processor_features(), os.environ.get("XLA_FLAGS", "")])
+
+
+@cache
+def sources_digest() -> str:
+    """A hash of the sources of this package."""
     digest = hashlib.sha256()
     folder = Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
-    lines = [f"{name} {version(name)}" for name in _PACKAGES]
-    lines += [processor_features(), os.environ.get("XLA_FLAGS", "")]
-    return digest.hexdigest() + "\n".join(lines)
+    return digest.hexdigest()[:16]
 
 
 def _digest(function: Callable, key: tuple) -> str:

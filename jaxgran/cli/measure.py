@@ -18,7 +18,6 @@ from jaxgran.maps.interruption import Interrupted
 from jaxgran.maps.parameters import options
 from jaxgran.model.checks import refused
 
-_LAW_SIZES = 0.26  # polydispersity of the flows that the laws of the errors were fitted to
 _BUDGETED = ("force_ratio", "pressure", "shear_stress", "granular_temperature", "local_granular_temperature")
 
 
@@ -117,11 +116,8 @@ def print_budget(data) -> None:
     if not np.isfinite(data.force_ratio).any():
         return
     title = f"Relative error, 95 %, of a large system{'' if data.status.size == 1 else ': median (largest)'}"
-    if "diameters" in data.attrs or data.attrs.get("polydispersity", _LAW_SIZES) != _LAW_SIZES:
-        title += (
-            f"\nall but sampling by laws measured at a polydispersity of {_LAW_SIZES:g}: "
-            "the sizes here differ, and these parts are rough estimates"
-        )
+    if "comment" in data.force_ratio_ci95.attrs:
+        title += f"\n{data.force_ratio_ci95.attrs['comment']}"
     table = Table(title, ("observable", "sampling", "time step", "size", "tolerance", "total"))
     for name in _BUDGETED:
         parts = relative_ci95(data, name)
@@ -129,7 +125,8 @@ def print_budget(data) -> None:
         cells = [_percent(part) for part in ordered]
         cells[1] = "at its dt" if name == "force_ratio" else cells[1]
         table.rows.append([name.replace("_", " "), *cells])
-    print_table(table)
+    if np.isfinite(data.force_ratio).any():
+        print_table(table)
 
 
 def _percent(part) -> str:
@@ -143,14 +140,6 @@ def _percent(part) -> str:
     return f"{median} %" if part.size == 1 else f"{median} ({largest}) %"
 
 
-def _say_retried(data) -> None:
-    """Print how many replicas failed and were run again with half the time step."""
-    timestep = next(data[name] for name in ("point_timestep", "timestep") if name in data.coords)
-    retried = int((data["seeds/sample_timestep"] < 0.75 * timestep).sum())
-    if retried:
-        say(f"retried with half the time step: {retried} replicas, see sample_timestep in the group seeds.")
-
-
 def finish(data, written: list[Path], interrupted: bool, output: Path | None = None) -> None:
     """Print what was written and what went wrong, and exit with the matching status.
 
@@ -160,7 +149,6 @@ def finish(data, written: list[Path], interrupted: bool, output: Path | None = N
 
     say_written(written)
     _say_imprecise(data)
-    _say_retried(data)
     bad = bad_points(data)
     short = bad.pop("short_sample", [])
     if short:

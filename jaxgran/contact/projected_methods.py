@@ -28,6 +28,7 @@ Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzila
 and Raydan (2000) for projected spectral gradients; Tonge, Benevolenski and Voroshilov (2012) for mass splitting.
 """
 
+import json
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -308,6 +309,16 @@ def solver_numbers(solver: ProjectedMethod) -> dict[str, Any]:
     """
     values = {field.name: getattr(solver, field.name) for field in fields(solver)}
     return {name: _in_json(value) for name, value in values.items()}
+
+
+def solver_text(solver: ProjectedMethod) -> str:
+    """Name and fields of a method, by which that of a user's class is compared.
+
+    Examples:
+      >>> solver_text(Nesterov(tolerance=1e-6))
+      'nesterov {"tolerance": 1e-06, "max_steps": 5000}'
+    """
+    return f"{solver_name(solver)} {json.dumps(solver_numbers(solver))}"
 
 
 def _in_json(value: Any) -> Any:

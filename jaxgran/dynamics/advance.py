@@ -174,7 +174,7 @@ def call_numba(
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
     numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, suspended)
-    record = layout.RECORD_HEAD + (layout.RECORD_OF_GRAIN + 3 * layout.RECORD_OF_CONTACT) * count
+    record = layout.record_numbers(count)
     kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
     shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), kept, (room, record)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]

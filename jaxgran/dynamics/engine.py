@@ -33,6 +33,7 @@ from jaxgran.contact.projected_methods import (
     require_solver,
     solver_name,
 )
+from jaxgran.environment import precision
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.model.flow import ShearFlow
@@ -171,7 +172,7 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
         return engine
     if requested is None:
         other = option or not _is_default(numerics.solver) or in_batch()
-        if state is not None and isinstance(engine, Numba) and not other and not jax.config.read("jax_enable_x64"):
+        if state is not None and isinstance(engine, Numba) and not other and precision() == "float32":
             _warn_once(_SINGLE_PRECISION)
         return Jax()
     where, reason = why
@@ -224,7 +225,7 @@ def _why_unsupported(
 
 def _why_no_kernel(automatic: bool, flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
     """Why a trial of the GPU kernel failed, or None; where the choice is automatic, a warning says so."""
-    problem = _kernel_problem(flow.grains, _dtype(state), device, jax.config.read("jax_enable_x64"))
+    problem = _kernel_problem(flow.grains, _dtype(state), device, precision() == "float64")
     if problem and automatic:
         _warn_once(f"flows take the engine jax: the kernel for GPUs does not run here ({problem}).")
     return ("here", f"the kernel for GPUs does not run ({problem})") if problem else None

@@ -29,7 +29,8 @@ from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
-_ROOM = 64  # records of one call
+_MOST_ROOM, _LEAST_ROOM = 64, 2  # records of one call; the least are those of a list and of its first contacts
+_MOST_BYTES = 2**26  # of the records of one call, above 170,000 grains those of the least
 _FEW = 16  # grains for a slot in the smaller one of two buffers for contacts
 
 
@@ -59,6 +60,13 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
     return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
 
 
+def records_of_call(grains: int) -> int:
+    """How many records a call of the numba engine keeps, within ``_MOST_BYTES``."""
+    from jaxgran.dynamics.numba_engine import layout
+
+    return max(_LEAST_ROOM, min(_MOST_ROOM, _MOST_BYTES // (8 * layout.record_numbers(grains))))
+
+
 class _Progress(NamedTuple):
     """An advance by one call of the numba engine after another, see ``NumbaCall``."""
 
@@ -75,8 +83,10 @@ def _recorded(
 ) -> tuple[State, Tally, Any]:
     """``advance_observed`` with the numba engine; its derivatives are those of the engine ``Jax``."""
 
+    room = records_of_call(flow.grains)
+
     def called(now: _Progress) -> _Progress:
-        call = call_numba(flow, solver, state, steps, _ROOM, now.suspended, now.memory)
+        call = call_numba(flow, solver, state, steps, room, now.suspended, now.memory)
         user_sums = _with_records(flow, state, observe, now.sums.user_sums, call)
         sums = call.sums._replace(user_sums=user_sums)
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)

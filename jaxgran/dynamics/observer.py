@@ -40,6 +40,8 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
     def found(slots: int) -> Any:
         def numbers() -> Any:
             values = observe_now(_no_contacts(slots, dtype), jnp.zeros(slots, dtype))
+            if not jax.tree.leaves(values):
+                raise InputError(f"observe must return at least one number, not {short_repr(values)}.")
             for x in jax.tree.leaves(values):
                 if not isinstance(x, _NUMBERS) or jnp.asarray(x).dtype.kind not in "biuf":
                     raise InputError(f"observe must return real numbers, not {short_repr(x)}.")

@@ -4,7 +4,8 @@
 file                content
 ==================  ================================================================================================
 ``map.nc``          the finished replicas, all parameters of the map, and the versions that its results depend on
-``journal-*.nc``    a batch that is running, see ``journal``
+``journal-*.nc``    a batch that is running, see ``journal``; the end of its name is a hash of the parameters, versions
+                    and sources
 ``lock``            locked by the process that writes here; released when that process ends for any reason
 ==================  ================================================================================================
 
@@ -14,6 +15,7 @@ computed again.
 """
 
 import glob
+import hashlib
 import json
 import os
 import shutil
@@ -21,7 +23,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,13 @@ import jax
 import numpy as np
 
 from jaxgran.analysis.instant import Instant
-from jaxgran.contact.projected_methods import solver_name, solver_numbers
+from jaxgran.contact.projected_methods import solver_text
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
+from jaxgran.environment import precision
+from jaxgran.files import same_file
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.own_observables import identity_of, sums_by_name
+from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
@@ -44,7 +48,6 @@ except ImportError:  # a system without such locks: a second run on one output i
     fcntl = None
 
 WRITING_SHARE = 0.05  # largest share of the time that is spent on writing
-_VERSIONS = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 
 class Checkpoint:
@@ -66,6 +69,7 @@ class Checkpoint:
         self.done: dict[Key, Replica] = {}
         self.damaged: list[str] = []
         self._identity = _identity(settings)
+        self._name = hashlib.sha256(json.dumps(self._identity, sort_keys=True).encode()).hexdigest()[:12]
         self._ended: list[Path] = []  # journals of the batches that map.nc lacks
         self._next_write = 0.0
         self._lock = _locked(self.folder, output)
@@ -87,9 +91,12 @@ class Checkpoint:
             self._next_write = ended + (ended - begun) / WRITING_SHARE
 
     def journal_path(self, keys: Sequence[Key]) -> Path:
-        """The file for the journal of a batch, named after its first replica."""
+        """The file for the journal of a batch, named after its first replica and all that its numbers depend on.
+
+        So a worker of an earlier map that still writes here writes no file of this one.
+        """
         point, seed = keys[0]
-        return self.folder / f"journal-{point}-{seed}.nc"
+        return self.folder / f"journal-{point}-{seed}-{self._name}.nc"
 
     def journals(self) -> list[list[Key]]:
         """The interrupted batches that can be continued from their journals."""
@@ -141,7 +148,7 @@ class Checkpoint:
                 arrays, begun = read_arrays(path)
             except CorruptFile:
                 raise InputError(f"the file map.nc in {str(self.folder)!r} is damaged: remove the folder.") from None
-            if len(arrays["keys"]) or self._journals():
+            if len(arrays["keys"]) or any(self.folder.glob("journal-*.nc")):
                 if not resume:
                     raise InputError(
                         f"output {str(self._output)!r} has an unfinished map: pass `resume=True` to continue it, or "
@@ -151,12 +158,12 @@ class Checkpoint:
                 self._require_same(begun)
                 self.done = _replicas_of(arrays, self.settings)
                 return
-        for journal in self._journals():
+        for journal in self.folder.glob("journal-*.nc"):
             journal.unlink()
         self._write()
 
     def _journals(self) -> list[Path]:
-        return sorted(self.folder.glob("journal-*.nc"))
+        return sorted(self.folder.glob(f"journal-*-{self._name}.nc"))
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -201,7 +208,7 @@ def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
 
 def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dict[Key, Replica]:
     """The replicas of ``_arrays_of``."""
-    dtype, own_sums, flows = np.dtype(_precision()), sums_by_name(settings), settings.flows()
+    dtype, own_sums, flows = np.dtype(precision()), sums_by_name(settings), settings.flows()
     replicas = {}
     for row, ((point, seed, status), tally, (strain, area, shear_rate)) in enumerate(
         zip(arrays["keys"].tolist(), arrays["tallies"], arrays["numbers"], strict=True)
@@ -218,17 +225,19 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
 
 def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
-    versions = {f"version of {name}": version(name) for name in _VERSIONS}
-    here = {"precision": _precision(), "device": jax.default_backend(), "number of running sums": len(TABLE)}
+    versions = versions_of(made_with())
+    here = {"precision": precision(), "device": jax.default_backend(), "number of running sums": len(TABLE)}
     parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
-    solver = f"{solver_name(settings.solver)} {json.dumps(solver_numbers(settings.solver))}"
     engine = "auto" if settings.engine is None else settings.engine.name
-    identity = {**parameters, "solver": solver, "engine": engine, "observe": identity_of(settings), **versions, **here}
+    identity = {
+        **parameters,
+        "solver": solver_text(settings.solver),
+        "engine": engine,
+        "observe": identity_of(settings),
+        **versions,
+        **here,
+    }
     return json.loads(json.dumps(identity, default=lambda number: number.item()))
-
-
-def _precision() -> str:
-    return "float64" if jax.config.read("jax_enable_x64") else "float32"
 
 
 def _locked(folder: Path, output: Path) -> int | None:
@@ -265,7 +274,4 @@ def _locked(folder: Path, output: Path) -> int | None:
 
 def _is_lock_of(folder: Path, lock: int | None) -> bool:
     """Whether the lock is that of this folder, and not of one that was removed since."""
-    try:
-        return lock is None or os.path.samestat(os.fstat(lock), (folder / "lock").stat())
-    except OSError:
-        return False
+    return lock is None or same_file(lock, folder / "lock")

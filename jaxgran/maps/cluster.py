@@ -8,25 +8,32 @@ from typing import Any, TypeVar
 
 import jax
 
+from jaxgran.environment import precision
+from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.model.checks import InputError
 
 T = TypeVar("T")
+Provenance = dict[str, dict[str, None]]  # values by name, each once, in their order
 _PATIENCE = "10s"  # longest wait for an answer of the scheduler
 
 
-def run_on_cluster(address: str, function: Callable[..., T], tasks: Sequence[tuple]) -> Generator[tuple[int, T | None]]:
+def run_on_cluster(
+    address: str, function: Callable[..., T], tasks: Sequence[tuple], made: Provenance | None = None
+) -> Generator[tuple[int, T | None]]:
     """Run a function on the arguments of every task on a cluster, with the precision of this process.
 
     Args:
       address: address of the scheduler, such as ``tcp://127.0.0.1:8786``.
       function: a function that a worker can import.
       tasks: arguments of each call; the first tasks start first.
+      made: receives, by name, each ``made_with`` of the workers once.
 
     Yields:
       The number of a finished task and its result; None if the cluster gave up on it.
 
     Raises:
-      InputError: (a ValueError) Dask is not installed, or no scheduler answers at the address.
+      InputError: (a ValueError) Dask is not installed, no scheduler answers at the address, or a worker has other
+        versions than this process.
     """
     try:
         from dask.distributed import Client, KilledWorker, as_completed
@@ -36,7 +43,7 @@ def run_on_cluster(address: str, function: Callable[..., T], tasks: Sequence[tup
         client = Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}.") from None
-    x64 = jax.config.read("jax_enable_x64")
+    x64, here = precision() == "float64", versions_of(made_with())
     with client:
         futures = {
             client.submit(_with_precision, x64, function, task, pure=False, priority=-number): number
@@ -44,12 +51,21 @@ def run_on_cluster(address: str, function: Callable[..., T], tasks: Sequence[tup
         }
         for future in as_completed(list(futures), loop=client.loop):
             try:
-                yield futures[future], future.result()
+                there, result = future.result()
+                for name, version in versions_of(there).items():
+                    if version != here[name]:
+                        different = f"{name.removeprefix('version_')} {version!r}, not {here[name]!r}"
+                        raise InputError(f"workers must have the versions of this process, and one has {different}.")
+                if made is not None:
+                    for name, value in there.items():
+                        made.setdefault(name, {})[value] = None
+                yield futures[future], result
             except KilledWorker:
                 yield futures[future], None
             future.release()
 
 
-def _with_precision(x64: bool, function: Callable[..., Any], task: tuple) -> Any:
+def _with_precision(x64: bool, function: Callable[..., Any], task: tuple) -> tuple[dict[str, str], Any]:
+    """What a worker computes with, and the result of the function."""
     jax.config.update("jax_enable_x64", x64)
-    return function(*task)
+    return made_with(), function(*task)

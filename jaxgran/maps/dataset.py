@@ -1,8 +1,6 @@
 """The data of a ratio map: a DataTree of observables with errors on the grid, and all parameters of the run."""
 
 import json
-import os
-import platform
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from datetime import UTC, datetime
@@ -11,7 +9,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from jaxgran import environment
 from jaxgran.contact.projected_methods import solver_name, solver_numbers
 from jaxgran.dynamics.engine import select_engine, solver_in_use
 from jaxgran.maps.batches import points_of_part
@@ -22,6 +19,7 @@ from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.large_system import large_system_variables
 from jaxgran.maps.own_observables import identity_of, own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
+from jaxgran.maps.provenance import made_with
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
 from jaxgran.maps.seeds import NOT_RUN, STATUS_FLAGS, replica_statuses, seed_coordinate, seed_variables, worst_status
@@ -98,7 +96,8 @@ def map_dataset(
     Args:
       settings: the map.
       replicas: replicas by point (in the order of ``settings.flows()``) and seed; None for those that were given up.
-      run: further attributes to store: command, wall time, speed.
+      run: further attributes to store: command, wall time, speed; with ``engine`` and ``solver`` also what ran, where
+        that is not what this process would take.
     """
     grid = PointGrid.of(settings)
     averages, statuses = point_averages(settings, replicas), replica_statuses(settings, replicas)
@@ -119,7 +118,8 @@ def map_dataset(
         groups["large_system"] = xr.Dataset(large_system_variables(settings, grid, averages))
     tree = {name: follow_conventions(group, name) for name, group in groups.items()}
     tree = {name: group.assign_attrs(title=_TITLES[name]) if name in _TITLES else group for name, group in tree.items()}
-    tree["/"].attrs.update({**run_attributes(settings), **_history(run), **run})
+    ran = {} if "engine" in run else what_runs(settings)
+    tree["/"].attrs.update({**run_attributes(settings), **ran, **_history(run), **run})
     return xr.DataTree.from_dict(tree)
 
 
@@ -190,6 +190,7 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     precision, device,          what it was computed with; the commit is empty outside a repository
     platform, python, commit
     version_PACKAGE             version of jaxgran and of packages that the numbers depend on
+    code_digest                 hash of the sources of jaxgran
     history, command            when and by what command the map was made
     automatic_choice            what was chosen by ``auto``, in words
     workers, resumed_replicas   number of threads, and of replicas that an earlier process left
@@ -205,22 +206,13 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
         del parameters["polydispersity"]
     parameters["observe"] = identity_of(settings)
     parameters = {name: value for name, value in parameters.items() if value is not None}
-    flow, of_sample = settings.flows()[0], "" if settings.observe is None else "observe"
-    engines = [
-        select_engine(replace(flow, grains=grains), settings.numerics, option=option)
-        for grains in settings.sizes
-        for option in ("", of_sample)
-    ]
-    numbers = solver_numbers(settings.solver)
-    solvers = [solver_in_use(engine, settings.solver) for engine in engines]
+    flow, numbers = settings.flows()[0], solver_numbers(settings.solver)
     return {
         "title": "Ratio of the mean contact force to that of binary collisions in simple shear of hard discs",
         "Conventions": CONVENTIONS,
         "format_version": FORMAT_VERSION,
         **{name: list(x) if isinstance(x, tuple) else x for name, x in parameters.items()},
         "snapshots": int(settings.snapshots),  # NetCDF has no True and False
-        "engine": ", ".join(dict.fromkeys(engine.name for engine in engines)),
-        "solver": ", ".join(dict.fromkeys(solvers)),
         "engine_requested": "auto" if settings.engine is None else settings.engine.name,
         "solver_requested": solver_name(settings.solver),
         "solver_parameters": json.dumps(numbers),
@@ -236,14 +228,16 @@ def run_attributes(settings: MapSettings) -> dict[str, Any]:
     }
 
 
-def made_with() -> dict[str, str]:
-    """Precision, device, platform, versions and commit of this process."""
-    packages = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
+def what_runs(settings: MapSettings) -> dict[str, str]:
+    """The attributes ``engine`` and ``solver``: what this process takes for the flows of a map."""
+    flow, of_sample = settings.flows()[0], "" if settings.observe is None else "observe"
+    engines = [
+        select_engine(replace(flow, grains=grains), settings.numerics, option=option)
+        for grains in settings.sizes
+        for option in ("", of_sample)
+    ]
+    solvers = [solver_in_use(engine, settings.solver) for engine in engines]
     return {
-        "precision": environment.precision(),
-        "device": environment.devices()[0],
-        "platform": f"{environment.system()}, {os.cpu_count()} cores",
-        "python": platform.python_version(),
-        "commit": environment.commit(),
-        **{f"version_{name.replace('-', '_')}": number for name, number in environment.versions(packages).items()},
+        "engine": ", ".join(dict.fromkeys(engine.name for engine in engines)),
+        "solver": ", ".join(dict.fromkeys(solvers)),
     }

@@ -6,18 +6,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxgran.maps.provenance import DECIDING
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.model.checks import InputError, short_repr
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from jaxgran.contact.projected_methods import ProjectedMethod
+    from jaxgran.maps.settings import MapSettings
+
 _OF_PARTS = ("first_seed", "seeds", "part")  # in which the maps may differ
 _SUMMED = ("wall_time_seconds", "resumed_replicas")
-_EQUAL = ("precision", "version_jaxgran", "version_jax", "version_jaxlib", "version_numba", "version_numpy")
+_EQUAL = ("precision", "code_digest", *(f"version_{name}" for name in DECIDING))
 
 
-def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[..., Any] | None = None) -> "xr.DataTree":
+def merge_maps(
+    maps: "Sequence[xr.DataTree | str | Path]",
+    observe: Callable[..., Any] | None = None,
+    solver: "ProjectedMethod | None" = None,
+) -> "xr.DataTree":
     """One map of the replicas of several maps: of parts, of other seeds, or of both.
 
     The result is that of one run, bit for bit: averages, standard errors and all else are computed from the sums of all
@@ -28,6 +36,7 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
       maps: data of maps, as ``ratio_map`` returns them, or their files. They have the same settings except
         ``part``, ``seeds`` and ``first_seed``, and their seeds follow one another.
       observe: the function that the maps were made with, if they were made with one, as files do not contain it.
+      solver: the solver that the maps were made with, if it is of the user's own class, as files do not contain it.
 
     Raises:
       InputError: (a ValueError) the maps differ in a setting, a version or the precision; two have the same replica;
@@ -40,13 +49,12 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
       >>> merged["seeds"].sizes["seed"]
       2
     """
+    import jax
     from xarray import DataTree
 
-    from jaxgran.maps.dataset import map_dataset
-    from jaxgran.maps.own_observables import identity_of, label_units, sums_by_name, units_of
+    from jaxgran.contact.projected_methods import solver_text
     from jaxgran.maps.results import choices_of, open_map
     from jaxgran.maps.settings import MapSettings
-    from jaxgran.maps.sums import replicas_of
 
     accepted = (str, os.PathLike, DataTree)
     if not isinstance(maps, (list, tuple)) or not maps or not all(isinstance(one, accepted) for one in maps):
@@ -66,17 +74,33 @@ def merge_maps(maps: "Sequence[xr.DataTree | str | Path]", observe: Callable[...
             "maps with an `error` sample by their number of seeds, so they cannot be merged with other seeds."
         )
     merged: dict[str, Any] = {**chosen[0], "first_seed": numbers[0], "seeds": len(numbers), "observe": observe}
-    settings = MapSettings(**{name: value for name, value in merged.items() if name != "part"})
+    if isinstance(chosen[0]["solver"], str):
+        if solver is None or solver_text(solver) != chosen[0]["solver"]:
+            raise InputError(f"solver must be that of the maps, which is {chosen[0]['solver']}.")
+        merged["solver"] = solver
+    with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
+        settings = MapSettings(**{name: value for name, value in merged.items() if name != "part"})
+        return _joined(names, chosen, opened, settings)
+
+
+def _joined(
+    names: list[str], chosen: list[dict[str, Any]], opened: "Sequence[xr.DataTree]", settings: "MapSettings"
+) -> "xr.DataTree":
+    """The map of all replicas."""
+    from jaxgran.maps.dataset import map_dataset
+    from jaxgran.maps.own_observables import identity_of, label_units, sums_by_name, units_of
+    from jaxgran.maps.sums import replicas_of
+
     if identity_of(settings) != chosen[0].get("observe"):
         raise InputError(f"observe must be the function of the maps, which is {chosen[0].get('observe')}.")
     replicas: dict[Key, Replica | None] = {}
     origin: dict[Key, str] = {}
     for name, one, data in zip(names, chosen, opened, strict=True):
-        offset = one["first_seed"] - numbers[0]
+        offset = one["first_seed"] - settings.first_seed
         for (point, seed), replica in replicas_of(data, replace(settings, seeds=one["seeds"])).items():
             key = point, seed + offset
             if key in replicas:
-                where = f"seed {key[1] + numbers[0]} of point {point}"
+                where = f"seed {key[1] + settings.first_seed} of point {point}"
                 raise InputError(f"maps must have no replica in common, and {origin[key]} and {name} have {where}.")
             replicas[key], origin[key] = replica, name
     merged_map = map_dataset(settings, replicas, _attributes(opened))

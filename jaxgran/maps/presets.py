@@ -57,7 +57,12 @@ def with_start(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of a preset or a file, replaced by those that are given and by what these imply."""
-    replaced = {"error": ("seeds", "strain"), "strain": ("error",), "polydispersity": ("diameters",)}
+    replaced = {
+        "error": ("seeds", "strain"),
+        "strain": ("error",),
+        "polydispersity": ("diameters",),
+        "diameters": ("polydispersity",),
+    }
     left_out = {name for option, names in replaced.items() if given.get(option) is not None for name in names}
     kept = {name: value for name, value in start.items() if name not in left_out}
     for name, other in (("grains", "timestep"), ("timestep", "activation")):

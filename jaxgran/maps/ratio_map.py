@@ -19,6 +19,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.io.atomic import require_place
 from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
+from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.interruption import Interrupted, is_interruption
 from jaxgran.maps.own_observables import label_units, sums_by_name
 from jaxgran.maps.parameters import RunParameters, takes
@@ -33,6 +34,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _MOST_WORKERS = 1024
+_OF_RUN = (
+    *("engine", "solver", "history", "part_points", "automatic_choice", "resumed_replicas"),
+    *("wall_time_seconds", "replica_steps_per_second"),
+)
+"""Attributes of a map that are no parameters and not those of ``run_attributes``."""
 
 
 @takes(RunParameters)
@@ -70,6 +76,8 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     run = RunParameters(**with_start(given))
     output = _checked(run)
     settings, automatic_choice = chosen_settings(run)
+    settings.require_engine()
+    _require_own_attributes(run, settings)
     units = {} if run.observe_units is None else run.observe_units
     if run.observe_units is not None:
         require_units(units, sums_by_name(settings) or ())
@@ -148,6 +156,17 @@ def _checked(run: RunParameters) -> Path | None:
     return output
 
 
+def _require_own_attributes(run: RunParameters, settings: MapSettings) -> None:
+    """Raise an InputError if the user's attributes have a name of the map's; only the command may be given."""
+    if not set(run.attributes or {}) - {"command"}:
+        return
+    from jaxgran.maps.dataset import run_attributes
+
+    names = {*inspect.signature(RunParameters).parameters, *run_attributes(settings), *_OF_RUN}
+    for name in set(run.attributes or {}) & names:
+        raise refused("attributes", name, "must have names that a map does not have")
+
+
 def _workers(run: RunParameters) -> int:
     """How many batches run at a time; InputError if they cannot."""
     on_cpu = jax.default_backend() == "cpu"
@@ -187,7 +206,8 @@ def _run(
             if callable(run.progress):
                 run.progress(float(np.sum(advance.steps)))
 
-        running = run_replicas(settings, workers, report, checkpoint, run.scheduler, run.record)
+        made: Provenance = {}
+        running = run_replicas(settings, workers, report, checkpoint, run.scheduler, run.record, made)
         try:
             with closing(running):
                 for key, replica in running:
@@ -198,6 +218,7 @@ def _run(
                 raise
             interruption = error
     seconds = perf_counter() - start
+    attributes |= {name: "; ".join(values) for name, values in made.items()}
     attributes |= {"wall_time_seconds": seconds, "replica_steps_per_second": meter.done_steps / seconds}
     return results, attributes, interruption
 

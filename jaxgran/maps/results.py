@@ -122,7 +122,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
 
     The description is "" if the file holds a map of the same settings.
     """
-    from jaxgran.contact.projected_methods import solver_name, solver_numbers
+    from jaxgran.contact.projected_methods import solver_text
     from jaxgran.maps.own_observables import identity_of
 
     try:
@@ -134,7 +134,7 @@ def earlier_map(path: Path, settings: "MapSettings") -> tuple[xr.DataTree | None
         there: Any = chosen.get(field.name, field.default)
         here: Any = identity_of(settings) if field.name == "observe" else getattr(settings, field.name)
         if isinstance(there, str) and field.name == "solver":
-            here = f"{solver_name(here)} {json.dumps(solver_numbers(here))}"
+            here = solver_text(here)
         if there != here:
             return data, f"a map with {field.name} {short_repr(there)} and not {short_repr(here)}"
     return data, ""
@@ -151,10 +151,12 @@ def is_finished(data: xr.DataTree) -> bool:
 
 def differences(data: xr.DataTree) -> list[str]:
     """Descriptions of the differences in versions, device and precision between a map and this process."""
-    from jaxgran.maps.dataset import made_with
+    from jaxgran.maps.provenance import made_with
 
     here = made_with()
-    names = [name for name in here if name.startswith("version_") or name in ("device", "precision", "commit")]
+    names = [
+        name for name in here if name.startswith("version_") or name in ("device", "precision", "commit", "code_digest")
+    ]
     return [
         f"{name.replace('_', ' ')} {data.attrs[name]} there, {here[name]} here"
         for name in names

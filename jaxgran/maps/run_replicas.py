@@ -8,12 +8,10 @@ import math
 import warnings
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, UInt32
 
@@ -22,18 +20,14 @@ from jaxgran.dynamics.threads import in_threads
 from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.cluster import run_on_cluster
+from jaxgran.maps.cluster import Provenance, run_on_cluster
 from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.status import Status
 from jaxgran.sampling.batch import AdvanceWrapper, ObserveBatch, advance_batch, reporting, stack
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.steady_state import prepare_batch, sample_batch
-from jaxgran.sampling.timestep import COARSE_TIMESTEP
-
-_REPEATED = Status.capacity, Status.nonfinite  # a jammed packing would be jammed again
 
 
 def run_replicas(
@@ -43,6 +37,7 @@ def run_replicas(
     checkpoint: Checkpoint | None = None,
     scheduler: str | None = None,
     record: AdvanceWrapper | None = None,
+    made: Provenance | None = None,
 ) -> Generator[tuple[Key, Replica | None]]:
     """Run every replica of a map and yield its key and result when its batch is done; None if it was given up.
 
@@ -54,13 +49,16 @@ def run_replicas(
       scheduler: address of a Dask scheduler, whose workers run the batches instead of this process. They
         keep journals if they can access the folder of the checkpoint. ``report`` is then called after whole batches.
       record: wraps the function that advances a sampled batch, but not the one of its preparation. It has an effect
-        only with one worker.
+        only with one worker, and each of its batches is one replica.
+      made: receives what the workers of a cluster computed with.
     """
     tasks, flows = remaining_batches(settings, workers, checkpoint), settings.flows()
+    if record is not None:  # a recorder follows one replica
+        tasks = [[key] for task in tasks for key in task]
     calls = [(settings, task, None if checkpoint is None else checkpoint.journal_path(task)) for task in tasks]
     report = report or (lambda _: None)
     if scheduler is not None:
-        outcomes = run_on_cluster(scheduler, _run_task, calls)
+        outcomes = run_on_cluster(scheduler, _run_task, calls, made)
     elif workers > 1:
         outcomes = in_threads(_run_task, calls, workers, report)
     else:
@@ -95,20 +93,10 @@ def _run_task(
     report: Callable[[Advance], None] | None = None,
     record: AdvanceWrapper | None = None,
 ) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved.
-
-    A replica whose time step was too long is run once more, from another packing and with half the time step, and the
-    better result is kept.
-    """
-    measured = _measured if record is None else partial(_measured, record=record)
+    """Prepare and sample the replicas of one batch; a batch that does not fit into memory is halved."""
     advance = _reporting(task, report)
     try:
-        done = measured(settings, task, advance if journal is None else Journal(journal, task, advance))
-        repeated = [key for key, replica in done if replica.status in _REPEATED]
-        if not repeated:
-            return done
-        second = dict(measured(settings, repeated, _reporting(repeated, report), refinement=2))
-        return [(key, min(one, second.get(key, one), key=lambda replica: replica.status)) for key, one in done]
+        return _measured(settings, task, advance if journal is None else Journal(journal, task, advance), record)
     except CorruptFile:
         assert journal is not None
         journal.unlink(missing_ok=True)
@@ -130,26 +118,20 @@ def _reporting(task: Sequence[Key], report: Callable[[Advance], None] | None) ->
 
 
 @persistent_jit
-def _key(seed: Array, point: Array, refinement: Array) -> UInt32[Array, "2"]:
-    """The random key of a replica, as numbers; another one for its second run."""
-    key = jax.random.fold_in(jax.random.key(seed), point)
-    return jax.random.key_data(jnp.where(refinement > 1, jax.random.fold_in(key, refinement), key))
+def _key(seed: Array, point: Array) -> UInt32[Array, "2"]:
+    """The random key of a replica, as numbers."""
+    return jax.random.key_data(jax.random.fold_in(jax.random.key(seed), point))
 
 
 def _measured(
-    settings: MapSettings,
-    task: Sequence[Key],
-    advance: ObserveBatch,
-    refinement: int = 1,
-    record: AdvanceWrapper | None = None,
+    settings: MapSettings, task: Sequence[Key], advance: ObserveBatch, record: AdvanceWrapper | None = None
 ) -> list[tuple[Key, Replica]]:
-    """Prepare and sample the replicas of a batch, with time steps divided by ``refinement``."""
+    """Prepare and sample the replicas of a batch."""
     flows = settings.flows()
-    flow = stack([replace(flows[point], timestep=flows[point].timestep / refinement) for point, _ in task])
-    keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point, refinement) for point, seed in task]))
-    coarse = COARSE_TIMESTEP / refinement
+    flow = stack([flows[point] for point, _ in task])
+    keys = jax.device_put(np.stack([_key(settings.first_seed + seed, point) for point, seed in task]))
     grains = settings.grains_of(flow.grains, len(task))
-    batch = prepare_batch(flow, keys, settings.equilibrate, advance, coarse, grains, numerics=settings.numerics)
+    batch = prepare_batch(flow, keys, settings.equilibrate, advance, grains=grains, numerics=settings.numerics)
     strain_before = batch.strain
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)

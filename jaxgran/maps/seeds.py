@@ -44,7 +44,7 @@ def seed_variables(
     status                status of the replica
     strain                sampled strain
     equilibration_strain  strain before the sample
-    sample_timestep       time step of the sample, shorter than asked for where a replica was retried
+    sample_timestep       time step of the sample
     NAME                  average of each observable, also of the user's, over the replica; only if the map has
                           several seeds, and NaN from the status ``infeasible`` on
     ====================  ===========================================================================================
@@ -62,11 +62,10 @@ def seed_variables(
         if settings.seeds > 1 and replica.status < GIVEN_UP:
             for name, value in replica.sample.averages.items():
                 values[name][key] = value
-    retried = "time step of the sample, shorter than asked for where a replica was retried"
     about = {
         "strain": (strain, {"long_name": "sampled strain", "units": "1"}),
         "equilibration_strain": (equilibration, {"long_name": "strain sheared before the sample", "units": "1"}),
-        "sample_timestep": (timestep, {"long_name": retried, "units": "1 / shear rate"}),
+        "sample_timestep": (timestep, {"long_name": "time step of the sample", "units": "1 / shear rate"}),
     }
     variables = {"status": grid.variable(statuses, {"long_name": "status", **STATUS_FLAGS}, "seed")}
     variables |= {name: grid.variable(column, attrs, "seed") for name, (column, attrs) in about.items()}

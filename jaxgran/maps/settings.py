@@ -15,7 +15,7 @@ import numpy as np
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
 from jaxgran.maps.own_names import require_observe
-from jaxgran.maps.parameters import BY_POINT, MapParameters
+from jaxgran.maps.parameters import BY_POINT, MapParameters, default
 from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
@@ -70,8 +70,6 @@ class MapSettings(MapParameters):
         self._require_diameters()
         self._require_part()
         flows = stack_of_any_size(self._checked_flows())
-        if self.engine is not None:
-            select_engine(flows, self.numerics, option="" if self.observe is None else "observe")
         if self.observe is not None:
             require_observe(self.observe, self._checked_flows()[0])
         shortest, longest = (float(limit(flow.timestep for flow in self._checked_flows())) for limit in (min, max))
@@ -122,6 +120,11 @@ class MapSettings(MapParameters):
     def _timesteps(self) -> tuple[float, ...]:
         return self.axes.get("timestep", (self.timestep,))  # type: ignore[arg-type]
 
+    def require_engine(self) -> None:
+        """Raise an InputError if the engine that is asked for cannot run this map here."""
+        if self.engine is not None:
+            select_engine(self.flows()[0], self.numerics, option="" if self.observe is None else "observe")
+
     def _require_by_point(self, name: str, points: int) -> None:
         """Raise an InputError unless what is given by point is given for all points, and not as a list too."""
         values = getattr(self, f"{name}_by_point")
@@ -143,6 +146,9 @@ class MapSettings(MapParameters):
         if self.diameters is None:
             return
         own_grains(self.diameters)  # type: ignore[arg-type]
+        if self.polydispersity != default("polydispersity"):
+            reason = "must be left out where `diameters` are given"
+            raise refused("polydispersity", self.polydispersity, reason)
         if any(size % len(self.diameters) for size in self.sizes):
             sizes = ", ".join(map(str, self.sizes))
             reason = f"must be a list whose length divides the number of grains, {sizes}"

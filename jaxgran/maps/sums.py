@@ -11,6 +11,7 @@ from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import flattened
+from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import GIVEN_UP, Status
@@ -59,6 +60,10 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
     status, strain, area = (
         numbers[name].values.reshape(shape) for name in ("seeds/status", "seeds/equilibration_strain", "sums/area")
     )
+    flags = numbers["seeds/status"].attrs  # those of the file, which an earlier version may have written
+    for value, name in zip(flags["flag_values"], flags["flag_meanings"].split(), strict=True):
+        own = Status[name] if name in Status.__members__ else NOT_RUN
+        status = np.where(numbers["seeds/status"].values.reshape(shape) == value, own, status)
     sums = numbers["sums/tally"].values
     sums = sums.reshape(*shape, *sums.shape[-2:])
     dtype, own_sums = np.dtype(str(data.attrs["precision"])), sums_by_name(settings)

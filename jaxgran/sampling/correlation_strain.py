@@ -8,9 +8,14 @@ this law with the correlation of measured series.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+
+from jaxgran.model.status import Status
 
 RELAXATION_STRAIN = 0.5  # strain in which the contact network adapts to a new time step
 FEWEST_CORRELATION_STRAINS = 4.0  # of a sample; a shorter one gets the status ``short_sample``
@@ -21,7 +26,7 @@ _WAVE = 0.35  # correlation strain of the longest waves over γ̇ L √(ρ/p)
 
 def flow_correlation_strain(
     averages: Mapping[str, ArrayLike], grains: int, mass: ArrayLike, area: ArrayLike, shear_rate: ArrayLike
-) -> np.ndarray:
+) -> Any:
     """Correlation strain of a flow: max(nT/τ, 0.35 γ̇ L √(ρ/p)), and at least that of the contact network.
 
     Args:
@@ -32,13 +37,21 @@ def flow_correlation_strain(
       shear_rate: γ̇, in 1/t.
 
     Returns:
-      Strain, of the shape of the arguments. Measured correlations are 0.2 to 3 times this. Where an average is not a
-      positive number, it is that of the contact network.
+      Strain, of the shape of the arguments, of JAX where the averages are. Measured correlations are 0.2 to 3 times
+      this. Where an average is not a positive number, it is that of the contact network.
     """
+    xp: Any = jnp if isinstance(averages["pressure"], jax.Array) else np
     temperature, pressure, shear_stress = (
-        np.asarray(averages[name], float) for name in ("granular_temperature", "pressure", "shear_stress")
+        xp.asarray(averages[name], float) for name in ("granular_temperature", "pressure", "shear_stress")
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        heating = grains / np.asarray(area) * temperature / shear_stress
-        waves = _WAVE * np.asarray(shear_rate) * np.sqrt(np.asarray(mass) / pressure)
-    return np.maximum(RELAXATION_STRAIN, np.fmax(*(np.where(np.isfinite(x), x, 0.0) for x in (heating, waves))))
+        heating = grains / xp.asarray(area) * temperature / shear_stress
+        waves = _WAVE * xp.asarray(shear_rate) * xp.sqrt(xp.asarray(mass) / pressure)
+    return xp.maximum(RELAXATION_STRAIN, xp.fmax(*(xp.where(xp.isfinite(x), x, 0.0) for x in (heating, waves))))
+
+
+def length_status(strain: Any, correlation_strain: Any) -> Any:
+    """``short_sample`` where a sampled strain is below ``FEWEST_CORRELATION_STRAINS``, otherwise ``ok``."""
+    xp = jnp if isinstance(strain, jax.Array) else np
+    short = strain < FEWEST_CORRELATION_STRAINS * correlation_strain
+    return xp.where(short, Status.short_sample.value, Status.ok.value)

@@ -47,7 +47,7 @@ from jaxgran.dynamics.tally import Tally
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.sampling.prediction import size_classes
-from jaxgran.sampling.sample import Sample
+from jaxgran.sampling.sample import Sample, durations
 from jaxgran.statistics import Estimates, standard_errors
 from jaxgran.theory.enskog import CollisionalTransfer, collisional_transfer, mixture_transfer
 from jaxgran.theory.mixture import mixture_of
@@ -86,7 +86,7 @@ def measured_over_enskog(
       collisions or of the dissipation rate of elastic grains.
     """
     sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *(seed.tally for seed in seeds))
-    return standard_errors(partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums)
+    return standard_errors(partial(_factors, flow, grains, np.asarray(seeds[0].area)), sums, durations(seeds))
 
 
 def _factors(flow: ShearFlow, grains: Grains | None, area: np.ndarray, tally: Tally) -> dict[str, np.ndarray]:

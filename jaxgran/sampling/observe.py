@@ -3,7 +3,7 @@
 import hashlib
 import re
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
 from jaxgran.contact.network import Contacts
@@ -70,7 +71,7 @@ def require_units(units: Any, names: Collection[str]) -> None:
 
 
 def digest_of(observe: Observable, flow: ShearFlow) -> str:
-    """A hash of what a function computes in a flow: its jaxpr, the values of the constants in it, and its results."""
+    """A hash of what a function computes in a flow: jaxpr, constants of it and of what it calls, and results."""
 
     def without(state: State) -> Any:
         return without_contacts(partial(_observe_step, observe, flow, state), state.positions.dtype)
@@ -78,9 +79,27 @@ def digest_of(observe: Observable, flow: ShearFlow) -> str:
     jaxpr, results = jax.make_jaxpr(without, return_shape=True)(_abstract_state(flow.grains))
     text = re.sub(" at 0x[0-9a-f]+", "", f"{jaxpr} {results}")  # addresses of functions
     digest = hashlib.sha256(text.encode())
-    for constant in jaxpr.consts:
-        digest.update(np.asarray(constant).tobytes())
+    for constant in _constants(jaxpr):
+        digest.update(f"{constant.dtype} {constant.shape}".encode() + constant.tobytes())
     return digest.hexdigest()[:16]
+
+
+def _constants(part: Any) -> Iterator[np.ndarray]:
+    """The arrays in a jaxpr, in the jaxprs of its equations and in their other parameters."""
+    if isinstance(part, ClosedJaxpr):
+        yield from (np.asarray(constant) for constant in part.consts)
+        yield from _constants(part.jaxpr)
+    elif isinstance(part, Jaxpr):
+        for equation in part.eqns:
+            yield from (np.asarray(x.val) for x in equation.invars if isinstance(x, Literal))
+            for _, parameter in sorted(equation.params.items()):
+                yield from _constants(parameter)
+        yield from (np.asarray(x.val) for x in part.outvars if isinstance(x, Literal))
+    elif isinstance(part, (tuple, list)):
+        for one in part:
+            yield from _constants(one)
+    elif isinstance(part, (np.ndarray, jax.Array)):
+        yield np.asarray(part)
 
 
 def _observe_step(observe: Observable, flow: ShearFlow, state: State, contacts: Contacts, impulses: Array) -> Any:

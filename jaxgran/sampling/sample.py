@@ -31,9 +31,10 @@ from jaxgran.model.display import Row, arrays, display_methods, rounded, statuse
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
 from jaxgran.sampling.averages import averages
+from jaxgran.sampling.correlation_strain import flow_correlation_strain, length_status
 from jaxgran.sampling.observables import OBSERVABLES, Averages
 from jaxgran.sampling.observe import Observable, advance_and_observe
-from jaxgran.statistics import Estimates, correlation_length, error_correlation, standard_errors
+from jaxgran.statistics import Estimates, correlation_length, error_correlation, merged_blocks, standard_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -109,7 +110,7 @@ class Sample(Averages, Indexable):
 
     @property
     def status(self) -> Int[Array | np.ndarray, "*replicas"]:
-        """The worst status, see ``Tally.outcome``."""
+        """The worst status, see ``Tally.outcome``; ``short_sample`` below four correlation strains."""
         return self._total.outcome
 
     @property
@@ -193,7 +194,7 @@ def observed_estimates(
     sums = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *parts)
     total = jax.tree.map(lambda x: x.sum(axis=(0, 1)), sums)
     structure = jax.tree.structure(jax.eval_shape(estimate_of_sums, *total))
-    values, errors = standard_errors(leaves_by_number, sums)
+    values, errors = standard_errors(leaves_by_number, sums, durations(seeds))
     return structure.unflatten(values.values()), structure.unflatten(errors.values())
 
 
@@ -204,11 +205,11 @@ def estimates(seeds: Sequence[Sample]) -> tuple[Estimates, Estimates]:
     deviation over the blocks.
     """
     average, sums = _stacked(seeds)
-    values, errors = standard_errors(average, sums)
+    values, errors = standard_errors(average, sums, durations(seeds))
     by_block = average(sums)
     extremes = {name: by_block[name] for name, one in OBSERVABLES.items() if one.extreme}
     largest = {name: np.asarray(x.max()) for name, x in extremes.items()}
-    spread = {name: np.asarray(x.std()) for name, x in extremes.items()}
+    spread = {name: np.asarray(x.std() if x.size > 1 else np.nan) for name, x in extremes.items()}
     return values | largest, errors | spread
 
 
@@ -221,14 +222,16 @@ def relative_error(measured: Sample) -> float:
 
 
 def correlation_strains(seeds: Sequence[Sample]) -> Estimates:
-    """Strain of one independent sample, for every average over replicas of one flow with equal sampled strains.
+    """Strain of one independent sample, for every average over replicas of one flow.
 
     The sampled strain of all replicas over this strain is the effective sample size. A correlation shorter than a block
-    cannot be resolved: the result is then the strain of a block.
+    of the longest replica cannot be resolved: the result is then the strain of this block.
     """
     average, sums = _stacked(seeds)
-    lengths = correlation_length(average, sums)
-    block = np.mean(sums.duration) * np.asarray(seeds[0].shear_rate)
+    strains = durations(seeds)
+    lengths = correlation_length(average, sums, strains)
+    count = merged_blocks(strains, *sums.duration.shape).sum()
+    block = np.sum(sums.duration) / count * np.asarray(seeds[0].shear_rate)
     return {name: length * block for name, length in lengths.items() if not OBSERVABLES[name].extreme}
 
 
@@ -240,7 +243,12 @@ def error_correlation_of(seeds: Sequence[Sample], first: str, second: str) -> fl
         found = average(sums)
         return {name: found[name] for name in (first, second)}
 
-    return float(error_correlation(pair, sums)[0, 1])
+    return float(error_correlation(pair, sums, durations(seeds))[0, 1])
+
+
+def durations(seeds: Sequence[Sample]) -> np.ndarray:
+    """The sampled time of each replica, (seeds,)."""
+    return np.array([np.sum(seed.tally.duration) for seed in seeds])
 
 
 def _stacked(seeds: Sequence[Sample]) -> tuple[Callable[[Tally], dict[str, Array]], Tally]:
@@ -345,7 +353,8 @@ def _require_sheared_state(blocks: int, flow: ShearFlow, state: State, strain: A
 def _sample(
     flow: ShearFlow, numerics: Numerics, state: State, strain: Array, blocks: int, observe: Observable | None = None
 ) -> tuple[State, Sample]:
-    return _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
+    end, measured = _sample_blocks(flow, numerics, state, _steps_of_blocks(flow, strain, blocks), observe)
+    return end, _with_length(measured, end)
 
 
 def _steps_of_blocks(flow: ShearFlow, strain: float | Array, blocks: int) -> Int[Array, " blocks"]:
@@ -382,9 +391,20 @@ def _sample_with_callback(
         measured = _sample_one_block(flow, numerics, state, jnp.asarray([steps]), observe)
         state, part = waited(measured)
         parts.append(part)
-        if callback(state, _joined(parts)):
+        if callback(state, _with_length(_joined(parts), state)):
             break
-    return state, _joined(parts)
+    return state, _with_length(_joined(parts), state)
+
+
+def _with_length(measured: Sample, state: State) -> Sample:
+    """The sample with the status ``short_sample`` in its last block where it is short, see ``correlation_strain``."""
+    tally, grains = measured.tally, measured.grains
+    total = averages(tally.total(axis=0), measured.area, grains, measured.shear_rate)
+    mass = jnp.sum(state.grains.masses)
+    correlation = flow_correlation_strain(total, grains, mass, measured.area, measured.shear_rate)
+    status = length_status(jnp.sum(tally.duration) * measured.shear_rate, correlation)
+    last = jnp.maximum(tally.status[-1], jnp.asarray(status, tally.status.dtype))
+    return replace(measured, tally=replace(tally, status=jnp.asarray(tally.status).at[-1].set(last)))
 
 
 def _joined(parts: list[Sample]) -> Sample:

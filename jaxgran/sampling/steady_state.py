@@ -13,7 +13,8 @@ differ by less than four standard errors of the noise about a linear trend.
 
 A chunk lasts a quarter of the correlation strain, which is measured in the first chunks. So the preparation takes at
 least three correlation strains. A sample lasts six, unless its strain is given; below four its status is
-``short_sample``.
+``short_sample``. A sample that ends when its estimated error is small lasts at least twice as long: of shorter ones, it
+would select those that underestimate their error.
 """
 
 from collections.abc import Mapping
@@ -46,17 +47,16 @@ from jaxgran.sampling.batch import (
     stack,
 )
 from jaxgran.sampling.correlation_strain import (
-    FEWEST_CORRELATION_STRAINS,
     LEAST_SAMPLE,
     RELAXATION_STRAIN,
     SAMPLE_CORRELATION_STRAINS,
     flow_correlation_strain,
+    length_status,
 )
 from jaxgran.sampling.packing import pack, require_room
 from jaxgran.sampling.prediction import predicted
 from jaxgran.sampling.sample import BLOCKS, Sample, check_precision, relative_error
 from jaxgran.sampling.timestep import (
-    COARSE_TIMESTEP,
     bounded_coarse_timestep,
     check_timestep,
     expected_temperature,
@@ -159,7 +159,6 @@ def prepare_batch(
     keys: Array,
     equilibrate: float | None = None,
     advance: AdvanceBatch = advance_batch,
-    coarse_timestep: float = COARSE_TIMESTEP,
     grains: Grains | None = None,
     numerics: Numerics = DEFAULT_NUMERICS,
 ) -> Batch:
@@ -174,7 +173,7 @@ def prepare_batch(
     state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep(numerics.engine))
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
-    coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, coarse_timestep, grains))
+    coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains=grains))
     predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
     each = for_replicas(numerics, len(status))
     batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))
@@ -198,19 +197,23 @@ def sample_batch(
       batch: prepared replicas.
       strain: strain to sample, or None for six correlation strains of each flow, at least 8.
       advance: advances the batch.
-      error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica is
-        doubled until it is reached, up to ``LONGEST_STRAIN`` or 32 correlation strains. None samples ``strain`` only.
+      error: target for the relative standard error of each of ``ERROR_OBSERVABLES``. The strain of a replica begins
+        with twice the one without a target, and is doubled until the target is reached, up to ``LONGEST_STRAIN`` or 32
+        correlation strains, where its status is ``strain_limit``. None samples ``strain`` only.
     """
     strains = (
         np.maximum(LEAST_SAMPLE, SAMPLE_CORRELATION_STRAINS * batch.correlation_strain)
         if strain is None
         else np.full_like(batch.correlation_strain, strain)
     )
+    if error is not None and strain is None:
+        strains = 2 * strains
     longest = np.maximum(LONGEST_STRAIN, LONGEST_CORRELATION_STRAINS * batch.correlation_strain)
+    imprecise = np.zeros(len(strains), bool)
     batch, tally = _blocks(batch, strains, BLOCKS, advance)
     while error is not None:
-        worst = np.array([relative_error(one) for one in _as_sample(batch, tally)])
-        extended = (worst > error) & (2 * strains <= longest) & (batch.status < GIVEN_UP)
+        imprecise = np.array([relative_error(one) for one in _as_sample(batch, tally)]) > error
+        extended = imprecise & (2 * strains <= longest) & (batch.status < GIVEN_UP)
         if not extended.any():
             break
         batch, more = _blocks(batch, np.where(extended, strains, 0), BLOCKS // 2, advance)
@@ -218,9 +221,9 @@ def sample_batch(
         tally = jax.tree.map(partial(_where_replica, extended), _doubled(tally, more), tally)
     sample = _as_sample(batch, tally)
     batch = batch._replace(correlation_strain=_correlation_strain(batch, _averages(batch, sample._total)))
-    short = strains < FEWEST_CORRELATION_STRAINS * batch.correlation_strain
-    of_length = np.where(short, Status.short_sample, Status.ok)
-    return batch._replace(status=np.maximum.reduce([batch.status, of_length, sample.status])), sample
+    of_length = length_status(strains, batch.correlation_strain)
+    of_error = np.where(imprecise, Status.strain_limit, Status.ok)
+    return batch._replace(status=np.maximum.reduce([batch.status, of_length, of_error, sample.status])), sample
 
 
 def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains | None = None) -> State:

@@ -192,7 +192,8 @@ def _temperatures(unknowns: Float[Array, "3 classes"]) -> Float[Array, "3 classe
 def _newton(function, start):
     """Root of `function` by Newton's method with a bounded step.
 
-    It stops after the first step below the square root of machine epsilon, as convergence is quadratic, or at a NaN.
+    It stops after the first step below the square root of machine epsilon, as convergence is quadratic. The root is NaN
+    if no step is below it.
     """
     tolerance = jnp.finfo(start.dtype).eps ** 0.5
 
@@ -208,7 +209,8 @@ def _newton(function, start):
         return unknowns - step * jnp.minimum(1, _LARGEST_STEP / step_size), step_size, iteration + 1
 
     infinity = jnp.full((), jnp.inf, start.dtype)
-    return jax.lax.while_loop(unfinished, iterate, (start, infinity, 0))[0]
+    unknowns, step_size, _ = jax.lax.while_loop(unfinished, iterate, (start, infinity, 0))
+    return jnp.where(step_size <= tolerance, unknowns, jnp.nan)
 
 
 def _dense_linear_solve(linear, target):

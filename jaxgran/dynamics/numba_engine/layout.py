@@ -43,6 +43,11 @@ INFEASIBLE, CAPACITY, NONFINITE = int(Status.infeasible), int(Status.capacity), 
 FAILED = int(Status.failed)
 
 
+def record_numbers(grains: int) -> int:
+    """Numbers of a record; contacts of discs form a planar graph."""
+    return RECORD_HEAD + (RECORD_OF_GRAIN + 3 * RECORD_OF_CONTACT) * grains
+
+
 class Flow(NamedTuple):
     """Numbers of a flow that do not change: side of the cell, shear rate, dt, θ, 1 + α, tolerance, most iterations."""
 

@@ -1,0 +1,31 @@
+"""What the numbers of a map were computed with: precision, device, platform, versions, and a hash of the sources."""
+
+import os
+import platform
+from collections.abc import Mapping
+
+from jaxgran import environment
+from jaxgran.cache.persistent_jit import sources_digest
+
+_PACKAGES = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
+DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
+"""Packages on whose versions the numbers depend, bit for bit."""
+
+
+def made_with() -> dict[str, str]:
+    """Precision, device, platform, versions, sources and commit of this process."""
+    return {
+        "precision": environment.precision(),
+        "device": environment.devices()[0],
+        "platform": f"{environment.system()}, {os.cpu_count()} cores",
+        "python": platform.python_version(),
+        "commit": environment.commit(),
+        "code_digest": sources_digest(),
+        **{f"version_{name.replace('-', '_')}": number for name, number in environment.versions(_PACKAGES).items()},
+    }
+
+
+def versions_of(made: Mapping[str, str]) -> dict[str, str]:
+    """The versions and sources on which the numbers depend, of what ``made_with`` returns or a file has."""
+    names = ("code_digest", *(f"version_{name}" for name in DECIDING))
+    return {name: made[name] for name in names if name in made}
