@@ -65,9 +65,9 @@ NEEDS_EVENTS = (
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
     """Raise an InputError unless this is one flow, one state of it and a number of time steps."""
     require_state(flow, state)
-    require_match(flow, state)
     words = f"a whole number of 0 to {MAX_STEPS}"
     require_number("steps", steps, lambda x: (x.dtype.kind in "iu") & (x >= 0) & (x <= MAX_STEPS), words)
+    require_match(flow, state)
 
 
 def advance_by_jax(
