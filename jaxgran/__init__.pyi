@@ -15,7 +15,7 @@ from .contact.projected_methods import (
 from .contact.residuals import ContactResiduals, contact_residuals
 from .contact.solve_contacts import ContactSolution, solve_contacts
 from .dynamics.advance import advance
-from .dynamics.engine import Jax, Numba, Pallas
+from .dynamics.engine import Jax, Numba
 from .dynamics.jax_engine import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
@@ -48,7 +48,6 @@ from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
 from .reference.law import ConstitutiveLaw, Rheology, constitutive_law
 from .reference.validity import Validity, validity
-from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
 from .sampling.sample import Sample, sample
 from .sampling.steady_state import heated, prepare
@@ -61,7 +60,6 @@ __all__ = [
     "ContactNetwork",
     "ContactResiduals",
     "ContactSolution",
-    "Cooling",
     "DelassusProblem",
     "Fields",
     "FisherInformation",
@@ -75,7 +73,6 @@ __all__ = [
     "Nesterov",
     "Numba",
     "Page",
-    "Pallas",
     "ProjectedMethod",
     "RestitutionFit",
     "Rheology",
@@ -94,7 +91,6 @@ __all__ = [
     "cluster_shares",
     "constitutive_law",
     "contact_residuals",
-    "cooling",
     "count_events",
     "dominating_errors",
     "enskog_factors",

@@ -36,7 +36,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import theory
 from jaxgran.plotting.map_figures import FIGURES
-from jaxgran.sampling import free_cooling, sample, steady_state
+from jaxgran.sampling import sample, steady_state
 from jaxgran.sampling.observe import observed_shapes
 
 GRAINS = 32
@@ -69,7 +69,6 @@ def nothing_runs() -> Iterator[None]:
             (fields, "_fields_at"),
             (steady_state, "prepare_batch"),
             (steady_state, "_heated"),
-            (free_cooling, "_cooling"),
             (ratio_map_module, "run_replicas"),
         ):
             patch.setattr(module, name, would_run)
@@ -124,7 +123,6 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "heated temperature": lambda x: jg.heated(flow(), KEY, x),
     "own_grains diameters": jg.own_grains,
     "own_grains masses": lambda x: jg.own_grains([1.0, 2.0], x),
-    "cooling times": lambda x: jg.cooling(jg.ShearFlow(**FLOW, shear_rate=0.0), SEEN.state, x),
     "snapshot_series strain": lambda x: jg.snapshot_series(flow(), SEEN.state, x, 4),
     "snapshot_series count": lambda x: jg.snapshot_series(flow(), SEEN.state, 1.0, x),
     "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.lucy(1.0)),
@@ -143,8 +141,6 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "prepare grains": lambda x: jg.prepare(flow(), KEY, grains=x),
     "pack grains": lambda x: jg.pack(flow(), KEY, x),
     "heated grains": lambda x: jg.heated(flow(), KEY, grains=x),
-    "cooling flow": lambda x: jg.cooling(x, SEEN.state, [1.0]),
-    "cooling state": lambda x: jg.cooling(flow(), x, [1.0]),
     "sample observe": lambda x: jg.sample(flow(), SEEN.state, 1.0, observe=x),
     "sample callback": lambda x: jg.sample(flow(), SEEN.state, 1.0, callback=x),
     "sample flow": lambda x: jg.sample(x, SEEN.state, 1.0),

@@ -3,7 +3,7 @@
 from typing import Literal
 
 Activation = Literal["midpoint", "touching"]
-EngineName = Literal["auto", "numba", "jax", "pallas"]  # on the command line and in files
+EngineName = Literal["auto", "numba", "jax"]  # on the command line and in files
 FileFormat = Literal["png", "pdf", "svg"]  # of a figure
 SolverName = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
 
