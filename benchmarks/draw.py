@@ -27,7 +27,7 @@ from benchmarks import (
 from benchmarks.output import RESULTS, Output
 from benchmarks.pages import read
 from jaxgran.maps.results import open_map
-from jaxgran.theory.corrected_shear import MEASURED_LAWS
+from jaxgran.reference.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "collapse": lambda: collapse.draw(read("collapse")["rows"]),

@@ -114,8 +114,8 @@ BENCHMARKS = (
     ),
     Benchmark(
         "dense_rheology",
-        "Do dense flows obey one friction law of the inertial number, and with which exponents?",
-        (20, 3),
+        "What are friction and pressure of 1000 grains between ν = 0.79 and 0.83?",
+        (10, 1),
         ("dense_rheology.json",),
     ),
     Benchmark(
@@ -130,13 +130,6 @@ BENCHMARKS = (
         "Are dense flows compatible with the exponents that are published for the jamming transition?",
         (0.1, 0.1),
         ("dense_limit.json", "dense_limit.png"),
-    ),
-    Benchmark(
-        "closure_study",
-        "How well does a closure fitted to a map predict points that it has not seen?",
-        (2, 1),
-        ("closure.json",),
-        (Option("dataset", "that of a map, as NetCDF; without it, one is made", Path),),
     ),
     Benchmark(
         "flow_picture",
@@ -291,39 +284,6 @@ BENCHMARKS = (
         "What do derivatives of a flow cost, and how fast do they grow with strain?",
         (5, 1),
         ("gradients.json", "gradients.png"),
-        one_core=True,
-    ),
-    Benchmark(
-        "fit_coverage",
-        "How often do 95 % intervals of a restitution fitted to tracks cover it, at which noise?",
-        (40, 1.5),
-        ("fit_coverage.json",),
-        (Option("--runs", "number of trajectories", int),),
-        one_core=True,
-    ),
-    Benchmark(
-        "tracked_discs",
-        "What is the restitution of the discs in this file, which a camera could have made?",
-        (0.3, 0.3),
-    ),
-    Benchmark(
-        "fit_lammps",
-        "Is the restitution of soft discs that LAMMPS has moved found from its dump?",
-        (10, 1),
-        ("fit_lammps.json",),
-    ),
-    Benchmark(
-        "fit_map",
-        "In which flows do the intervals of a fitted restitution cover it, and where do clusters bias them?",
-        (12, 1),
-        ("fit_map.json",),
-        one_core=True,
-    ),
-    Benchmark(
-        "fit_design",
-        "How well is the error of a restitution known before tracks are measured, and how far apart should frames be?",
-        (6, 1),
-        ("fit_design.json",),
         one_core=True,
     ),
     Benchmark(

@@ -20,7 +20,7 @@ import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_maps import known_closure, ratio_dataset, with_timesteps
+from made_up_maps import ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
 from synthetic import one_sentence, refused, snapshot_of
 
@@ -129,8 +129,6 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "gaussian width": lambda x: jg.fields_at(SEEN, POINT, jg.gaussian(x)),
     "lucy radius": lambda x: jg.fields_at(SEEN, POINT, jg.lucy(x)),
     "heaviside radius": lambda x: jg.fields_at(SEEN, POINT, jg.heaviside(x)),
-    "friction_law largest_inertial_number": lambda x: jg.friction_law(dense_map(), x),
-    "friction_law smallest_packing_fraction": lambda x: jg.friction_law(dense_map(), 0.3, x),
 }
 OBJECTS: dict[str, Callable[[Any], Any]] = {
     "polydisperse key": lambda x: jg.polydisperse(4, 0.2, x),
@@ -151,7 +149,6 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "snapshot_series state": lambda x: jg.snapshot_series(flow(), x, 1.0, 4),
     "fields_at seen": lambda x: jg.fields_at(x, POINT, jg.lucy(1.0)),
     "fields_at graining": lambda x: jg.fields_at(SEEN, POINT, x),
-    "friction_law data": jg.friction_law,
     **{
         name: getattr(jg, name)
         for name in (
@@ -160,18 +157,10 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
             "ratio_against_timestep",
             "theory_errors",
             "cluster_shares",
-            "friction_figure",
         )
     },
     "save_figures data": lambda x: jg.save_figures(x, "none/map"),
 }
-
-
-def dense_map() -> xr.Dataset:
-    """A map with what a friction law needs, and too few dense points for one."""
-    names = ("inertial_number", "macroscopic_friction")
-    data = ratio_dataset(alphas=2, nus=2)
-    return data.assign({f"{name}{end}": data.force_ratio for name in names for end in ("", "_stderr")})
 
 
 NEVER: list[Any] = [  # no argument of any function
@@ -236,9 +225,6 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
     assert jg.solve_contacts(row, 1.0).impulses.tolist() == pytest.approx([4 / 3, 2 / 3], rel=1e-3)
     pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
     assert jg.contact_residuals(pair, [0.5]).natural_map == 0
-    points = jg.predict(known_closure(), [0.5, 0.6], [0.7, 0.6])
-    arrays = jg.predict(known_closure(), np.array([0.5, 0.6]), np.array([0.7, 0.6]))
-    assert points.pressure.tolist() == arrays.pressure.tolist()
     with pytest.raises(WouldRun):
         jg.fields_at(SEEN, [[1.0, 2.0]], jg.lucy(1.0))
 
@@ -384,7 +370,6 @@ def test_what_is_no_map_is_refused_by_every_figure_and_as_a_file(kind: str, tmp_
     for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
         assert "must be a ratio map" in verdict(draw, data)
     assert "must be a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
-    assert "must be a ratio map" in verdict(jg.friction_law, data)
     data.to_netcdf(tmp_path / "no.nc", engine="netcdf4")
     for words in (["plot", "no.nc"], ["map", "--from-map", "no.nc"]):
         outcome = jaxgran(tmp_path, *words)

@@ -7,10 +7,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from flows import GRAINS, flow_of
-from made_up_maps import known_closure
 from synthetic import refused, snapshot_of
 
 import jaxgran as jg
@@ -51,21 +49,15 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "contact_residuals": lambda x, _: jg.contact_residuals(PAIR, x * jnp.ones(2)).natural_map,
     "validity": lambda x, _: jg.validity(x, 0.7).measured,
     "constitutive_law": lambda x, _: jg.constitutive_law()(x, 0.7, 2 * x),
-    "predict": lambda x, _: jg.predict(known_closure(), x, 0.7),
-    "restitution_from_stresses": lambda x, _: jg.restitution_from_stresses(known_closure(), 0.7, x, 1.0).restitution,
 }
 NOT_BACKWARD = {"advance", "sample", "snapshot_series", "count_events", "pack"}
 # Those take long to trace with their tangents; the derivatives of an advance are in the tests of the gradients.
-LONG = {"count_events", "pack", "restitution_from_stresses", "advance", "sample", "snapshot_series"}
+LONG = {"count_events", "pack", "advance", "sample", "snapshot_series"}
 
 REFUSED: dict[str, Callable[[Any, State], Any]] = {
     "prepare": lambda x, _: jg.prepare(replace(FLOW, restitution=x), KEY),
     "heated": lambda x, _: jg.heated(FLOW, KEY, grains=jg.own_grains(x * jnp.ones(COUNT))),
-    "tracks_of_states": lambda x, state: jg.tracks_of_states(
-        np.arange(2.0), jax.tree.map(lambda y: y[None] * x, state)
-    ),
-    "fit_restitution": lambda x, _: jg.fit_restitution(jg.Tracks(*[x] * 7)),
-    "fisher_information": lambda x, _: jg.fisher_information(replace(FLOW, restitution=x), 20, jg.TrackNoise(1e-3)),
+    "fit_trajectory": lambda x, state: jg.fit_trajectory(replace(FLOW, restitution=x), state, state, 9, 1e-3, 1e-3),
     "flow_figure": lambda x, _: jg.flow_figure(replace(seen(), restitution=x)),
     "Sample": lambda x, state: jg.sample(replace(FLOW, restitution=x), state, 0.1, blocks=2)[1].errors(),
     "ratio_map": lambda x, _: jg.ratio_map([x], [0.6]),
@@ -73,11 +65,11 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 
 # Classes, and what takes datasets and files.
 WITHOUT_ARRAYS = """
-    ContactNetwork ContactResiduals ContactSolution DelassusProblem FisherInformation TrackNoise Closure Fields
-    Grains InputError JaxMdSpace RestitutionFit ShearFlow Snapshot State Status Tally Trajectory averages_against_grains
-    cluster_shares dominating_errors explore Page fit_closure friction_figure friction_law
-    ratio_against_timestep ratio_contours ratio_curves BarzilaiBorwein Jacobi JacobiCount JacobiDiagonal Nesterov
-    ProjectedMethod Jax Numba Tracks merge_maps open_map read_tracks read_trajectory save_figures theory_errors
+    ContactNetwork ContactResiduals ContactSolution DelassusProblem Fields
+    TrajectoryFit Grains InputError JaxMdSpace ShearFlow Snapshot State Status Tally Trajectory averages_against_grains
+    cluster_shares dominating_errors explore Page
+    ratio_against_timestep ratio_contours ratio_curves BarzilaiBorwein Jacobi Nesterov
+    ProjectedMethod Jax Numba merge_maps open_map read_trajectory save_figures theory_errors
     enskog_factors write_trajectory Validity ConstitutiveLaw Rheology
 """
 
