@@ -101,18 +101,6 @@ BENCHMARKS = (
         ("dissipation.json", "dissipation.png"),
     ),
     Benchmark(
-        "approach_speeds",
-        "How fast do colliding grains approach, beside grains with independent velocities?",
-        (10, 0.5),
-        ("approach_speeds.json", "approach_speeds.png"),
-    ),
-    Benchmark(
-        "quick_map",
-        "What does `jaxgran map` draw when it is given no option?",
-        (0.5, 0.4),
-        ("quick_curves.png", "quick_errors.png"),
-    ),
-    Benchmark(
         "dense_rheology",
         "What are friction and pressure of 1000 grains between ν = 0.79 and 0.83?",
         (10, 1),
@@ -139,31 +127,11 @@ BENCHMARKS = (
         (Option("--colour", "what colours the grains", choices=("speed", "pressure")),),
     ),
     Benchmark(
-        "fields_picture",
-        "What do the coarse-grained fields of a dense flow look like?",
-        (1.5, 0.5),
-        ("fields.json", "fields.png"),
-        one_core=True,
-    ),
-    Benchmark(
         "collapse",
         "What does a time step do to an inelastic collapse of three and four discs?",
         (1, 0.4),
         ("collapse.json", "collapse.png"),
         one_core=True,
-    ),
-    Benchmark(
-        "pulse",
-        "What does a loose contact solve do to a packing that is pushed at one side?",
-        (2, 0.3),
-        ("pulse.json", "pulse.png"),
-        one_core=True,
-    ),
-    Benchmark(
-        "binary_force",
-        "How much does the force ratio depend on what counts as the binary force?",
-        (0.5, 0.2),
-        ("binary_force.json",),
     ),
     Benchmark(
         "contact_duration",
@@ -218,7 +186,6 @@ BENCHMARKS = (
         "Which contact problems is a solver compared on, and what are their solutions?",
         (4, 0.5),
         ("collection.h5", "collection.json"),
-        (Option("--fclib", "folder for a file of each problem in the layout of FCLIB", Path),),
         one_core=True,
         module="collection.make",
     ),
@@ -260,16 +227,10 @@ BENCHMARKS = (
         ("size_limits.json",),
     ),
     Benchmark(
-        "layering",
-        "Do flows separate into layers where their friction grows with the packing fraction?",
-        (40, 0.5),
-        ("layering.json", "layering.png"),
-    ),
-    Benchmark(
         "coverage",
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
         (6, 0.5),
-        ("coverage.json", "coverage.png"),
+        ("coverage.json",),
         one_core=True,
     ),
     Benchmark(
@@ -285,12 +246,5 @@ BENCHMARKS = (
         (5, 1),
         ("gradients.json", "gradients.png"),
         one_core=True,
-    ),
-    Benchmark(
-        "mutants",
-        "Do the tests find mistakes of one word, made in a copy of the code?",
-        (20, 2),
-        ("mutants.json",),
-        (Option("--only", "one mistake alone, by its name; writes nothing"),),
     ),
 )

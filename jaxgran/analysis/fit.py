@@ -87,7 +87,8 @@ def fit_trajectory(
     Raises:
       InputError: (a ValueError) the arguments are not windows of this flow; a window is longer than the horizon, at
         which the rms of ∂(position)/∂α of its grains is one diameter; there are more ``events``; or the misfit stays
-        above what the noise explains. Or JAX traces an argument.
+        above what the noise explains, as in a minimum with other collisions, which a noisy start makes likely. Or JAX
+        traces an argument.
     """
     require_untraced("fit_trajectory", "call it with numbers", flow, start, end)
     require_number("restitution", flow.restitution, lambda x: (x > 0) & (x < 1), "one first guess between 0 and 1")
