@@ -24,14 +24,12 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
 from jaxgran.dynamics.tally import Tally
 from jaxgran.maps.status_report import BadPoints
 from jaxgran.model.status import Status
-from jaxgran.plotting.drawing import LABEL_SIZE, TWO_COLUMNS, styled
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.correlation_strain import flow_correlation_strain
 from jaxgran.sampling.sample import BLOCKS, ERROR_OBSERVABLES
@@ -80,7 +78,6 @@ def run(output: Output, error: float | None = None) -> None:
         print(f"{row['observable']:21s} strain/correlation strain {row['strain']}, seeds {row['seeds']}: {shares}")
     head = {"plan": plan._asdict(), "seconds": time.perf_counter() - start, "over_flows": over_flows}
     output.write_rows("coverage", head, "rows", rows)
-    output.write_picture(draw(over_flows), "coverage")
 
 
 def flow_rows(plan: Plan, alpha: float, nu: float, rng: np.random.Generator) -> Iterator[dict]:
@@ -194,25 +191,3 @@ def means_over_flows(rows: list[dict]) -> Iterator[dict]:
         same = [row for row in rows if tuple(row[key] for key in keys) == values]
         means = {name: round(float(np.mean([row[name] for row in same])), 4) for name in ("covered", "width")}
         yield dict(zip(keys, values, strict=True)) | means | {"least_covered": min(row["covered"] for row in same)}
-
-
-STYLES = {1: ("0.0", "o"), 2: ("0.4", "s"), 8: ("0.65", "^")}  # of the seeds drawn: grey and marker
-
-
-@styled
-def draw(rows: list[dict]) -> Figure:
-    """Share of intervals that cover the mean against the sampled strain; the accepted shares are shaded."""
-    figure = Figure(figsize=(TWO_COLUMNS, 2.1), layout="constrained")
-    panels = figure.subplots(1, len(OBSERVABLES), sharey=True)
-    for axes, name in zip(panels, OBSERVABLES, strict=True):
-        axes.axhspan(*HOLDS, color="0.9", zorder=0)
-        for seeds, (grey, marker) in STYLES.items():
-            here = [row for row in rows if (row["observable"], row["seeds"]) == (name, seeds)]
-            label = f"{seeds} seed{'s' if seeds > 1 else ''}"
-            x, y = ([row[key] for row in here] for key in ("strain", "covered"))
-            axes.plot(x, y, color=grey, marker=marker, label=label)
-        axes.set(xticks=STRAINS, ylim=(0.8, 1.0), title=name.replace("_", " "))
-    figure.supxlabel("sampled strain / correlation strain", fontsize=LABEL_SIZE)
-    panels[0].set_ylabel("coverage of 95 % intervals")
-    panels[0].legend(loc="lower right")
-    return figure

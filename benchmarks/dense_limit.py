@@ -23,16 +23,17 @@ import json
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.optimize
 from matplotlib.figure import Figure
 
 from benchmarks.least_squares import weighted_fit
 from benchmarks.output import RESULTS, Output, rounded
-from jaxgran.inference.friction_law import fit_power_law
 from jaxgran.plotting.drawing import NU_LABEL, SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
 
 EXPONENTS = (0.40, 0.35)
 LOOSEST = (0.79, 0.81, 0.82)  # smallest packing fraction of a fit with a free exponent
 ROUNDS = 30  # of the effective variance
+LEAST_EXPONENT, LARGEST_EXPONENT = 0.05, 4.0  # of a free fit; an exponent at a bound is not determined
 
 
 class Fit(NamedTuple):
@@ -74,14 +75,44 @@ def free_fit(points: dict[str, np.ndarray], ordinate: str) -> dict[str, Any]:
     number, number_error = points["inertial_number"], points["inertial_number_stderr"]
     exact = np.zeros_like(number)
     error, sign = points.get(f"{ordinate}_stderr", exact), -1.0 if ordinate == "packing_fraction" else 1.0
-    law = fit_power_law(number, points[ordinate], number_error, error, exact, sign)
-    (offset, _, exponent), (offset_error, _, exponent_error) = law.parameters.tolist(), law.standard_errors.tolist()
+    (offset, exponent), (offset_error, exponent_error), chi_squared = fit_power_law(
+        number, points[ordinate], number_error, error, sign
+    )
     found = {
         "offset": [offset, offset_error],
         "exponent": [exponent, exponent_error],
-        "reduced_chi_squared": law.chi_squared,
+        "reduced_chi_squared": chi_squared,
     }
     return rounded(found, 4)
+
+
+def fit_power_law(
+    x: np.ndarray, y: np.ndarray, x_error: np.ndarray, y_error: np.ndarray, sign: float
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Offset and exponent of y = offset ± coefficient · x^exponent, their standard errors, and the reduced χ²."""
+    scale = x.max()  # so that coefficient and offset are of similar size
+    parameters, covariance, deviation = np.array([y[x.argmin()], max(np.ptp(y), 1e-3), 0.5]), np.eye(3), y_error
+
+    def law(number, offset, coefficient, exponent):
+        return offset + sign * coefficient * number**exponent
+
+    def slopes(number, _, coefficient, exponent):
+        power = number**exponent
+        return np.stack([np.ones_like(number), sign * power, sign * coefficient * power * np.log(number)], axis=-1)
+
+    for _ in range(ROUNDS):
+        previous, (_, coefficient, exponent) = parameters, parameters
+        slope = sign * coefficient * exponent * (x / scale) ** (exponent - 1) / scale
+        deviation = np.sqrt(np.maximum(y_error**2 + (slope * x_error) ** 2, 1e-18))
+        bounds = [-np.inf, 0.0, LEAST_EXPONENT], [np.inf, np.inf, LARGEST_EXPONENT]
+        parameters, covariance = scipy.optimize.curve_fit(
+            law, x / scale, y, previous, deviation, absolute_sigma=True, bounds=bounds, jac=slopes
+        )
+        if np.allclose(parameters, previous, rtol=1e-6):
+            break
+    chi_squared = float(np.sum(((y - law(x / scale, *parameters)) / deviation) ** 2) / (len(x) - 3))
+    errors = np.sqrt(np.diagonal(covariance) * max(1.0, chi_squared))
+    return (float(parameters[0]), float(parameters[2])), (float(errors[0]), float(errors[2])), chi_squared
 
 
 def free_fits(points: dict[str, np.ndarray]) -> list[dict[str, Any]]:

@@ -26,7 +26,7 @@ from jaxgran.environment import usable_cores
 from jaxgran.maps.presets import PRESETS
 from jaxgran.maps.schema import flattened
 from jaxgran.plotting.drawing import SMALL_SIZE, TWO_COLUMNS, curve_styles, label_log_axis, styled
-from jaxgran.theory.corrected_shear import (
+from jaxgran.reference.corrected_shear import (
     MEASURED_LAWS,
     CorrelationLaws,
     corrected_shear,
@@ -318,15 +318,9 @@ def corrected_theory(data: xr.DataTree, points: Points, others: dict[str, Points
         "length_and_dense_pairs": replace(laws, pairs=np.asarray(laws.pairs) * [0, 1, 1]),
         "length_and_pairs": laws,
     }
-    closure = jg.fit_closure(data)
     for name, some in {"fitted_map": points, **others}.items():
         within = {"all": some["nu"] > 0, "to_0.75": some["nu"] <= DENSEST, "core": in_core(some)}
-        prediction = jg.predict(closure, some["alpha"], some["nu"])
-        errors = {key: misfits(one, some) for key, one in variants.items()} | {
-            "17_coefficients": {
-                key: np.log(np.asarray(getattr(prediction, key)) / some[key]) for key in ("pressure", "shear_stress")
-            }
-        }
+        errors = {key: misfits(one, some) for key, one in variants.items()}
         found[name] = {
             part: {"points": int(chosen.sum())}
             | {

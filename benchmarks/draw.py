@@ -1,6 +1,6 @@
 """Figures of committed results, drawn again without a measurement: ``python -m benchmarks draw``.
 
-Pictures of single flows (``fields``, ``flow``) and of the quick map keep no result, so their benchmarks draw them.
+The picture of a single flow (``flow``) keeps no result, so its benchmark draws it.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,12 +11,10 @@ from matplotlib.figure import Figure
 from benchmarks import (
     collapse,
     contact_duration,
-    coverage,
     dissipation,
     enskog_factors,
     gradients,
     paper,
-    pulse,
     scaling,
     size_figures,
     speed_vs_accuracy,
@@ -27,7 +25,7 @@ from benchmarks import (
 from benchmarks.output import RESULTS, Output
 from benchmarks.pages import read
 from jaxgran.maps.results import open_map
-from jaxgran.theory.corrected_shear import MEASURED_LAWS
+from jaxgran.reference.corrected_shear import MEASURED_LAWS
 
 PICTURES: dict[str, Callable[[], Figure]] = {
     "collapse": lambda: collapse.draw(read("collapse")["rows"]),
@@ -40,9 +38,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "size_study": lambda: size_figures.draw_sizes(read("size_study")["flows"]),
     "size_study_waves": lambda: size_figures.draw_waves(read("size_study")["flows"]),
     "enskog_factors": lambda: enskog_factors.draw(enskog_factors.FULL, read("enskog_factors")["rows"]),
-    "coverage": lambda: coverage.draw(read("coverage")["over_flows"]),
     "gradients": lambda: gradients.draw(read("gradients")["flows"]),
-    "pulse": lambda: pulse.draw(read("pulse")["rows"], read("pulse")["run"]["discs_along"]),
     "scaling": lambda: scaling.draw(read("scaling"), read("scaling")["exponents"]),
     "speed_vs_accuracy": lambda: speed_vs_accuracy.draw(read("peers"), read("speed_vs_accuracy")),
     "stability": lambda: stability.draw(read("stability")["cells"]),

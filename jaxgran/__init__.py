@@ -21,8 +21,8 @@ Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis.
     for row in zip(alphas, nus, samples.force_ratio, samples.errors()["force_ratio"]):
         print("α = {:.1f}, ν = {:.1f}: {:.3f} ± {:.3f}".format(*row))
 
-``sample``, ``advance``, ``snapshot_series`` and ``cooling`` take a batch directly, and so do ``prepare`` and ``heated``
-with a batch of keys. ``jax.vmap`` and ``jax.lax.map`` of them do the same. Leave ``engine`` out: on a processor the
+``sample``, ``advance`` and ``snapshot_series`` take a batch directly, also by ``jax.vmap`` and ``jax.lax.map``;
+``prepare`` and ``heated`` take a batch of keys. Leave ``engine`` out: on a processor the
 numba engine is then chosen, also under a plain ``vmap``, and nothing is faster there. A ``vmap`` with
 ``axis_name="jaxgran_replica"`` takes the engine ``Jax`` in lockstep, for accelerators, far slower on a processor.
 

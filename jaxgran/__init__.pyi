@@ -2,31 +2,22 @@
 
 from .analysis.coarse_graining import gaussian, heaviside, lucy
 from .analysis.fields import Fields, fields_at, grid
+from .analysis.fit import TrajectoryFit, fit_trajectory
 from .analysis.jax_md_space import JaxMdSpace, jax_md_space
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
     BarzilaiBorwein,
     Jacobi,
-    JacobiCount,
-    JacobiDiagonal,
     Nesterov,
     ProjectedMethod,
 )
 from .contact.residuals import ContactResiduals, contact_residuals
 from .contact.solve_contacts import ContactSolution, solve_contacts
 from .dynamics.advance import advance
-from .dynamics.engine import Jax, Numba, Pallas
+from .dynamics.engine import Jax, Numba
 from .dynamics.jax_engine import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
-from .inference.closure import Closure, predict
-from .inference.closure_fit import fit_closure
-from .inference.experiment_design import FisherInformation, TrackNoise, fisher_information
-from .inference.friction_law import friction_law
-from .inference.restitution import RestitutionFit, fit_restitution
-from .inference.stress_inversion import restitution_from_stresses
-from .io.track_files import read_tracks
-from .io.tracks import Tracks, tracks_of_states
 from .io.trajectory import Trajectory, read_trajectory, write_trajectory
 from .maps.merge import merge_maps
 from .maps.ratio_map import ratio_map
@@ -40,14 +31,12 @@ from .page.document import Page
 from .page.explore import explore
 from .plotting.enskog_factors import enskog_factors
 from .plotting.flow import flow_figure
-from .plotting.friction import friction_figure
 from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
 from .reference.law import ConstitutiveLaw, Rheology, constitutive_law
 from .reference.validity import Validity, validity
-from .sampling.free_cooling import Cooling, cooling
 from .sampling.packing import pack
 from .sampling.sample import Sample, sample
 from .sampling.steady_state import heated, prepare
@@ -55,28 +44,21 @@ from .sampling.steady_state import heated, prepare
 __version__: str
 __all__ = [
     "BarzilaiBorwein",
-    "Closure",
     "ConstitutiveLaw",
     "ContactNetwork",
     "ContactResiduals",
     "ContactSolution",
-    "Cooling",
     "DelassusProblem",
     "Fields",
-    "FisherInformation",
     "Grains",
     "InputError",
     "Jacobi",
-    "JacobiCount",
-    "JacobiDiagonal",
     "Jax",
     "JaxMdSpace",
     "Nesterov",
     "Numba",
     "Page",
-    "Pallas",
     "ProjectedMethod",
-    "RestitutionFit",
     "Rheology",
     "Sample",
     "ShearFlow",
@@ -84,26 +66,20 @@ __all__ = [
     "State",
     "Status",
     "Tally",
-    "TrackNoise",
-    "Tracks",
     "Trajectory",
+    "TrajectoryFit",
     "Validity",
     "advance",
     "averages_against_grains",
     "cluster_shares",
     "constitutive_law",
     "contact_residuals",
-    "cooling",
     "count_events",
     "enskog_factors",
     "explore",
     "fields_at",
-    "fisher_information",
-    "fit_closure",
-    "fit_restitution",
+    "fit_trajectory",
     "flow_figure",
-    "friction_figure",
-    "friction_law",
     "gaussian",
     "grid",
     "heated",
@@ -115,21 +91,17 @@ __all__ = [
     "own_grains",
     "pack",
     "polydisperse",
-    "predict",
     "prepare",
     "ratio_against_timestep",
     "ratio_contours",
     "ratio_curves",
     "ratio_map",
-    "read_tracks",
     "read_trajectory",
-    "restitution_from_stresses",
     "sample",
     "save_figures",
     "snapshot_series",
     "solve_contacts",
     "theory_errors",
-    "tracks_of_states",
     "validity",
     "write_trajectory",
 ]

@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.model.display import with_error
-from jaxgran.theory.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
+from jaxgran.reference.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})

@@ -17,7 +17,7 @@ import typer.main
 from made_up_maps import with_variables
 from synthetic import random_replica
 
-from jaxgran.cli import app, fit, info, measure, merge, run
+from jaxgran.cli import app, info, measure, merge, run
 from jaxgran.maps import results
 from jaxgran.maps.replica import Advance
 from jaxgran.model.status import Status
@@ -45,7 +45,7 @@ def jaxgran(folder: Path, *arguments: str) -> Outcome:
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["jaxgran", *arguments])
         patch.setattr(typer.main, "get_command", commands)
-        for module in (fit, info, measure, merge, run):
+        for module in (info, measure, merge, run):
             patch.setattr(module, "configured_jax", lambda: jax)
         app.main()
     return Outcome(end.value.code or 0, out.getvalue(), err.getvalue())

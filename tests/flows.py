@@ -1,7 +1,7 @@
 """Flows of ``GRAINS`` grains that tests share; engines that are compiled once for them; when two runs are the same."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -13,7 +13,6 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.jax_engine import advance_by_jax
-from jaxgran.dynamics.pallas_engine import kernel
 from jaxgran.dynamics.tally import INSTANT, TABLE, Tally
 from jaxgran.maps import batches
 from jaxgran.maps.replica import Key, Replica
@@ -83,7 +82,7 @@ def in_batches(size: int, settings: MapSettings, **options: Any) -> dict[Key, Re
 
 # Fixtures
 
-ENGINES = ("numba", "pallas", "jax")
+ENGINES = ("numba", "jax")
 
 
 @pytest.fixture(scope="session")
@@ -99,7 +98,7 @@ def run():
 
 @pytest.fixture(scope="session")
 def engines(run):
-    """``engines[name](flow, state, steps, solver=EXACT)``: the advance by an engine, compiled; pallas interpreted."""
+    """``engines[name](flow, state, steps, solver=EXACT)``: the advance by an engine, compiled."""
 
     def compiled(advance):
         call = jax.jit(advance)
@@ -109,10 +108,8 @@ def engines(run):
 
         return run
 
-    interpreted = partial(kernel.advance_by_pallas, interpret=True)
     return {
         "numba": compiled(lambda flow, solver, state, steps: advance(flow, state, steps, solver=solver)),
-        "pallas": compiled(interpreted),
         "jax": lambda flow, state, steps, solver=EXACT: run(flow, state, steps, solver=solver),
     }
 

@@ -1,58 +1,15 @@
-"""Made-up maps: of a known closure, of a known excess of the force ratio, and of known laws of dense flow."""
-
-from functools import cache
+"""Made-up maps of a known excess of the force ratio."""
 
 import numpy as np
 import xarray as xr
 
-from jaxgran.inference.closure import LAWS, Closure, Law, predict
 from jaxgran.plotting.enskog_factors import PANELS
 from jaxgran.sampling.enskog_factors import RATES
 
-ALPHA, NU = (0.2, 0.35, 0.5, 0.65, 0.8), (0.5, 0.6, 0.65, 0.7, 0.75, 0.79)
-SCATTER = 0.02
-RELATIVE = {"pressure": 0.04, "macroscopic_friction": 0.01, "force_ratio": 0.015}  # standard errors of a made-up map
-TRUE = {
-    "pressure": (7.0, -5.0, 1.5, -1.0, 2.0, -0.6),
-    "macroscopic_friction": (-1.6, 1.0, -0.3, 0.5, -0.5, 0.13),
-    "force_ratio": (-9.0, 8.5, 4.0, 4.7, -4.0),
-}
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
 DIMS = ("packing_fraction", "restitution")
 STDERR = 0.02  # of every stress in a map of the theory, relative
-FRICTION, FRACTION = (0.10, 0.60, 0.40), (0.84, -0.25, 0.80)
-
-
-def known_closure(scatter: float = 0.0) -> Closure:
-    """Return the closure of the true coefficients, with no error but the scatter."""
-    laws = [Law(np.array(c), np.zeros((len(c), len(c))), np.array(scatter)) for c in TRUE.values()]
-    spans = np.array([ALPHA[0], ALPHA[-1]]), np.array([NU[0], NU[-1]])
-    return Closure(*laws, *spans, np.array(0.8386), np.array(1e-3))
-
-
-@cache
-def exact() -> np.ndarray:
-    """Pressure, friction and force ratio of the true closure on the map, (3, ν, α)."""
-    seen = predict(known_closure(), np.array(ALPHA), np.array(NU)[:, None])
-    return np.stack([seen.pressure, seen.shear_stress / seen.pressure, seen.force_ratio])
-
-
-def made_up_map(seed: int | None = 0, scatter: float = 0.0, noise: float = 1.0) -> xr.Dataset:
-    """Return a map that obeys the true closure, with Gaussian errors of its logarithms."""
-    random, dims = np.random.default_rng(seed), ("packing_fraction", "restitution")
-    variables = {}
-    for name, value in zip(LAWS, exact(), strict=True):
-        error = noise * RELATIVE[name]
-        shift = random.normal(size=value.shape) * np.hypot(error, scatter) if seed is not None else 0.0
-        variables[name] = (dims, value * np.exp(shift))
-        variables[f"{name}_stderr"] = (dims, value * np.exp(shift) * error)
-    data = xr.Dataset(
-        variables, {"packing_fraction": list(NU), "restitution": list(ALPHA)}, {"timestep": 1e-3, "format_version": 2}
-    )
-    shear_error = np.hypot(RELATIVE["pressure"], RELATIVE["macroscopic_friction"]) * noise
-    data["shear_stress"] = data.pressure * data.macroscopic_friction
-    return data.assign(shear_stress_stderr=data.shear_stress * shear_error)
 
 
 def excess_of(restitution: np.ndarray, packing_fraction: np.ndarray) -> np.ndarray:
@@ -104,43 +61,6 @@ def with_grains(data: xr.Dataset, *grains: int, noise: float = 0.01) -> xr.Datas
         parts.append(part.assign(status=data.status.copy(deep=True)))
     several = xr.concat(parts, xr.Variable("grains", list(grains)))
     return several.assign_attrs(data.attrs | {"grains": list(grains)})
-
-
-def power(number: np.ndarray, law: tuple[float, float, float]) -> np.ndarray:
-    return law[0] + law[1] * number ** law[2]
-
-
-def dense_map(
-    seed: int | None = 0,
-    noise: float = 0.02,
-    alphas: tuple[float, ...] = (0.2, 0.5),
-    nus: int = 8,
-    shift: float = 0.0,
-    correlation: float = 0.0,
-) -> xr.Dataset:
-    """Return a map that obeys both laws, with Gaussian errors; each next restitution has `shift` more friction.
-
-    The errors of inertial number and friction have the given correlation.
-    """
-    nu = np.linspace(0.75, 0.836, nus)
-    number = np.repeat((((FRACTION[0] - nu) / -FRACTION[1]) ** (1 / FRACTION[2]))[:, None], len(alphas), axis=1)
-    friction = power(number, FRICTION) + shift * np.arange(len(alphas))
-    errors = noise * number, noise * friction
-    if seed is not None:
-        random = np.random.default_rng(seed)
-        first, other = random.normal(size=(2, *number.shape))
-        second = correlation * first + np.sqrt(1 - correlation**2) * other
-        number, friction = number + errors[0] * first, friction + errors[1] * second
-    dims = ("packing_fraction", "restitution")
-    variables = {
-        "inertial_number": (dims, number),
-        "inertial_number_stderr": (dims, errors[0]),
-        "macroscopic_friction": (dims, friction),
-        "macroscopic_friction_stderr": (dims, errors[1]),
-        "diagnostics/friction_error_correlation": (dims, np.full(number.shape, correlation)),
-        "status": (dims, np.zeros(number.shape, int)),
-    }
-    return xr.Dataset(variables, {"packing_fraction": nu, "restitution": list(alphas)})
 
 
 def with_variables(data: xr.DataTree, *names: str) -> xr.DataTree:

@@ -6,21 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import random_instant, random_replica, random_tally, snapshot_of
+from synthetic import random_instant, random_replica
 
-from jaxgran.dynamics.engine import DEFAULT_NUMERICS
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.flow import ShearFlow
 from jaxgran.model.status import Status
-from jaxgran.page.film import Film
 
 MARKUP = '<script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">&amp; <b>bold</b>'
 """An attribute that would run as a script, if it were markup."""
@@ -49,22 +44,6 @@ def page_map() -> xr.DataTree:
     own = data.force_ratio.assign_attrs(long_name=MARKUP, units="<i>σ</i>") ** 2
     data["own <u>name</u>"] = own.assign_attrs(long_name=MARKUP, units="<i>σ</i>")
     return data
-
-
-def made_up_film(frames: int = 5) -> Film:
-    """A film of a few grains that stay where they are, with the sums of random steps between its frames."""
-    rng, film, steps = np.random.default_rng(0), Film(), iter(range(frames))
-    flow = jax.tree.map(lambda x: np.array([x]), ShearFlow(16, 0.1, 0.8, 1e-3))
-    seen = snapshot_of(rng.uniform(0, 5, (1, 16, 2)), [[(0, 1, 2.0), (1, 2, 1.0), (5, 6, 1.0)]], side=5.0)
-    frame = jax.tree.map(lambda x: x[0], seen)
-    state: Any = SimpleNamespace(side=np.array([5.0]))
-    recorder: Any = SimpleNamespace(recording=lambda advance: advance)
-    advance = film.recording(recorder)(lambda flow, numerics, state, steps: (state, random_tally(rng, 1)))
-    for step in steps:
-        if step:
-            advance(flow, DEFAULT_NUMERICS, state, np.array([1]))
-        film.frames.keep(frame, 10 * step)
-    return film
 
 
 @contextmanager

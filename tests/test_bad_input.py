@@ -22,7 +22,7 @@ import xarray as xr
 from command_line import POINTS, Outcome, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_maps import known_closure, ratio_dataset, with_timesteps
+from made_up_maps import ratio_dataset, with_timesteps
 from matplotlib.figure import Figure
 from synthetic import one_sentence, refused, snapshot_of
 
@@ -38,7 +38,7 @@ from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.plotting import theory
 from jaxgran.plotting.map_figures import FIGURES
-from jaxgran.sampling import free_cooling, sample, steady_state
+from jaxgran.sampling import sample, steady_state
 from jaxgran.sampling.observe import observed_shapes
 
 GRAINS = 32
@@ -71,7 +71,6 @@ def nothing_runs() -> Iterator[None]:
             (fields, "_fields_at"),
             (steady_state, "prepare_batch"),
             (steady_state, "_heated"),
-            (free_cooling, "_cooling"),
             (ratio_map_module, "run_replicas"),
         ):
             patch.setattr(module, name, would_run)
@@ -126,15 +125,12 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "heated temperature": lambda x: jg.heated(flow(), KEY, x),
     "own_grains diameters": jg.own_grains,
     "own_grains masses": lambda x: jg.own_grains([1.0, 2.0], x),
-    "cooling times": lambda x: jg.cooling(jg.ShearFlow(**FLOW, shear_rate=0.0), SEEN.state, x),
     "snapshot_series strain": lambda x: jg.snapshot_series(flow(), SEEN.state, x, 4),
     "snapshot_series count": lambda x: jg.snapshot_series(flow(), SEEN.state, 1.0, x),
     "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.lucy(1.0)),
     "gaussian width": lambda x: jg.fields_at(SEEN, POINT, jg.gaussian(x)),
     "lucy radius": lambda x: jg.fields_at(SEEN, POINT, jg.lucy(x)),
     "heaviside radius": lambda x: jg.fields_at(SEEN, POINT, jg.heaviside(x)),
-    "friction_law largest_inertial_number": lambda x: jg.friction_law(dense_map(), x),
-    "friction_law smallest_packing_fraction": lambda x: jg.friction_law(dense_map(), 0.3, x),
 }
 OBJECTS: dict[str, Callable[[Any], Any]] = {
     "polydisperse key": lambda x: jg.polydisperse(4, 0.2, x),
@@ -145,8 +141,6 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "prepare grains": lambda x: jg.prepare(flow(), KEY, grains=x),
     "pack grains": lambda x: jg.pack(flow(), KEY, x),
     "heated grains": lambda x: jg.heated(flow(), KEY, grains=x),
-    "cooling flow": lambda x: jg.cooling(x, SEEN.state, [1.0]),
-    "cooling state": lambda x: jg.cooling(flow(), x, [1.0]),
     "sample observe": lambda x: jg.sample(flow(), SEEN.state, 1.0, observe=x),
     "sample callback": lambda x: jg.sample(flow(), SEEN.state, 1.0, callback=x),
     "sample flow": lambda x: jg.sample(x, SEEN.state, 1.0),
@@ -157,7 +151,6 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "snapshot_series state": lambda x: jg.snapshot_series(flow(), x, 1.0, 4),
     "fields_at seen": lambda x: jg.fields_at(x, POINT, jg.lucy(1.0)),
     "fields_at graining": lambda x: jg.fields_at(SEEN, POINT, x),
-    "friction_law data": jg.friction_law,
     **{
         name: getattr(jg, name)
         for name in (
@@ -166,18 +159,10 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
             "ratio_against_timestep",
             "theory_errors",
             "cluster_shares",
-            "friction_figure",
         )
     },
     "save_figures data": lambda x: jg.save_figures(x, "none/map"),
 }
-
-
-def dense_map() -> xr.Dataset:
-    """A map with what a friction law needs, and too few dense points for one."""
-    names = ("inertial_number", "macroscopic_friction")
-    data = ratio_dataset(alphas=2, nus=2)
-    return data.assign({f"{name}{end}": data.force_ratio for name in names for end in ("", "_stderr")})
 
 
 NEVER: list[Any] = [  # no argument of any function
@@ -242,9 +227,6 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
     assert jg.solve_contacts(row, 1.0).impulses.tolist() == pytest.approx([4 / 3, 2 / 3], rel=1e-3)
     pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
     assert jg.contact_residuals(pair, [0.5]).natural_map == 0
-    points = jg.predict(known_closure(), [0.5, 0.6], [0.7, 0.6])
-    arrays = jg.predict(known_closure(), np.array([0.5, 0.6]), np.array([0.7, 0.6]))
-    assert points.pressure.tolist() == arrays.pressure.tolist()
     with pytest.raises(WouldRun):
         jg.fields_at(SEEN, [[1.0, 2.0]], jg.lucy(1.0))
 
@@ -390,7 +372,6 @@ def test_what_is_no_map_is_refused_by_every_figure_and_as_a_file(kind: str, tmp_
     for draw in (jg.ratio_curves, jg.ratio_contours, jg.ratio_against_timestep, jg.theory_errors, jg.cluster_shares):
         assert "must be a ratio map" in verdict(draw, data)
     assert "must be a ratio map" in verdict(lambda x: jg.save_figures(x, tmp_path / "map"), data)
-    assert "must be a ratio map" in verdict(jg.friction_law, data)
     data.to_netcdf(tmp_path / "no.nc", engine="netcdf4")
     for words in (["plot", "no.nc"], ["map", "--from-map", "no.nc"]):
         outcome = jaxgran(tmp_path, *words)

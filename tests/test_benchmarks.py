@@ -79,8 +79,8 @@ def test_an_unknown_name_is_refused_and_an_option_belongs_to_its_benchmark() -> 
         with pytest.raises(SystemExit) as end:
             door.parser().parse_args(words)
         assert end.value.code == 2
-    chosen = vars(door.parser().parse_args(["closure_study", "map.nc", "--quick"]))
-    assert chosen["dataset"] == Path("map.nc")
+    chosen = vars(door.parser().parse_args(["reference_map", "--folder", "maps", "--quick"]))
+    assert chosen["folder"] == Path("maps")
 
 
 def test_a_full_run_is_refused_from_a_changed_tree(

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from command_line import jaxgran
-from pages import MARKUP, browser, made_up_film, open_page, page_map
+from pages import MARKUP, browser, open_page, page_map
 
 import jaxgran as jg
 from jaxgran.maps.parameters import RunParameters
@@ -317,26 +317,3 @@ def test_copied_are_the_table_and_a_command_that_runs(map_page, tmp_path: Path, 
     (flow,) = settings.flows()
     assert {name: getattr(flow, name) for name in point} == point
     assert (settings.grains, settings.seeds, settings.activation) == (64, 2, "midpoint")
-
-
-def test_flow_plays_pauses_and_steps(chromium, tmp_path: Path) -> None:
-    made_up_film().page().save(tmp_path / "flow.html")
-    open_page(chromium, tmp_path / "flow.html")
-    strain = chromium.find_element("id", "strain")
-    play, forward, back = (chromium.find_element("id", name) for name in ("play", "forward", "back"))
-    assert strain.text == "strain 0.000, frame 1 of 5" and play.text == "Play"  # the browser asks for no motion
-    forward.click()
-    forward.click()
-    back.click()
-    assert strain.text == "strain 10.000, frame 2 of 5"
-    marked = chromium.execute_script("return element('averages').data.slice(-4).map((one) => one.y[0])")
-    averages = chromium.execute_script("return averages.map((one) => one.values)")
-    assert marked == [one[1] for one in averages] and averages[0][0] is None
-    play.click()
-    assert play.text == "Pause"
-    wait_for(lambda: "frame 4 of 5" in strain.text)
-    play.click()
-    stopped = strain.text
-    time.sleep(0.3)
-    assert strain.text == stopped
-    assert_quiet(chromium)

@@ -29,16 +29,14 @@ from command_line import (
 from drawn import write_without_drawing
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_maps import known_closure, made_up_map
 from matplotlib.figure import Figure
 from PIL import Image
-from synthetic import one_sentence, random_replica
+from synthetic import random_replica
 
 from jaxgran.cli import app, arguments
 from jaxgran.cli import map as map_module
 from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.environment import usable_cores
-from jaxgran.inference import restitution
 from jaxgran.io.trajectory import read_trajectory
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.dataset import NOT_RUN
@@ -110,24 +108,19 @@ MISTAKES = {  # one for each kind of option, check and file
     f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
     "map --error 0.02 --strain 5": "--strain and --error exclude each other",
     "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
-    "map --engine pallas": "engine must be jax or chosen automatically on a CPU, not pallas",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
     f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
     f"{FLOW} --trajectory flow.gsd --frame-strain 0": "--frame-strain must be at least 5e-05, for",
-    f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory, --movie or --page",
+    f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory or --movie",
     f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most the strain between",
-    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory, --movie and --page show one seed: leave out --seeds",
+    f"{FLOW} --movie flow.gif --seeds 2": "--trajectory and --movie show one seed: leave out --seeds",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
     "explore text.nc --output page.nc": "output must be a file name that ends in .html",
     "plot none.nc": "there is no file",
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.83",
-    "fit text.gsd --pressure 3": "--pressure requires a map, and 'text.gsd' is none",
-    "fit text.nc --frame-time 1": "--frame-time requires tracks of discs, and 'text.nc' is a map",
-    "fit text.nc --pressure 3": "--packing-fraction must be given, too",
-    "fit text.gsd --frame-strain 1 --frame-time 1": "--frame-strain and --frame-time exclude each other",
     # as they slip in
     "draw": "there is no command 'draw': see jaxgran --help",
     "mpa": "there is no command 'mpa', perhaps map is meant",
@@ -395,62 +388,6 @@ def rows_of(table: str) -> dict[str, str]:
     return dict(re.split(r"\s{2,}", line.strip()) for line in table.splitlines() if "  " in line.strip())
 
 
-def test_fit_finds_the_restitution_of_a_trajectory(tmp_path: Path, monkeypatch) -> None:
-    jaxgran(tmp_path, *SMALL_RUN, "--trajectory", "flow.gsd", "--frame-strain", "0.02")
-    outcome = jaxgran(tmp_path, "fit", "flow.gsd")
-    assert (outcome.status, outcome.err) == (0, "")
-    rows = rows_of(outcome.out)
-    found, error = map(float, rows["restitution ± standard error"].split(" ± "))
-    assert abs(found - 0.7) < max(0.02, 4 * error)
-    as_json = parsed(jaxgran(tmp_path, "fit", "flow.gsd", "--json").out)
-    assert as_json["recorded_restitution"]["value"] == 0.7
-    assert as_json["restitution"]["value"] == pytest.approx(found, abs=1e-3)
-    monkeypatch.setattr(restitution, "_MOST_STEPS", 1)
-    outcome = jaxgran(tmp_path, "fit", "flow.gsd")
-    assert (outcome.status, outcome.out) == (3, "")
-    assert "did not converge" in outcome.err
-    assert one_sentence(outcome.err.rstrip("\n"))
-
-
-@pytest.fixture(scope="module")
-def known_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("known") / "known.nc"
-    data = made_up_map()
-    flags = {"flag_values": [0], "flag_meanings": "ok"}
-    data = data.assign(status=(data.pressure.dims, np.zeros(data.pressure.shape, int), flags))
-    write_dataset(xr.DataTree(data), path)
-    return path
-
-
-def test_fit_finds_a_restitution_from_the_stresses_of_a_map(known_map: Path, tmp_path: Path) -> None:
-    point = made_up_map().sel(packing_fraction=0.7, restitution=0.65)
-    stresses = ("--pressure", f"{float(point.pressure)}", "--shear-stress", f"{float(point.shear_stress)}")
-    outcome = jaxgran(tmp_path, "fit", str(known_map), "--packing-fraction", "0.7", *stresses)
-    assert outcome.status == 0
-    found, error = outcome.out.splitlines()[-1].removeprefix("restitution ").split(",")[0].split(" ± ")
-    assert abs(float(found) - 0.65) < max(0.05, 4 * float(error))
-
-
-@pytest.fixture
-def known_law(monkeypatch) -> None:
-    """The law of the known map as it is, in place of a fit of it."""
-    errors = {"error": -0.02, "noise": 0.01}
-    names = ("pressure", "shear_stress", "force_ratio")
-    data = xr.Dataset({f"{name}_{kind}": ("point", [error, error]) for name in names for kind, error in errors.items()})
-    monkeypatch.setattr("jaxgran.inference.closure_fit.fit_closure", lambda _: known_closure())
-    monkeypatch.setattr("jaxgran.inference.cross_validation.leave_one_out", lambda _: data)
-
-
-def test_fit_of_a_map_prints_how_well_a_law_describes_it(known_map: Path, known_law, tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path, "fit", str(known_map))
-    assert (outcome.status, outcome.err) == (0, "")
-    for name in ("pressure", "shear stress", "force ratio"):
-        (row,) = (line.split() for line in outcome.out.splitlines() if line.strip().startswith(name))
-        assert row[len(name.split()) :] == ["2", "%", "2", "%", "1", "%"]
-    found = parsed(jaxgran(tmp_path, "fit", str(known_map), "--json").out)
-    assert found["pressure_rms_error"]["value"] == pytest.approx(0.02) and len(found) == 9
-
-
 # Help, completion, colours
 
 
@@ -476,7 +413,7 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
 @pytest.mark.parametrize(
     ("line", "expected"),
     {
-        "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "fit", "info"},
+        "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "info"},
         "jaxgran run --m": {"--movie"},
         "jaxgran map --preset ": {"quick", "paper", "dense"},
     }.items(),

@@ -5,15 +5,13 @@ import json
 from fractions import Fraction
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-from scipy.sparse import csc_array
 
 from benchmarks import networks
-from benchmarks.collection import PATH, Entry, fclib, load
+from benchmarks.collection import PATH, Entry, load
 from benchmarks.collection.certificates import Problem, certificate, delassus, obstacle, obstructed, solved
-from benchmarks.collection.compare import Answer, compare, draw_profile
+from benchmarks.collection.compare import Answer, compare
 from benchmarks.collection.files import write
 from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
@@ -151,26 +149,6 @@ def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold()
             assert obstacle(one.problem, high, low) < 1e-28
 
 
-def test_layout_of_fclib_holds_the_same_problem_in_space(entries, tmp_path):
-    entry = entries[2]
-    fclib.write(tmp_path / "one.hdf5", entry)
-    count = len(entry.problem.approach)
-    with h5py.File(tmp_path / "one.hdf5") as file:
-        local = file["fclib_local"]
-        sizes = {name: int(local[f"W/{name}"][0]) for name in ("m", "n", "nzmax", "nz")}
-        parts = [local[f"W/{name}"][()] for name in ("x", "i", "p")]
-        assert [part.dtype for part in parts] == [np.float64, np.int32, np.int32]
-        assert local["spacedim"][0] == 3 and sizes["m"] == sizes["n"] == 3 * count and sizes["nz"] == -1
-        matrix = csc_array(tuple(parts), shape=(3 * count, 3 * count))
-        assert sizes["nzmax"] == matrix.nnz
-        r, u, q = (file[name][()] for name in ("solution/r", "solution/u", "fclib_local/vectors/q"))
-        assert np.all(local["vectors/mu"][()] == 0) and local["info/title"][()].decode() == entry.name
-    np.testing.assert_allclose(matrix @ r + q, u, atol=1e-14)
-    np.testing.assert_allclose(matrix.toarray()[::3, ::3], entry.matrix.toarray(), atol=1e-14)
-    np.testing.assert_allclose(u[::3], entry.solution.velocities, atol=1e-12)
-    assert np.linalg.eigvalsh(matrix.toarray())[0] > -1e-12
-
-
 def test_solvers_are_judged_by_their_residual_and_not_by_their_word(entries):
     solvers = {
         "right": lambda entry, tolerance: lambda: entry.solution.impulses if entry.solution.feasible else None,
@@ -187,8 +165,3 @@ def test_solvers_are_judged_by_their_residual_and_not_by_their_word(entries):
         )
         assert row.seconds > 0
         assert row.residual < 1e-12 or row.solver in ("wrong", "gives up") or not row.feasible
-    in_time, in_products = draw_profile(rows).axes
-    assert [line.get_label() for line in in_time.lines] == list(solvers)
-    assert [line.get_label() for line in in_products.lines] == ["counting"]
-    ends = {line.get_label(): float(line.get_ydata()[-1]) for line in in_time.lines}
-    assert ends == {"right": 1, "counting": 1, "wrong": 0, "gives up": 0}

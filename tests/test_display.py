@@ -1,6 +1,4 @@
-"""Objects show themselves in one line and in a table of HTML: short for any batch, whole, and without a failure."""
-
-from html.parser import HTMLParser
+"""Objects show themselves in one line: short for any batch, whole, and without a failure."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic import random_tally
 
-from jaxgran.model.display import Row, html_of, text_of, value_text, with_error
+from jaxgran.model.display import value_text, with_error
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -41,48 +39,12 @@ def sample(replicas: int | None = None, status: int = Status.ok) -> Sample:
 MADE = {"ShearFlow": flow, "State": state, "Sample": sample}
 
 
-class Cells(HTMLParser):
-    """The texts of the cells of a table; fails where an element is not closed by its own end."""
-
-    def __init__(self, html: str):
-        super().__init__()
-        self.open: list[str] = []
-        self.rows: list[list[str]] = []
-        self.feed(html)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag, attrs) -> None:
-        self.open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("th", "td"):
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data) -> None:
-        if self.open[-1] in ("th", "td"):
-            self.rows[-1][-1] += data
-
-
-def cells(thing) -> dict[str, list[str]]:
-    """The rows of the table of a thing, by their names."""
-    return {name: rest for name, *rest in Cells(thing._repr_html_()).rows}
-
-
 @pytest.mark.parametrize("name", MADE)
 @pytest.mark.parametrize("replicas", [None, REPLICAS])
-def test_line_and_table_are_short_whole_and_of_the_same_rows(name: str, replicas: int | None) -> None:
-    thing = jax.tree.map(jnp.asarray, MADE[name](replicas))
-    line, rows = repr(thing), cells(thing)
+def test_the_line_is_short_and_whole(name: str, replicas: int | None) -> None:
+    line = repr(jax.tree.map(jnp.asarray, MADE[name](replicas)))
     assert line.startswith(f"{name}(") and line.endswith(")")
     assert "\n" not in line and len(line) < 700
-    assert len(thing._repr_html_()) < 6000
-    shown = [part.split("=")[0].replace("_", " ") for part in line.removeprefix(f"{name}(").split(", ") if "=" in part]
-    assert shown == list(rows)
-    assert all(len(row) == 2 for row in rows.values())
 
 
 def test_one_flow_is_shown_as_it_is_written() -> None:
@@ -92,47 +54,32 @@ def test_one_flow_is_shown_as_it_is_written() -> None:
 
 def test_batch_is_shown_by_its_number_and_range() -> None:
     assert f"restitution=<{REPLICAS} values, 0.1 to 0.9>" in repr(flow(REPLICAS))
-    assert cells(state(REPLICAS))["replicas"][0] == str(REPLICAS)
+    assert f"replicas={REPLICAS}" in repr(state(REPLICAS))
 
 
 def test_state_tells_what_a_picture_of_it_would() -> None:
     one = state()
-    rows = cells(one)
     temperature = np.sum(one.grains.masses[:, None] * one.velocities**2) / (2 * GRAINS)
-    assert float(rows["granular temperature"][0]) == pytest.approx(temperature, rel=1e-5)
     area = np.pi * np.sum(one.grains.radii**2)
-    assert float(rows["packing fraction"][0]) == pytest.approx(area / 81, rel=1e-5)
-    assert rows["precision"][0] == "float64"
+    assert f"packing_fraction={float(f'{area / 81:.6g}')}, granular_temperature={float(f'{temperature:.6g}')}" in repr(
+        one
+    )
+    assert "precision='float64'" in repr(one)
 
 
 def test_sample_shows_its_averages_with_their_errors_and_its_status() -> None:
     one = sample(status=Status.deep_overlap)
-    rows, errors = cells(one), one.errors()
+    errors = one.errors()
     for name in ("force_ratio", "pressure", "granular_temperature"):
         expected = with_error(float(one.averages[name]), float(errors[name]))
-        assert rows[name.replace("_", " ")][0] == expected
         assert f"{name}={expected}" in repr(one)
-    assert rows["status"][0] == "deep_overlap"
-    assert rows["pressure"][1] == "m/t²"
+    assert "deep_overlap" in repr(one)
 
 
 def test_statuses_of_a_batch_are_counted() -> None:
     batch = sample(5)
     batch.tally.status[3, 7] = Status.not_steady
-    assert cells(batch)["status"][0] == "ok (4), not_steady (1)"
-
-
-def test_what_values_hold_is_escaped() -> None:
-    class Wicked:
-        def __repr__(self) -> str:
-            return "<script>alert('&')</script>\n" * 50
-
-    rows = [Row("a<b", Wicked(), "<m>"), Row("text", "</td><td>")]
-    html = html_of("T<", rows, "note & <i>")
-    assert "<script" not in html and "<i>" not in html and "T&lt;" in html
-    assert [row[0] for row in Cells(html).rows] == ["a<b", "text"]
-    assert Cells(html).rows[1][1] == "</td><td>"
-    assert "\n" not in text_of("T", rows) and len(text_of("T", rows)) < 300
+    assert "ok (4), not_steady (1)" in repr(batch)
 
 
 @pytest.mark.parametrize("name", MADE)
@@ -141,15 +88,13 @@ def test_whatever_stands_in_the_place_of_a_number_is_shown(name: str, leaf) -> N
     """JAX fills its trees with axes, shapes and placeholders."""
     odd = jax.tree.map(lambda _: leaf, MADE[name]())
     assert repr(odd).startswith(f"{name}(")
-    Cells(odd._repr_html_())
 
 
 @pytest.mark.parametrize("name", MADE)
 def test_traced_values_are_shown_by_their_type(name: str) -> None:
     seen = []
-    jax.jit(lambda thing: seen.append((repr(thing), thing._repr_html_())))(MADE[name](3))
-    assert "Tracer" in seen[0][0]
-    Cells(seen[0][1])
+    jax.jit(lambda thing: seen.append(repr(thing)))(MADE[name](3))
+    assert "Tracer" in seen[0]
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,6 @@ def test_python_of_a_page_runs(page: str, tmp_path: Path) -> None:
     code = "\n".join(python_of(page))
     script = tmp_path / "page.py"
     script.write_text(code, encoding="utf-8")
-    (tmp_path / "tracked_discs.csv").symlink_to(ROOT / "notebooks" / "tracked_discs.csv")
     environment = os.environ | {"MPLBACKEND": "agg", "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
     done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -32,8 +32,8 @@ from jaxgran.model.status import Status
 
 EPS = np.finfo(float).eps
 # The same steps in one advance and in two, where contacts are listed and solved in another order
-JOINED = {"numba": 1e-7, "pallas": 1e-7, "jax": 1e-10}
-UNCHANGED = {"numba": 0, "pallas": 0, "jax": 4 * EPS}
+JOINED = {"numba": 1e-7, "jax": 1e-10}
+UNCHANGED = {"numba": 0, "jax": 4 * EPS}
 
 
 def test_grain_flies_straight_in_the_laboratory(engine_run, scene):

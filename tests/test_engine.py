@@ -76,10 +76,6 @@ def test_single_precision_that_was_not_asked_for_is_one_warning(flowing) -> None
 
 
 IMPOSSIBLE = {
-    "thread block on a processor": (
-        lambda state: jg.advance(of(), state, STEPS, engine=jg.Pallas()),
-        "on a CPU, not pallas: it is made for NVIDIA GPUs",
-    ),
     "another solver": (
         lambda state: jg.advance(of(), state, STEPS, engine=jg.Numba(), solver=jg.Jacobi()),
         "with the solver jacobi, not numba",
@@ -116,19 +112,6 @@ IMPOSSIBLE = {
             of(), state, 0.1, observe=lambda seen: seen.state.side, engine=jg.Numba(), solver=jg.Jacobi()
         ),
         "with the solver jacobi, not numba",
-    ),
-    "an observable, block by block": (
-        lambda state: jg.sample(
-            of(), state, 0.1, observe=lambda seen: seen.state.side, callback=lambda *_: False, engine=jg.Pallas()
-        ),
-        "on a CPU, not pallas",
-    ),
-    "a sample": (lambda state: jg.sample(of(), state, 0.1, engine=jg.Pallas()), "on a CPU, not pallas"),
-    "a preparation": (lambda _: jg.prepare(of(), jax.random.key(0), engine=jg.Pallas()), "on a CPU, not pallas"),
-    "snapshots": (lambda state: jg.snapshot_series(of(), state, 0.1, 2, engine=jg.Pallas()), "on a CPU, not pallas"),
-    "free cooling": (
-        lambda state: jg.cooling(of(shear_rate=0.0), state, [0.1], engine=jg.Pallas()),
-        "on a CPU, not pallas",
     ),
     "a map": (
         lambda _: jg.ratio_map([0.5], [0.6], engine=jg.Numba(), solver=jg.Nesterov()),

@@ -12,8 +12,6 @@ from flows import GRAINS
 from test_docs import ROOT
 
 import jaxgran as jg
-from jaxgran.analysis.order import pair_correlation
-from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.model.cell import displacement
 from jaxgran.model.state import State
 
@@ -81,23 +79,6 @@ def test_list_of_jax_md_loses_pairs_where_the_box_is_sheared(state: State) -> No
     ours = jg.jax_md_space(state).displacement
     anew = build(ours, box, dr_threshold=0.0, disable_cell_list=True).allocate(state.positions, extra_capacity=GRAINS)
     assert pairs_of(anew.update(sheared.positions, box=sheared_box)) >= pairs_within(sheared, CUTOFF)
-
-
-def test_pair_correlation_of_jax_md_is_ours_smoothed(state: State) -> None:
-    """jax-md sums Gaussians about every pair: those of the bins of our histogram."""
-    from jax_md import quantity
-
-    radii, smoothing, width = np.linspace(1.2, 2.4, 7), 0.1, 5e-4
-    edges = np.arange(0.9, 3.1, width)
-    ours = pair_correlation(snapshot(FLOW, state), edges)
-    area = float(state.side) ** 2
-    count = ours.value * np.pi * np.diff(edges**2) * GRAINS * (GRAINS - 1) / 2 / area  # pairs in a bin
-    kernel = np.exp(-0.5 * ((ours.at - radii[:, None]) / smoothing) ** 2) / radii[:, None]
-    theirs = quantity.pair_correlation(jg.jax_md_space(state).displacement, jnp.asarray(radii), smoothing, eps=0.0)
-    found = np.mean(theirs(state.positions), axis=0)
-    most = np.exp(-0.5) / smoothing * width / 2 / radii[0]  # error of a pair, by the largest slope and half a bin
-    np.testing.assert_allclose(found, 2 / GRAINS * kernel @ count, rtol=0, atol=2 / GRAINS * np.sum(count) * most)
-    assert np.ptp(found) > 0.1 * np.mean(found)
 
 
 @pytest.mark.parametrize("tilt", TILTS)

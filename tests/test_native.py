@@ -1,12 +1,7 @@
-"""Numba engine and thread block are the plain advance: same contacts, same impulses, same sums, same failures.
+"""The numba engine is the plain advance: same contacts, same impulses, same sums, same failures."""
 
-The thread block is interpreted here. That Pallas can lower it for a GPU needs none, and is tested too.
-"""
-
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,17 +12,13 @@ from flows import COUNTS, EXACT, GRAINS, assert_same_state, flow_of
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from jaxgran.contact.projected_methods import BarzilaiBorwein, Nesterov
+from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics import engine as engine_module
-from jaxgran.dynamics.engine import MOST_GRAINS, Jax, Numba, Numerics, Pallas, select_engine
+from jaxgran.dynamics.engine import Numba
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, find_near_pairs, skin_loss
-from jaxgran.dynamics.pallas_engine import kernel
 from jaxgran.dynamics.tally import TABLE, empty_tally
-from jaxgran.model.checks import InputError
-from jaxgran.model.control_flow import AXIS
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -36,9 +27,9 @@ from jaxgran.model.status import Status
 LOOSE = BarzilaiBorwein(1e-6, 10**6)
 
 
-@pytest.fixture(scope="module", params=["numba", "pallas"])
-def native_run(request, engines):
-    return engines[request.param]
+@pytest.fixture(scope="module")
+def native_run(engines):
+    return engines["numba"]
 
 
 def assert_same(ours, plain, atol: float) -> None:
@@ -152,136 +143,6 @@ def test_stiff_clusters_are_solved_as_by_the_plain_advance(run, native_run, heav
     np.testing.assert_allclose(ours[1].impulse, plain[1].impulse, rtol=1e-5)
 
 
-@pytest.fixture
-def gpu(monkeypatch, engines):
-    """Processors that pass for GPUs, with the kernel that is interpreted, and compiled for other tests already."""
-    _forget()
-
-    class Device:
-        platform = "gpu"
-
-    device = Device()
-    monkeypatch.setattr(jax, "devices", lambda *_: [device])
-    monkeypatch.setattr(jax, "default_device", lambda _: nullcontext())
-    interpreted = engines["pallas"]
-
-    def advance_by_pallas(flow, solver, state, steps):
-        return interpreted(flow, state, steps, solver)
-
-    monkeypatch.setattr(kernel, "advance_by_pallas", advance_by_pallas)
-    monkeypatch.setattr(kernel, "jax", SimpleNamespace(jit=lambda compiled: compiled))
-    yield monkeypatch
-    _forget()
-
-
-def _forget() -> None:
-    """What is known of the kernel on a device, and the warning that it does not run."""
-    for kept in (engine_module._kernel_problem, engine_module._warn_once):
-        kept.cache_clear()
-
-
-def test_a_gpu_takes_thread_blocks(gpu, flowing) -> None:
-    """And says that the engine is experimental."""
-    flow, state = flow_of(0.6), flowing(0.6)
-    with pytest.warns(UserWarning, match="pallas, which is experimental"):
-        assert select_engine(flow, Numerics(engine=Pallas()), state) == Pallas()
-    assert select_engine(flow, Numerics(), state) == Pallas()
-    large = replace(flow, grains=MOST_GRAINS + 1)
-    refused = {"the solver nesterov": (flow, Nesterov()), "more than 1024 grains": (large, BarzilaiBorwein())}
-    for words, (other, solver) in refused.items():
-        assert select_engine(other, Numerics(solver), state) == Jax()
-        with pytest.raises(InputError, match=f"engine must be jax or chosen automatically with {words}, not pallas: "):
-            select_engine(other, Numerics(solver, Pallas()), state)
-    with pytest.raises(InputError, match="automatically on a GPU, not numba: it is made for proc"):
-        select_engine(flow, Numerics(engine=Numba()), state)
-
-
-def broken(*_):
-    raise RuntimeError("no such\ninstruction")
-
-
-def unsolved(advance, flow, solver, state, steps):
-    return advance(flow, replace(solver, max_steps=1), state, steps)
-
-
-def late(advance, flow, solver, state, steps):
-    return advance(replace(flow, timestep=0.1), solver, state, steps)
-
-
-@pytest.mark.parametrize(
-    ("failure", "said"),
-    [
-        (broken, "no such instruction"),
-        (unsolved, "it fails in the contact law, clusters"),
-        (late, "it fails in overlaps"),
-    ],
-)
-def test_a_gpu_whose_kernel_does_not_run_takes_the_plain_advance(gpu, flowing, failure, said) -> None:
-    gpu.setattr(kernel, "advance_by_pallas", partial(failure, kernel.advance_by_pallas))
-    flow, state = flow_of(0.6), flowing(0.6)
-    with pytest.warns(UserWarning, match=f"the kernel for GPUs does not run here .*{said}"):
-        assert select_engine(flow, Numerics(), state) == Jax()
-    assert select_engine(flow, Numerics(), state) == Jax()  # and says so once
-    with pytest.raises(InputError, match=f"automatically here, not pallas: .*{said}"):
-        select_engine(flow, Numerics(engine=Pallas()), state)
-
-
-def without_a_gpu() -> AbstractContextManager:
-    """Return the context in which JAX lowers for a GPU that is not there; before 0.12 it does so without."""
-    if jax.__version_info__ < (0, 12):
-        return nullcontext()
-    device = jax.sharding.AbstractDevice(device_kind="NVIDIA H100", num_cores=132, platform="gpu")
-    return jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), (), abstract_device=device))
-
-
-@pytest.mark.parametrize(("count", "dtype"), [(16, jnp.float64), (1024, jnp.float32)])
-def test_the_kernel_lowers_for_a_gpu(count, dtype) -> None:
-    """To a Triton module in which a thread is a grain, so that what a thread has written is its own."""
-    replicas = 3
-
-    def some(*shape: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((replicas, *shape), dtype)
-
-    state = State(Grains(some(count), some(count)), some(count, 2), some(count, 2), some(), some())
-    way = kernel if count > 16 else advance_module  # the latter is traced with the plain advance
-    advance = jax.vmap(
-        partial(way.advance_by_pallas, ShearFlow(count, 0.5, 0.6, 1e-3), BarzilaiBorwein()), (0, None), axis_name=AXIS
-    )
-    with without_a_gpu():
-        traced = jax.jit(advance).trace(state, jax.ShapeDtypeStruct((), jnp.int32))
-        text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    (call,) = (line for line in text.splitlines() if "__gpu$xla.gpu.triton" in line)
-    threads = max(64, 1 << (count - 1).bit_length())
-    assert f"grid_x = {replicas} : i32" in call and f"num_warps = {threads // 32} : i32" in call
-    assert "stablehlo.while" not in text  # replicas do not wait for each other
-    if count == 16:  # compiled for a processor it is the plain advance
-        assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-
-
-@pytest.fixture(scope="module")
-def grid_run():
-    """``grid_run(flow, states, steps)``: three replicas in a grid, in single precision."""
-    interpreted = jax.vmap(partial(kernel.advance_by_pallas, interpret=True), (None, None, 0, 0), axis_name=AXIS)
-    advance = jax.jit(interpreted)
-
-    def run(flow, states, steps):
-        stacked = jax.tree.map(lambda *x: np.stack(x).astype(np.float32), *states)
-        return jax.tree.map(np.asarray, advance(flow, LOOSE, stacked, np.asarray(steps, np.int32)))
-
-    return run
-
-
-def test_a_failed_replica_of_a_grid_leaves_its_neighbours_alone(flowing, grid_run) -> None:
-    flow, state = flow_of(0.78), flowing(0.78)
-    lost, steps = replace(state, velocities=state.velocities.at[3, 0].set(jnp.nan)), [40, 40, 0]
-    after, tally = grid_run(flow, (state, lost, state), steps)
-    assert tally.status.tolist() == [Status.ok, Status.nonfinite, Status.ok]
-    before = jax.tree.map(np.float32, state)
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[2], after), before)
-    other = grid_run(flow, (state, flowing(0.78, 1), lost), steps)  # other neighbours
-    jax.tree.map(np.testing.assert_array_equal, *(jax.tree.map(lambda x: x[0], of) for of in ((after, tally), other)))
-
-
 def test_steps_that_outrun_a_usual_skin_have_lists_as_wide_as_they_need(native_run) -> None:
     row, rng = 6, np.random.default_rng(1)
     places = 1.05 * np.stack(np.divmod(np.arange(GRAINS), row), axis=-1) + 0.5
@@ -301,15 +162,6 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
         _, tally = native_run(flow_of(0.03, shear_rate=0.0), state, 2)
         assert np.isfinite(tally.worst_residual)
         assert np.sum(tally.residual_counts) == tally.solves
-
-
-def test_single_precision_is_double_precision_to_its_rounding(flowing, grid_run, engines) -> None:
-    flow, state = flow_of(0.7), flowing(0.7)
-    after, tally = jax.tree.map(lambda x: x[0], grid_run(flow, (state, state, state), [100, 0, 0]))
-    expected, sums = engines["pallas"](flow, state, 100, LOOSE)
-    assert after.positions.dtype == jnp.float32 and float(tally.solves) == float(sums.solves) > 10
-    np.testing.assert_allclose(after.velocities, expected.velocities, atol=1e-3)
-    np.testing.assert_allclose(tally.impulse, sums.impulse, rtol=1e-4)
 
 
 @pytest.mark.parametrize("engine", [None, Numba()])

@@ -12,8 +12,9 @@ from benchmarks import networks as module
 from benchmarks.exact_contacts import exact, incidence
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
+from benchmarks.stability import JacobiDiagonal
 from jaxgran.contact.delassus import spectral_bound
-from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, JacobiDiagonal, Nesterov
+from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 

@@ -10,7 +10,7 @@ import xarray as xr
 from synthetic import refused
 
 from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.dynamics.engine import Numba, Pallas
+from jaxgran.dynamics.engine import Numba
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import checkpoint, journal
 from jaxgran.maps.dataset import map_dataset
@@ -203,8 +203,6 @@ def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None
 
 
 def test_an_engine_that_cannot_observe_is_refused() -> None:
-    with pytest.raises(InputError, match="not pallas"):
-        ratio_map(**MAP, engine=Pallas(), observe=observe)
     with pytest.raises(InputError, match="with the solver jacobi, not numba"):
         ratio_map(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)
 

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from command_line import jaxgran
 from made_up_maps import ratio_dataset, with_grains, with_timesteps
-from pages import MARKUP, made_up_film, page_map
+from pages import MARKUP, page_map
 from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
@@ -22,7 +22,6 @@ from jaxgran.maps.points import PointGrid
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.model.checks import InputError
 from jaxgran.page.document import document
-from jaxgran.page.film import AVERAGES
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
 from jaxgran.reference.table import MEASURED, Table, shipped_table
@@ -191,11 +190,10 @@ def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
 
 
 def test_page_forbids_itself_every_request() -> None:
-    for name in ("map", "flow"):
-        template = files("jaxgran.page").joinpath(f"{name}.html").read_text(encoding="utf-8")
-        policy = re.search(r'Content-Security-Policy" content="(.*?)"', template)
-        assert policy is not None and policy[1].startswith("default-src 'none';")
-        assert "http:" not in template and "https:" not in template and "connect-src" not in policy[1]
+    template = files("jaxgran.page").joinpath("map.html").read_text(encoding="utf-8")
+    policy = re.search(r'Content-Security-Policy" content="(.*?)"', template)
+    assert policy is not None and policy[1].startswith("default-src 'none';")
+    assert "http:" not in template and "https:" not in template and "connect-src" not in policy[1]
 
 
 @pytest.mark.parametrize("name", ["activation", "solver_requested", "tolerance", "seeds"])
@@ -224,24 +222,6 @@ def test_explore_writes_a_page_that_a_notebook_shows(tmp_path: Path) -> None:
     frame = page._repr_html_()
     assert frame.startswith("<iframe") and html.escape(page.text) in frame
     assert "MB" in repr(page)
-
-
-def test_film_has_the_running_averages_of_its_frames() -> None:
-    film = made_up_film()
-    page = written(film.page())
-    assert page["strain"] == pytest.approx([0.0, 10, 20, 30, 40]) and len(page["frames"]) == 5
-    assert [one["values"][0] for one in page["averages"]] == [None] * len(AVERAGES)
-    sums = film._sum
-    assert sums is not None
-    assert page["averages"][0]["values"][-1] == pytest.approx((sums.impulse / sums.binary_impulse).item(), rel=1e-6)
-    assert len({one["force"] for one in page["frames"]}) == 1  # one scale
-    assert "N = 16" in page["about"] and "α = 0.1, ν = 0.8" in page["title"]
-
-
-def test_film_of_many_grains_keeps_a_part_of_its_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("jaxgran.page.film._MOST_DRAWN_GRAINS", 40)
-    page = written(made_up_film().page())
-    assert len(page["frames"]) == len(page["strain"]) == 3
 
 
 def test_data_of_a_page_have_no_numbers_that_json_lacks() -> None:

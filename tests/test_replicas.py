@@ -73,27 +73,9 @@ def test_strains_and_steps_may_differ_between_replicas(states: State) -> None:
     np.testing.assert_array_equal(jax.jit(jg.advance)(FLOWS, states, np.array([1, 0, 3]))[1].steps, [1, 0, 3])
 
 
-def test_snapshots_and_cooling_take_a_batch(states: State) -> None:
+def test_snapshots_take_a_batch(states: State) -> None:
     series = partial(jg.snapshot_series, strain=0.02, count=2)
     assert_same(series(FLOWS, states), jax.vmap(series)(FLOWS, states))
-    cooled = partial(jg.cooling, times=np.array([0.01, 0.02]))
-    flows = replace(FLOWS, shear_rate=0.0)
-    assert_same(cooled(flows, states), jax.vmap(cooled)(flows, states))
-
-
-def test_states_are_prepared_under_vmap_as_by_a_batch_of_keys(states: State) -> None:
-    def prepared(alpha, nu, key):
-        return jg.prepare(jg.ShearFlow(GRAINS, alpha, nu, 1e-3), key, equilibrate=1.0)
-
-    assert_same(jax.vmap(prepared)(ALPHAS, NUS, KEYS[:3]), states)
-    table = jax.vmap(jax.vmap(prepared, (None, 0, 0)), (0, None, 0))(ALPHAS[:2], NUS[:2], KEYS.reshape(2, 2))
-    assert_same(jax.tree.map(lambda x: x[0, 0], table), states[0])
-    assert_same(jax.tree.map(lambda x: x[1, 0], table), jg.prepare(jg.ShearFlow(GRAINS, 0.5, 0.5, 1e-3), KEYS[2], 1.0))
-
-
-def test_gases_are_heated_under_vmap_as_by_a_batch_of_keys() -> None:
-    temperatures = jnp.asarray([0.5, 1.0, 2.0])
-    assert_same(jax.vmap(jg.heated)(FLOWS, KEYS[:3], temperatures), jg.heated(FLOWS, KEYS[:3], temperatures))
 
 
 @pytest.mark.parametrize(

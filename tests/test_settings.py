@@ -10,7 +10,7 @@ from synthetic import one_sentence, refused
 
 from jaxgran.cli.map import MAP_OPTIONS
 from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.dynamics.engine import Numba, Pallas
+from jaxgran.dynamics.engine import Numba
 from jaxgran.maps.parameters import MapParameters, RunParameters
 from jaxgran.maps.presets import PRESETS, with_start
 from jaxgran.maps.settings import MapSettings, chosen_settings
@@ -42,8 +42,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"equilibrate": -1.0}, "at least 0"),
     ({"solver": "gauss"}, "a ProjectedMethod, such as"),
     ({"snapshots": 1}, "True or False"),
-    ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\), jg.Pallas\(\) or None"),
-    ({"engine": Pallas()}, "on a CPU, not pallas: it is made for NVIDIA GPUs"),
+    ({"engine": "jax"}, r"jg.Jax\(\), jg.Numba\(\) or None"),
     ({"engine": Numba(), "solver": Jacobi()}, "with the solver jacobi, not numba"),
 ]
 

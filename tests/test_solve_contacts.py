@@ -20,7 +20,6 @@ from jaxgran import (
     DelassusProblem,
     InputError,
     Jacobi,
-    JacobiCount,
     Nesterov,
     Status,
     contact_residuals,
@@ -127,7 +126,7 @@ def test_dense_and_sparse_matrices_are_the_same_problem():
         np.testing.assert_allclose(other.velocities, first.velocities, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("method", [Nesterov, Jacobi, JacobiCount])
+@pytest.mark.parametrize("method", [Nesterov, Jacobi])
 def test_every_bounded_method_solves_a_matrix(method):
     problem = replace(
         matrix_problem(1), matrix=jnp.asarray(np.eye(SIZE) + 0.5 * (np.eye(SIZE, k=1) + np.eye(SIZE, k=-1)))

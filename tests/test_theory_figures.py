@@ -10,10 +10,8 @@ from made_up_maps import (
     STDERR,
     assumption_of,
     closure_of,
-    dense_map,
     excess_of,
     factor_of,
-    ratio_dataset,
     share_of,
     theory_dataset,
     with_timesteps,
@@ -22,10 +20,8 @@ from matplotlib.axes import Axes
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from jaxgran.inference.friction_law import friction_law
 from jaxgran.plotting.contours import EXCESS_LEVELS
 from jaxgran.plotting.enskog_factors import LENGTH_PANEL, PANELS, enskog_factors
-from jaxgran.plotting.friction import friction_figure
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import ratio_contours, ratio_curves
 from jaxgran.plotting.theory import ERROR_LEVELS, SHARE_LEVELS, cluster_shares, error_parts, theory_errors
@@ -198,48 +194,6 @@ def test_share_of_the_pressure_lies_on_its_isolines() -> None:
     assert len(contour_lines(panel(figure, "m"), "#00803c")) == len(EXCESS_LEVELS)
 
 
-# -------------------------------------------------------------------------------------------- rheology
-
-
-def dense_dataset(**options) -> xr.Dataset:
-    """Return a synthetic map of dense flow with everything that a figure needs."""
-    data = dense_map(**options)
-    dims, shape = data.inertial_number.dims, data.inertial_number.shape
-    data["status"].attrs = {"flag_values": np.arange(7), "flag_meanings": "ok a not_steady c d e f"}
-    ratio = {"force_ratio": (dims, np.full(shape, 2.0)), "force_ratio_stderr": (dims, np.full(shape, 0.1))}
-    return data.assign(ratio).assign_attrs(ratio_dataset().attrs)
-
-
-def test_laws_are_drawn_over_the_points_they_are_fitted_to() -> None:
-    data = dense_dataset()
-    law = friction_law(data)
-    figure = friction_figure(data)
-    for axes, name in zip(figure.axes, ("friction", "packing_fraction"), strict=True):
-        assert axes.get_xscale() == "log"
-        curves = [line for line in axes.lines if len(line.get_xdata()) == 100]
-        assert len(curves) == 3
-        for curve, one in zip(curves, (*law.by_restitution.values(), law), strict=True):
-            part = getattr(one, name)
-            number = np.asarray(curve.get_xdata())
-            np.testing.assert_allclose((number[0], number[-1]), part.span)
-            np.testing.assert_allclose(curve.get_ydata(), part(number))
-
-
-def test_points_that_no_law_is_fitted_to_are_open() -> None:
-    data = dense_dataset()
-    data.status[-1, 0] = 2
-    figure = friction_figure(data)
-    filled = (data.inertial_number <= 0.3) & (data.status == 0)
-    for axes, y in zip(figure.axes, (data.macroscopic_friction, data.packing_fraction), strict=True):
-        points = [c.lines[0] for c in axes.containers]
-        shown = [np.c_[p.get_xdata(), p.get_ydata()] for p in points if p.get_markerfacecolor() != "white"]
-        expected = xr.broadcast(data.inertial_number, y)
-        chosen = [np.stack([v.values[filled.values[:, k], k] for v in expected], axis=-1) for k in range(2)]
-        for drawn, wanted in zip(shown, chosen, strict=True):
-            np.testing.assert_allclose(drawn, wanted)
-        np.testing.assert_allclose(rings(axes), [[float(v[-1, 0]) for v in expected]])
-
-
 # --------------------------------------------------------------------------------------------- together
 
 
@@ -252,11 +206,9 @@ def test_map_without_any_value_is_drawn(draw) -> None:
     assert "no measured values" in [text.get_text() for text in figure.axes[0].texts]
 
 
-@pytest.mark.parametrize(
-    "draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares, friction_figure]
-)
+@pytest.mark.parametrize("draw", [ratio_curves, ratio_contours, theory_errors, enskog_factors, cluster_shares])
 def test_shortest_time_step_is_drawn(draw) -> None:
-    data = dense_dataset() if draw is friction_figure else theory_dataset()
+    data = theory_dataset()
     several = with_timesteps(data, 3e-4, 1e-2)
     if draw is theory_errors:  # what a theory predicts has no time step
         several = several.assign({name: data[name] for name in ("theory/pressure", "theory/shear_stress")})
@@ -277,10 +229,8 @@ def test_shortest_time_step_is_drawn(draw) -> None:
             theory_dataset(3, 3).drop_vars("theory/enskog_factor_pressure_local_temperature"),  # made before
             ["curves", "contours", "theory", "clusters"],
         ),
-        (dense_dataset(), ["curves", "contours", "rheology"]),
-        (dense_dataset(nus=3, alphas=(0.5,)), ["curves"]),
     ],
-    ids=["all", "line", "no theory", "no factors", "dense", "few"],
+    ids=["all", "line", "no theory", "no factors"],
 )
 def test_figures_are_written_where_the_map_has_their_data(
     data: xr.Dataset, names: list[str], tmp_path: Path, monkeypatch

@@ -19,7 +19,6 @@ from synthetic import one_sentence
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
-from jaxgran.io.track_files import read_tracks
 from jaxgran.io.trajectory import (
     Trajectory,
     check_trajectory,
@@ -433,10 +432,9 @@ def test_a_file_of_another_format_is_refused_in_a_sentence(seen, tmp_path: Path,
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "FORMAT_VERSION", 7)
         write_frame(path, seen[0.3], 0)
-    for read in (read_trajectory, read_tracks):
-        with pytest.raises(InputError, match="has format_version 7, and this version of jaxgran reads") as refused:
-            read(path)
-        assert one_sentence(str(refused.value))
+    with pytest.raises(InputError, match="has format_version 7, and this version of jaxgran reads") as refused:
+        read_trajectory(path)
+    assert one_sentence(str(refused.value))
 
 
 def interrupts(*_, **__):

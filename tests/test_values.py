@@ -58,7 +58,7 @@ def test_no_public_value_compares_arrays_by_their_truth() -> None:
     public = (getattr(jg, name) for name in jg.__all__)
     values = [one for one in public if isinstance(one, type) and is_dataclass(one)]
     of_arrays = [one for one in values if any("rray" in str(field.type) for field in fields(one))]
-    assert len(of_arrays) > 12 and {jg.State, jg.Tracks, jg.Fields} <= {*of_arrays}
+    assert len(of_arrays) > 12 and {jg.State, jg.Fields} <= {*of_arrays}
     solvers = {one for one in of_arrays if issubclass(one, jg.ProjectedMethod)}  # they hold single numbers
     assert {one for one in of_arrays if one.__eq__ is not equal_values} <= solvers
 

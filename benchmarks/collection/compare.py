@@ -16,13 +16,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.collection.files import Entry
 from benchmarks.collection.make import padded
 from benchmarks.gauss_seidel import gauss_seidel
-from benchmarks.profiles import STYLES, draw_shares, with_styles
 from benchmarks.timing import timed
 from jaxgran.contact.problem import as_contacts
 from jaxgran.model.status import Status
@@ -130,27 +128,3 @@ OURS: dict[str, Prepare] = {
     "nesterov": partial(projected, jg.Nesterov()),
     "Gauss–Seidel": swept,
 }
-
-
-def draw_profile(rows: Sequence[Row]) -> Figure:
-    """Performance profiles in time, and in products with W of the solvers that count them, on what has a solution."""
-    rows = [row for row in rows if row.feasible]
-    names = list(dict.fromkeys(row.solver for row in rows))
-    counting = [name for name in names if all(row.products == row.products for row in rows if row.solver == name)]
-    styles = with_styles(names, STYLES)
-    shown = [("seconds", names, "time over that of the best")]
-    shown += [("products", counting, "products with W over those of the best")] if counting else []
-    figure = Figure(figsize=(5 * len(shown) + 0.5, 4.6), layout="constrained")
-    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for axes, (cost, solvers, label) in zip(panels, shown, strict=True):
-        costs = {
-            name: np.array([getattr(row, cost) if row.solved else np.inf for row in rows if row.solver == name])
-            for name in solvers
-        }
-        draw_shares(axes, costs, {name: styles[name] for name in solvers})
-        axes.set_xlabel(label)
-    count = len({row.problem for row in rows})
-    panels[0].set_ylabel(f"share of {count} problems, to {rows[0].tolerance:.0e}")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(4, len(names)))
-    return figure

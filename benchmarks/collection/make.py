@@ -2,7 +2,6 @@
 
 python -m benchmarks collection                  # benchmarks/results/collection.h5 and a table of what is in it
 python -m benchmarks collection --quick          # few problems of each kind
-python -m benchmarks collection --fclib FOLDER   # beside it, a file for each problem in the layout of FCLIB
 
 The same seeds give the same bytes on one machine. ``files`` has the layout, ``certificates`` says how the solutions
 are computed and proved. Nothing here is timed.
@@ -10,7 +9,6 @@ are computed and proved. Nothing here is timed.
 
 import hashlib
 from collections.abc import Iterable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +16,6 @@ import numpy as np
 
 import jaxgran as jg
 from benchmarks.collection.certificates import Problem, Solved, centre, obstructed, solved
-from benchmarks.collection.fclib import write_all
 from benchmarks.collection.files import Entry, write
 from benchmarks.collection.problems import Made, problems
 from benchmarks.networks import SLOTS
@@ -30,8 +27,8 @@ UNIQUE, WORST = 1e-20, 1e-13  # natural residuals: above the first a solution is
 _GUESS = jg.BarzilaiBorwein(tolerance=1e-10, max_steps=500_000)
 
 
-def run(output: Output, fclib: Path | None = None) -> None:
-    """Make the problems, solve and prove them, and write the file, its summary, and files for FCLIB."""
+def run(output: Output) -> None:
+    """Make the problems, solve and prove them, and write the file and its summary."""
     entries = list(made(problems(output.quick)))
     path = output.path("collection", ".h5")
     write(path, entries)
@@ -45,8 +42,6 @@ def run(output: Output, fclib: Path | None = None) -> None:
         "bound_of_entries_over_bound_of_grains": bounds(entries),
     }
     output.write_rows("collection", head, "families", rows)
-    if fclib is not None:
-        write_all(fclib, entries)
 
 
 def made(collection: Iterable[Made]) -> Iterable[Entry]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from benchmarks.collection.compare import Prepare, projected, swept
 from benchmarks.solvers.numba_engine import by_cluster
+from benchmarks.stability import JacobiCount, JacobiDiagonal
 from jaxgran.contact.projected_methods import SOLVERS
 
 DEFAULT = "barzilai-borwein"
@@ -27,7 +28,7 @@ def our_solvers() -> dict[str, Solver]:
     settings = {"jacobi": {"relaxation": 1.8}, "jacobi-count": {"relaxation": 1.8}}
     settings |= {"jacobi-diagonal": {"relaxation": 1.0}}  # nothing bounds W there, so a longer step does harm alone
     methods = {}
-    for name, method in SOLVERS.items():
+    for name, method in {**SOLVERS, "jacobi-count": JacobiCount, "jacobi-diagonal": JacobiDiagonal}.items():
         chosen = settings.get(name, {})
         methods[name] = Solver(partial(projected, method(**chosen)), "products with W", chosen, True)
     return {

@@ -1,7 +1,6 @@
 """What the site shows from outside ``docs``: charts, notebooks, a drawing of the folders, and pages of its root.
 
-Charts come from ``benchmarks/results`` into ``charts`` of the site, and the file of tracked discs from ``notebooks``. The
-drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build, and
+Charts come from ``benchmarks/results`` into ``charts`` of the site. The drawing of the folders, ``charts/architecture.svg``, is made from the imports of the code at every build, and
 ``charts/paper.html`` from the dataset of the paper's map. Pages are templates (``benchmarks/pages.py``), and those of
 ``executed.PAGES`` show what their examples print. A line between two ``$$`` is a formula of TeX.
 
@@ -58,8 +57,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         files.append(File.generated(config, f"notebooks/{name}.md", content=markdown))
         for file, content in beside.items():
             files.append(File.generated(config, f"notebooks/{file}", content=content))
-    discs = ROOT / "notebooks" / "tracked_discs.csv"
-    files.append(File.generated(config, f"commands/{discs.name}", abs_src_path=str(discs)))
     for page, source in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     return files

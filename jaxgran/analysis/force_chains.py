@@ -1,19 +1,17 @@
-"""Force chains: clusters of grains in loaded contact, their forces and fabric.
+"""Force chains: clusters of grains in loaded contact, and their forces.
 
 A contact is *loaded* if it carries an impulse. A *cluster* is a set of grains connected by loaded contacts.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jaxgran.analysis.series import Curve, Measured, Sums, by_time, centres, histograms, ratio, series, with_errors
+from jaxgran.analysis.series import Curve, Measured, by_time, centres, histograms, ratio, series, with_errors
 from jaxgran.contact.clusters import cluster_labels
 from jaxgran.dynamics.snapshots import Snapshot
-
-_DIRECTIONS = 12  # bins of 15° on the half circle, for the mean force at an angle
 
 
 class Loaded(NamedTuple):
@@ -58,29 +56,6 @@ class ClusterShare(NamedTuple):
     force: Measured
     pressure: Measured
     shear_stress: Measured
-
-
-class Fabric(NamedTuple):
-    """Anisotropies of the loaded contacts. Angles are those of the normals, in radians in (−π/2, π/2].
-
-    =================  ======  ====  ====================================================================
-    field              shape   unit  meaning
-    =================  ======  ====  ====================================================================
-    tensor             (2, 2)  –     fabric tensor ⟨n n⟩
-    anisotropy         ()      –     a_c of the density of directions (1 + a_c cos 2(θ − θ_c))/2π
-    direction          ()      rad   θ_c
-    force_anisotropy   ()      –     a_n of the mean force at an angle, f₀(1 + a_n cos 2(θ − θ_n))
-    force_direction    ()      rad   θ_n
-    stress_anisotropy  ()      –     (Σ₁ − Σ₂)/(Σ₁ + Σ₂), principal values of the contact stress
-    =================  ======  ====  ====================================================================
-    """
-
-    tensor: Measured
-    anisotropy: Measured
-    direction: Measured
-    force_anisotropy: Measured
-    force_direction: Measured
-    stress_anisotropy: Measured
 
 
 def loaded_contacts(snapshots: Snapshot) -> Loaded:
@@ -139,58 +114,3 @@ def cluster_share(snapshots: Snapshot) -> ClusterShare:
     }
     estimates = with_errors(lambda s: {"share": ratio(s["many"], s["all"])}, sums)["share"]
     return ClusterShare(*(Measured(*share) for share in zip(*estimates, strict=True)))
-
-
-def force_distribution(snapshots: Snapshot, edges: ArrayLike) -> Curve:
-    """Probability density of F/⟨F⟩ over the loaded contacts, in bins with the given edges."""
-    load, edges = loaded_contacts(snapshots), np.asarray(edges)
-    times = len(series(snapshots).impulses)
-    counts = histograms(times, load.time, load.force * load.force.size / load.force.sum(), edges)
-    sums = {"n": counts, "all": np.bincount(load.time, minlength=times)}
-    estimates = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
-    return Curve(centres(edges), *estimates)
-
-
-def fabric(snapshots: Snapshot) -> Fabric:
-    """Fabric tensor and the anisotropies of contacts and forces.
-
-    For nearly monodisperse discs with aligned principal directions they give the stress:
-    (Σ₁ − Σ₂)/(Σ₁ + Σ₂) ≈ (a_c + a_n)/2, or (a_c + a_n)/(2 + a_c a_n) to second order. The mean force at an angle is
-    taken in bins of 15°; the force anisotropy is NaN if a bin is empty.
-
-    Source: L. Rothenburg and R. J. Bathurst, Géotechnique 39, 601 (1989).
-    """
-    load, times = loaded_contacts(snapshots), len(series(snapshots).impulses)
-    angle = np.arctan2(load.normals[:, 1], load.normals[:, 0]) % np.pi
-    edges = np.linspace(0, np.pi, _DIRECTIONS + 1)
-    angle = np.minimum(angle, np.nextafter(np.pi, 0))  # a tiny negative angle modulo π rounds to π
-    sums = {
-        "nn": by_time(times, load.time, load.normals[:, :, None] * load.normals[:, None, :]),
-        "stress": by_time(times, load.time, load.moments()),
-        "contacts": histograms(times, load.time, angle, edges),
-        "force": histograms(times, load.time, angle, edges, load.force),
-    }
-    width = np.pi / _DIRECTIONS
-    wave = np.stack([np.cos(2 * centres(edges)), np.sin(2 * centres(edges))])
-    wave = wave * width / np.sin(width)  # corrects for the average over the width of a bin
-
-    def estimate(s: Sums) -> Sums:
-        normals, stress = (ratio(x, np.trace(x, axis1=-2, axis2=-1)[..., None, None]) for x in (s["nn"], s["stress"]))
-        force = ratio(s["force"], s["contacts"])
-        (contact, direction), (deviator, _) = (_mode(x[..., 0, 0] - 0.5, x[..., 0, 1]) for x in (normals, stress))
-        second, force_direction = _mode(*((force * w).sum(axis=-1) for w in wave))
-        return {
-            "tensor": normals,
-            "anisotropy": 4 * contact,
-            "direction": direction,
-            "force_anisotropy": ratio(2 * second, force.sum(axis=-1)),
-            "force_direction": force_direction,
-            "stress_anisotropy": 2 * deviator,
-        }
-
-    return Fabric(**with_errors(estimate, sums))
-
-
-def _mode(x: Any, y: Any) -> tuple[Any, Any]:
-    """Amplitude and angle of a second Fourier mode."""
-    return np.hypot(x, y), np.arctan2(y, x) / 2

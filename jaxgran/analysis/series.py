@@ -3,7 +3,7 @@
 Errors come from the jackknife over blocks of times, since successive times are correlated (``statistics``).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgran.dynamics.snapshots import Snapshot
-from jaxgran.model.cell import minimum_image
 from jaxgran.statistics import jackknife
 
 Sums = Mapping[str, Any]  # NumPy arrays or scalars by name
@@ -59,13 +58,6 @@ def ratio(numerator: Any, denominator: Any) -> np.ndarray:
     """A quotient that is NaN where the denominator is zero, without a warning."""
     numerator, denominator = np.broadcast_arrays(numerator, denominator)
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator != 0)
-
-
-def all_pairs(frames: Any) -> Iterator[tuple[np.ndarray, np.ndarray, Float[np.ndarray, "pairs 2"]]]:
-    """For each time of a series, grains i < j of every pair and the minimum-image separation from j to i (σ)."""
-    i, j = np.triu_indices(frames.state.positions.shape[1], 1)
-    for positions, side, tilt in zip(frames.state.positions, frames.state.side, frames.state.tilt, strict=True):
-        yield i, j, minimum_image(positions[i] - positions[j], side, tilt)
 
 
 def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:

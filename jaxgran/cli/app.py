@@ -16,7 +16,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jaxgran
 from jaxgran.cli.arguments import examples
 from jaxgran.cli.explore import EXPLORE_EXAMPLES, explore_command
-from jaxgran.cli.fit import FIT_EXAMPLES, fit_command
 from jaxgran.cli.info import INFO_EXAMPLES, info_command
 from jaxgran.cli.map import MAP_EXAMPLES, PLOT_EXAMPLES, map_command, plot_command
 from jaxgran.cli.merge import MERGE_EXAMPLES, merge_command
@@ -72,12 +71,6 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
         "Say whether kinetic theory holds for a flow.",
         "Say what kinetic theory can predict at a restitution and a packing fraction, from a map measured once.",
         WHERE_EXAMPLES,
-    ),
-    "fit": (
-        fit_command,
-        "Infer a restitution, or the law of a map.",
-        "Infer the restitution of tracked discs, or fit a closure to a map and infer a restitution from stresses.",
-        FIT_EXAMPLES,
     ),
     "info": (
         info_command,

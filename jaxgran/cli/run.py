@@ -1,4 +1,4 @@
-"""The command ``run``: one flow, its averages, and its frames as a trajectory, movie or page."""
+"""The command ``run``: one flow, its averages, and its frames as a trajectory or movie."""
 
 import math
 import os
@@ -27,8 +27,6 @@ _PHYSICS = (  # what is printed without --all, with the shear-stress ratio below
 RUN_EXAMPLES = {
     "A flow in its steady state: averages with errors": "jaxgran run --restitution 0.5 --packing-fraction 0.7",
     "A movie of it, about a hundred frames": "jaxgran run --restitution 0.1 --packing-fraction 0.8 --movie flow.gif",
-    "The same as a page for a browser, which pauses and steps": "jaxgran run --restitution 0.1 --packing-fraction 0.8 "
-    "--page flow.html",
     "All its frames for other programs, every 0.01 of strain": "jaxgran run --restitution 0.5 --packing-fraction 0.7 "
     "--trajectory flow.gsd --frame-strain 0.01",
 }
@@ -45,7 +43,6 @@ RUN_OPTIONS = {
     "movie": Option(
         "GIF or MP4 of the flow: grains by their speed, and the forces between them.", Path, example="FILE.gif"
     ),
-    "page": Option("HTML file that plays the flow in a browser, with its running averages.", Path, example="FILE.html"),
     "frame_strain": Option(
         "Strain between frames, each at the nearest time step.",
         default="a hundredth of --strain, or 0.05 with --error",
@@ -67,7 +64,6 @@ def run_run_command(
     packing_fraction: float,
     trajectory: Path | None = None,
     movie: Path | None = None,
-    page: Path | None = None,
     frame_strain: float | None = None,
     force_strain: float | None = None,
     all: bool = False,
@@ -75,21 +71,21 @@ def run_run_command(
     quiet: bool = False,
     **given: Any,
 ) -> None:
-    frames_wanted = any(x is not None for x in (trajectory, movie, page))
+    frames_wanted = any(x is not None for x in (trajectory, movie))
     chosen = {"seeds": 1, **given}
     if frames_wanted:
         if chosen["seeds"] > 1:
-            raise InputError("`trajectory`, `movie` and `page` show one seed: leave out `seeds`.", field="seeds")
+            raise InputError("`trajectory` and `movie` show one seed: leave out `seeds`.", field="seeds")
         if "error" not in chosen:
             chosen.setdefault("strain", _RECORDED_STRAIN)
     strain = chosen.get("strain", _RECORDED_STRAIN)
-    for name, file in (("trajectory", trajectory), ("movie", movie), ("page", page)):
+    for name, file in (("trajectory", trajectory), ("movie", movie)):
         if file is not None and os.path.isfile(file) and not chosen.get("overwrite"):
             raise InputError(
                 f"{name} {short_repr(str(file))} already exists; pass `overwrite=True` to replace it.", field=name
             )
-    recorder, frames, film = _recorder(trajectory, movie, page, frame_strain, force_strain, strain)
-    record = None if recorder is None else recorder.recording if film is None else film.recording(recorder)
+    recorder, frames = _recorder(trajectory, movie, frame_strain, force_strain, strain)
+    record = None if recorder is None else recorder.recording
     output = chosen.get("output")
     plane = {"restitution": (restitution,), "packing_fraction": (packing_fraction,)}
     data, interrupted, written = run_map({**plane, **chosen, "record": record}, quiet)
@@ -104,9 +100,6 @@ def run_run_command(
             say(f"wrote {trajectory}: {recorder.frames} frames")
         if movie is not None:
             _write_movie(movie, frames, quiet)
-        if film is not None and page is not None:
-            film.page().save(page)
-            say(f"wrote {page}: {len(film.frames.scenes)} frames")
     finish(data, [output] if output is not None and written else [], interrupted, output)
 
 
@@ -116,25 +109,23 @@ run_command = command(RUN_OPTIONS, run_run_command, required=("restitution", "pa
 def _recorder(
     trajectory: Path | None,
     movie: Path | None,
-    page: Path | None,
     frame_strain: float | None,
     force_strain: float | None,
     strain: float,
 ):
-    """The recorder of the flow, the frames of its movie, and the film of its page; None if there is no file for it."""
-    if trajectory is None and movie is None and page is None:
+    """The recorder of the flow and the frames of its movie; None if there is no file for it."""
+    if trajectory is None and movie is None:
         for name, value in (("frame_strain", frame_strain), ("force_strain", force_strain)):
             if value is not None:
-                raise InputError(f"`{name}` requires `trajectory`, `movie` or `page`.", field=name)
-        return None, None, None
+                raise InputError(f"`{name}` requires `trajectory` or `movie`.", field=name)
+        return None, None
     configured_jax()
-    from jaxgran.io.atomic import require_place
     from jaxgran.io.trajectory import check_trajectory, write_frame
     from jaxgran.plotting.movie import MOST_DRAWN, Frames, check_movie
     from jaxgran.sampling.recorder import Recorder
 
     if frame_strain is not None:
-        most_frames = MOST_RECORDED if movie is None and page is None else MOST_DRAWN
+        most_frames = MOST_RECORDED if movie is None else MOST_DRAWN
         least, most = strain / most_frames, strain
         accepted = f"at least {least:g}, for {most_frames} frames, and at most the sampled strain, {most:g}"
         require_number("frame_strain", frame_strain, lambda x: (x >= 0.99 * least) & (x <= most), accepted)
@@ -142,22 +133,14 @@ def _recorder(
     if force_strain is not None:
         accepted = f"above 0 and at most the strain between frames, {every:g}"
         require_number("force_strain", force_strain, lambda x: (x > 0) & (x <= every), accepted)
-    keep, frames, film = [], Frames(), None
+    keep, frames = [], Frames()
     if trajectory is not None:
         check_trajectory(trajectory)
         keep.append(partial(write_frame, trajectory))
     if movie is not None:
         check_movie(movie)
         keep.append(frames.keep)
-    if page is not None:
-        from jaxgran.page.document import require_plotly
-        from jaxgran.page.film import Film
-
-        require_place(page, "page", ".html")
-        require_plotly()
-        film = Film()
-        keep.append(film.frames.keep)
-    return Recorder(every, *keep, force_strain=force_strain or 0.0), frames, film
+    return Recorder(every, *keep, force_strain=force_strain or 0.0), frames
 
 
 def _write_movie(movie: Path, frames, quiet: bool) -> None:

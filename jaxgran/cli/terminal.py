@@ -6,7 +6,7 @@ exit status  meaning
 0            done
 1            the file system failed
 2            a mistake in the input
-3            finished, but a point has a bad status, or a fit failed
+3            finished, but a point has a bad status
 130          interrupted (Ctrl-C)
 143          ended by SIGTERM, which Slurm sends before it kills
 ===========  ========================================================

@@ -1,21 +1,17 @@
 """The Delassus operator W = H M⁻¹ Hᵀ of a contact network: its products, and diagonals to scale an iteration by.
 
 W of a network is never stored: Hᵀ gathers the impulses of the contacts on their grains, H reads the relative normal
-velocities that follow. Three diagonals D stand for it in the ``projected_methods``:
+velocities that follow. Two diagonals D stand for it in the ``projected_methods``:
 
 - ``diagonal``: W_cc = 1/m_i + 1/m_j. The classical choice; nothing bounds W by it, and networks make it diverge.
-- ``count_bound``: z_i/m_i + z_j/m_j with z_b the number of contacts of grain b (mass splitting). Since
-  |Σ ±n x|² ≤ z Σ x², W ⪯ D.
 - ``spectral_bound``: λ(A_i)/m_i + λ(A_j)/m_j with λ(A_b) the largest eigenvalue of A_b = Σ n nᵀ over the contacts of
-  grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D;
-  and λ(A_b) ≤ z_b, so it is never worse than the count.
+  grain b, a 2×2 matrix. For any vector x, xᵀWx = Σ_b |Σ_c ±n x_c|²/m_b ≤ Σ_b λ(A_b)/m_b Σ_{c∋b} x_c² = xᵀDx, so W ⪯ D.
 
-An isolated pair has D = W in all three.
+An isolated pair has D = W in both.
 
-A problem given by its matrix has the same four functions. Its bounds know no grains, only the entries of W. For any
+A problem given by its matrix has the same functions. Its bounds know no grains, only the entries of W. For any
 s > 0, 2 |x_c x_d| ≤ x_c² s_d/s_c + x_d² s_c/s_d, so the diagonal Σ_d |W_cd| s_d/s_c bounds W (Gershgorin). With
-s_c = W_cc^-½ it is ``spectral_bound``. As |W_cd| ≤ (W_cc W_dd)^½, it is at most z_c W_cc with z_c the number of entries
-of row c, which is ``count_bound``.
+s_c = W_cc^-½ it is ``spectral_bound``.
 """
 
 from collections.abc import Callable
@@ -31,7 +27,7 @@ from jaxgran.contact.network import Contacts
 from jaxgran.contact.problem import DelassusProblem, entries, is_sparse
 from jaxgran.model.indexing import added_at, taken
 
-Operator = Contacts | DelassusProblem  # what has the four functions product, diagonal and bounds
+Operator = Contacts | DelassusProblem  # what has the functions product, diagonal and bound
 
 
 def grain_impulses(contacts: Contacts, impulses: Float[Array, " contacts"], grains: int) -> Float[Array, "grains 2"]:
@@ -62,17 +58,8 @@ def delassus_product(contacts: Contacts, impulses: Float[Array, " contacts"], gr
 
 @singledispatch
 def diagonal(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
-    """Diagonal of W; one in unused slots, as in all three, so that it can be divided by."""
+    """Diagonal of W; one in unused slots, as in both, so that it can be divided by."""
     return jnp.where(contacts.used, contacts.inverse_mass_i + contacts.inverse_mass_j, 1)
-
-
-@singledispatch
-def count_bound(contacts: Contacts, grains: int) -> Float[Array, " contacts"]:
-    """Diagonal D with W ⪯ D from the numbers of contacts of the grains."""
-    one = contacts.used.astype(contacts.normals.dtype)[:, None]
-    count = _gathered(contacts, one, one, grains)[:, 0]
-    bound = taken(count, contacts.i) * contacts.inverse_mass_i + taken(count, contacts.j) * contacts.inverse_mass_j
-    return jnp.where(contacts.used, bound, 1)
 
 
 @singledispatch
@@ -101,12 +88,6 @@ def _(problem: DelassusProblem, grains: int) -> Array:
     else:
         own = jnp.diagonal(matrix)
     return jnp.where(own > 0, own, 1)
-
-
-@count_bound.register
-def _(problem: DelassusProblem, grains: int) -> Array:
-    count = _times(_each(problem.matrix, lambda x: (x != 0).astype(x.dtype)), jnp.ones_like(problem.approach))
-    return jnp.maximum(count, 1) * diagonal(problem, grains)
 
 
 @spectral_bound.register

@@ -1,8 +1,8 @@
-"""The law of a contact: arithmetic that every engine shares.
+"""The law of a contact: arithmetic that both engines share.
 
-These functions take numbers or arrays and have no branches on values. The engines ``Jax`` and ``Pallas`` call them
-with arrays of JAX; the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What
-branches, such as the search for the next contact or a solver, is written for each engine, and tests compare them.
+These functions take numbers or arrays and have no branches on values. The engine ``Jax`` calls them with arrays of JAX;
+the numba engine compiles the same source for numbers (``dynamics.numba_engine.compilation``). What branches, such as
+the search for the next contact or a solver, is written for each engine, and tests compare them.
 
 The rule: a pair is a contact when free flight over the look-ahead time θ·dt makes it overlap. With s the separation,
 u the relative velocity in the laboratory and d the sum of the radii, the gap along the flight is

@@ -6,15 +6,13 @@ place of the operator W, and cost one product with W each. They differ in D, in 
 =================  ===============  ==============================  ========================================
 method             diagonal D       starting point y                step length τ
 =================  ===============  ==============================  ========================================
-JacobiDiagonal     diag(W)          p                               relaxation ω
-JacobiCount        contact counts   p                               ω
-Jacobi             spectral bound   p                               ω
+Jacobi             spectral bound   p                               relaxation ω
 Nesterov           spectral bound   p + k/(k+3) (p − p_before)      1; k restarts when the step turns uphill
 BarzilaiBorwein    spectral bound   p                               curvature along the last step; guarded
 =================  ===============  ==============================  ========================================
 
 Where W ⪯ D, a Jacobi step lowers ½pᵀWp + bᵀp for every ω < 2, and Nesterov's method converges at τ = 1. With diag(W)
-neither holds: ``JacobiDiagonal`` is kept because it shows what the bound is for.
+neither holds (``benchmarks/stability.py``).
 
 Barzilai and Borwein take τ from the last step s: sᵀDs/sᵀWs and sᵀWs/(Ws)ᵀD⁻¹(Ws) in turn, both at least 1 as W ⪯ D.
 The objective does not fall in every step, and with a projection the iterates can cycle. The safeguard needs no values
@@ -25,7 +23,7 @@ to a third fewer products than Nesterov's method alone (``benchmarks solvers``).
 A subclass of ``ProjectedMethod`` is a method too, wherever it is written.
 
 Sources: Nesterov (1983); O'Donoghue and Candès (2015) for the restart; Barzilai and Borwein (1988); Birgin, Martínez
-and Raydan (2000) for projected spectral gradients; Tonge, Benevolenski and Voroshilov (2012) for mass splitting.
+and Raydan (2000) for projected spectral gradients.
 """
 
 import json
@@ -38,7 +36,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxgran.contact.delassus import Operator, count_bound, diagonal, spectral_bound
+from jaxgran.contact.delassus import Operator, spectral_bound
 from jaxgran.contact.law import LONGEST_STRIDE, PROGRESS, WINDOW
 from jaxgran.model.checks import InputError, concrete_or_none, require_number, short_repr
 from jaxgran.model.choices import SolverName
@@ -250,41 +248,11 @@ class Jacobi(ProjectedMethod):
         return now.point, jnp.asarray(self.relaxation, now.point.dtype)
 
 
-@dataclass(frozen=True)
-class JacobiCount(Jacobi):
-    """``Jacobi`` with D the numbers of contacts over the masses (mass splitting), which also bounds W.
-
-    Source: R. Tonge, F. Benevolenski and A. Voroshilov, ACM Trans. Graph. 31, 105 (2012).
-
-    Examples:
-      >>> JacobiCount()
-      JacobiCount(tolerance=0.0001, max_steps=5000, relaxation=1.8)
-    """
-
-    def bound(self, contacts: Operator, grains: int) -> Array:
-        return count_bound(contacts, grains)
-
-
-@dataclass(frozen=True)
-class JacobiDiagonal(Jacobi):
-    """``Jacobi`` with D = diag(W), the classical choice, which does not bound W and diverges in dense flows.
-
-    Examples:
-      >>> JacobiDiagonal()
-      JacobiDiagonal(tolerance=0.0001, max_steps=5000, relaxation=1.8)
-    """
-
-    def bound(self, contacts: Operator, grains: int) -> Array:
-        return diagonal(contacts, grains)
-
-
 DEFAULT_SOLVER = BarzilaiBorwein()
 SOLVERS: dict[SolverName, type[ProjectedMethod]] = {  # by their names on the command line and in files
     "barzilai-borwein": BarzilaiBorwein,
     "nesterov": Nesterov,
     "jacobi": Jacobi,
-    "jacobi-count": JacobiCount,
-    "jacobi-diagonal": JacobiDiagonal,
 }
 
 

@@ -1,28 +1,22 @@
 """Advances one replica through time, with the engine that ``dynamics.engine`` selects.
 
-XLA calls the numba engine through its foreign function interface, and the engine ``Pallas`` is a kernel. So ``jit``,
-``lax.map`` and ``vmap`` apply to all engines.
+XLA calls the numba engine through its foreign function interface, so ``jit``, ``lax.map`` and ``vmap`` apply to both
+engines.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.engine import Engine, Jax, Numba, checked_numerics, select_engine
-from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, advance_by_jax, ended, require_advance
+from jaxgran.dynamics.engine import Engine, Jax, checked_numerics, select_engine
+from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.state import State
-
-_CompiledEngine = Callable[[ShearFlow, ProjectedMethod, State, Array], tuple[State, Tally]]
 
 
 def advance(
@@ -40,9 +34,9 @@ def advance(
 
     A batch is a flow or a state whose arrays have a leading (replicas,) axis, as in ``sample``.
 
-    Without an ``engine`` a compiled one is taken on a processor or an NVIDIA GPU, if the solver is a
-    ``BarzilaiBorwein`` and ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. All
-    engines solve the same steps to the same tolerance, and differ by rounding and within the tolerance only. On a
+    Without an ``engine``, ``Numba`` is taken on a processor, if the solver is a ``BarzilaiBorwein`` and
+    ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. Both engines solve the same
+    steps to the same tolerance, and differ by rounding and within the tolerance only. On a
     processor ``Numba`` takes a tenth or less of the time of ``Jax``, and far less of that of a ``vmap`` of ``Jax``; the
     page "Many replicas at once" of the documentation has measurements. This function does not compile itself: call it
     within ``jax.jit``.
@@ -63,13 +57,11 @@ def advance(
       moving_contacts: whether derivatives include the shift of the contacts in time, see
         ``dynamics.jax_engine``. Values do not change.
       solver: solves the contacts of each step. New numbers in it do not recompile.
-      engine: ``Jax()``, ``Numba()`` or ``Pallas()`` (experimental, not run on a device); None for an automatic choice,
-        see ``dynamics.engine``.
+      engine: ``Jax()`` or ``Numba()``; None for an automatic choice, see ``dynamics.engine``.
 
     Returns:
       The state after the last step, and the tally of the steps, with a leading (replicas,) axis for a batch. A replica
-      with a number that is not finite stops with the status ``nonfinite``. On a GPU, a replica whose lists are full
-      stops with ``capacity``.
+      with a number that is not finite stops with the status ``nonfinite``.
 
     Raises:
       InputError: the axes of a batch differ, the engine cannot do this, or a derivative in reverse mode lacks
@@ -84,27 +76,20 @@ def advance(
             return advance(flow, state, steps, free_flight, events, moving_contacts, solver=solver, engine=engine)
 
         return over_replicas(advance_one, numerics, batch, option)
-    if events is None:
-        flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
     selected = select_engine(flow, numerics, state, option)
     if isinstance(selected, Jax):
         return advance_by_jax(flow, numerics.solver, state, steps, free_flight, events, moving_contacts)
-    compiled = advance_by_numba if isinstance(selected, Numba) else advance_by_pallas
-    return _advance_compiled(compiled, flow, numerics.solver, state, steps)
+    return _advance_compiled(flow, numerics.solver, state, steps)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _advance_compiled(
-    engine: _CompiledEngine, flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array
-) -> tuple[State, Tally]:
-    """The advance by a compiled engine; its derivatives are those of the engine ``Jax``."""
-    return engine(flow, solver, state, steps)
+@jax.custom_jvp
+def _advance_compiled(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+    """The advance by the numba engine; its derivatives are those of the engine ``Jax``."""
+    return advance_by_numba(flow, solver, state, steps)
 
 
 @_advance_compiled.defjvp
-def _advance_compiled_jvp(
-    engine: _CompiledEngine, primals: tuple, tangents: tuple
-) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
+def _advance_compiled_jvp(primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
     return jax.jvp(advance_by_jax, primals, tangents)
 
 
@@ -186,11 +171,3 @@ def call_numba(
     end = State(grains, positions, velocities, state.side, found[layout.TILT])
     sums = sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32))
     return NumbaCall(end, sums, found[layout.SUSPENDED], found[layout.RECORDED].astype(jnp.int32), records, memory)
-
-
-def advance_by_pallas(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
-    """Advance one replica with the GPU kernel, or with the engine ``Jax`` on another device."""
-    from jaxgran.dynamics.pallas_engine import kernel
-
-    engines = {"cuda": kernel.advance_by_pallas, "default": advance_by_jax}
-    return lax.platform_dependent(flow, solver, state, steps, **engines)

@@ -4,20 +4,15 @@
 engine     for                                    needs
 =========  =====================================  ==========================================================
 Numba      processors                             float64, the default solver, no ``vmap`` with a named axis
-Pallas     NVIDIA GPUs; experimental              at most 1024 grains, the default solver
 Jax        everything else, and as the reference  nothing: every backend, precision, solver and derivative
 =========  =====================================  ==========================================================
 
-``Pallas`` has run in Pallas' interpreter only, not yet on a device; where it is taken, a warning says so.
-
-All engines solve the same steps to the same tolerance, and differ in speed and rounding. Derivatives and steps without
-free flight run in the engine ``Jax`` only, and ``observe`` in it and in ``Numba``. Where no engine is given, that of
-the backend is taken if it can do what is asked for, and otherwise ``Jax``. A given engine that cannot raises an
-InputError.
+Both engines solve the same steps to the same tolerance, and differ in speed and rounding. Derivatives and steps without
+free flight run in the engine ``Jax`` only. Where no engine is given, ``Numba`` is taken on a processor if it can do
+what is asked for, and otherwise ``Jax``. A given engine that cannot raises an InputError.
 """
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, ClassVar
@@ -39,11 +34,6 @@ from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
-MOST_GRAINS = 1024  # of a thread block: one thread a grain, and CUDA allows 1024 threads
-_EXPERIMENTAL = (
-    "flows take the engine pallas, which is experimental, not run on a device by its authors: it has passed its tests "
-    "in an interpreter and a trial on this device, and nothing was measured with it. The engine jax is the reference."
-)
 _SINGLE_PRECISION = (
     "JAX computes in single precision, in which flows take the engine jax, several times slower than the numba engine: "
     'begin with jax.config.update("jax_enable_x64", True).'
@@ -79,31 +69,11 @@ class Numba:
 
     name: ClassVar[str] = "numba"
     platform: ClassVar[str] = "cpu"
-    hardware: ClassVar[str] = "processors"
     options: ClassVar[tuple[str, ...]] = ("observe",)
     solver: ClassVar[str] = "gauss-seidel, barzilai-borwein where stiff"
 
 
-@dataclass(frozen=True)
-class Pallas:
-    """Engine for NVIDIA GPUs, experimental, not run on a device: up to 1024 grains, ``BarzilaiBorwein`` only.
-
-    One kernel takes all steps. It has run in an interpreter only, and a warning says so where it is taken. The compiler
-    it needs, Pallas' Triton backend, is deprecated since JAX 0.11.
-
-    Examples:
-      >>> Pallas()
-      Pallas()
-    """
-
-    name: ClassVar[str] = "pallas"
-    platform: ClassVar[str] = "gpu"
-    hardware: ClassVar[str] = "NVIDIA GPUs"
-    options: ClassVar[tuple[str, ...]] = ()
-    solver: ClassVar[str] = "barzilai-borwein"
-
-
-Engine = Jax | Numba | Pallas
+Engine = Jax | Numba
 
 
 def engine_named(name: str) -> Engine | None:
@@ -116,7 +86,7 @@ def engine_named(name: str) -> Engine | None:
       >>> engine_named("numba"), engine_named("auto")
       (Numba(), None)
     """
-    engines: dict[str, Engine | None] = {"auto": None, **{kind.name: kind() for kind in (Jax, Numba, Pallas)}}
+    engines: dict[str, Engine | None] = {"auto": None, **{kind.name: kind() for kind in (Jax, Numba)}}
     if str(name) not in engines:
         raise InputError(f"engine must be {', '.join(engines)}, not {short_repr(name)}.")
     return engines[str(name)]
@@ -139,7 +109,7 @@ def checked_numerics(solver: Any, engine: Any) -> Numerics:
     use_cache()  # what is checked here is compiled next
     require_solver(solver)
     if engine is not None and not isinstance(engine, Engine):
-        raise InputError(f"engine must be jg.Jax(), jg.Numba(), jg.Pallas() or None, not {short_repr(engine)}.")
+        raise InputError(f"engine must be jg.Jax(), jg.Numba() or None, not {short_repr(engine)}.")
     return Numerics(solver, engine)
 
 
@@ -159,24 +129,17 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     if isinstance(requested, Jax):
         return requested
     device = _device()
-    engine = requested or next((kind() for kind in (Numba, Pallas) if kind.platform == device.platform), None)
-    if engine is None:
-        return Jax()
-    option = "" if option in engine.options else option
-    why = _why_unsupported(engine, flow, numerics.solver, state, option, device)
-    if why is None and isinstance(engine, Pallas):
-        why = _why_no_kernel(requested is None, flow, state, device)
+    option = "" if option in Numba.options else option
+    why = _why_unsupported(numerics.solver, state, option, device)
     if why is None:
-        if isinstance(engine, Pallas):
-            _warn_once(_EXPERIMENTAL)
-        return engine
+        return Numba()
     if requested is None:
-        other = option or not _is_default(numerics.solver) or in_batch()
-        if state is not None and isinstance(engine, Numba) and not other and precision() == "float32":
+        other = option or not _is_default(numerics.solver) or in_batch() or device.platform != Numba.platform
+        if state is not None and not other and precision() == "float32":
             _warn_once(_SINGLE_PRECISION)
         return Jax()
     where, reason = why
-    raise InputError(f"engine must be jax or chosen automatically {where}, not {engine.name}: {reason}.")
+    raise InputError(f"engine must be jax or chosen automatically {where}, not {Numba.name}: {reason}.")
 
 
 def in_lockstep(engine: Engine | None = None) -> bool:
@@ -189,7 +152,7 @@ def in_lockstep(engine: Engine | None = None) -> bool:
 
 
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
-    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in all of them.
+    """Name of the method that solves the contacts in an engine; isolated pairs have a closed form in both.
 
     Examples:
       >>> solver_in_use(Jax(), DEFAULT_SOLVER), solver_in_use(Numba(), DEFAULT_SOLVER)
@@ -199,36 +162,23 @@ def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
 
 
 def _is_default(solver: ProjectedMethod) -> bool:
-    """Whether this is the method that all engines have, with any tolerance."""
+    """Whether this is the method that both engines have, with any tolerance."""
     return type(solver) is BarzilaiBorwein
 
 
-def _why_unsupported(
-    engine: Numba | Pallas, flow: ShearFlow, solver: ProjectedMethod, state: State | None, option: str, device: Any
-) -> tuple[str, str] | None:
-    """When an engine cannot advance a flow, and why, as two parts of a sentence; None if it can."""
-    if device.platform != engine.platform:
-        return f"on a {device.platform.upper()}", f"it is made for {engine.hardware}"
+def _why_unsupported(solver: ProjectedMethod, state: State | None, option: str, device: Any) -> tuple[str, str] | None:
+    """When the engine ``Numba`` cannot advance a flow, and why, as two parts of a sentence; None if it can."""
+    if device.platform != Numba.platform:
+        return f"on a {device.platform.upper()}", "it is made for processors"
     if option:
-        others = [kind.name for kind in (Numba, Pallas) if option in kind.options]
-        return f"with {option}", f"only the engine {' or '.join([*others, Jax.name])} does that"
+        return f"with {option}", f"only the engine {Jax.name} does that"
     if not _is_default(solver):
         return f"with the solver {solver_name(solver)}", "it has a contact solve of its own"
-    if isinstance(engine, Numba) and _dtype(state) != jnp.float64:
+    if _dtype(state) != jnp.float64:
         return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
-    if isinstance(engine, Numba) and in_batch():
+    if in_batch():
         return f"in a vmap with the axis name {AXIS!r}", "it takes a vmap without a name"
-    if isinstance(engine, Pallas) and flow.grains > MOST_GRAINS:
-        return f"with more than {MOST_GRAINS} grains", "every grain has a thread of one block"
     return None
-
-
-def _why_no_kernel(automatic: bool, flow: ShearFlow, state: State | None, device: Any) -> tuple[str, str] | None:
-    """Why a trial of the GPU kernel failed, or None; where the choice is automatic, a warning says so."""
-    problem = _kernel_problem(flow.grains, _dtype(state), device, precision() == "float64")
-    if problem and automatic:
-        _warn_once(f"flows take the engine jax: the kernel for GPUs does not run here ({problem}).")
-    return ("here", f"the kernel for GPUs does not run ({problem})") if problem else None
 
 
 def _dtype(state: State | None) -> jnp.dtype:
@@ -239,24 +189,6 @@ def _device() -> Any:
     """The device that JAX computes on by default."""
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
     return jax.devices(device)[0] if device is None or isinstance(device, str) else device
-
-
-@cache
-def _kernel_problem(grains: int, dtype: jnp.dtype, device: Any, x64: bool) -> str:
-    """Why the kernel does not compile on a device or breaks the contact law there; "" if it works. Tried once."""
-
-    def trial() -> None:
-        from jaxgran.dynamics.pallas_engine import kernel
-
-        with jax.default_device(device), jax.enable_x64(x64):
-            kernel.trial(grains, dtype)
-
-    try:
-        with ThreadPoolExecutor(1) as other:  # another thread: the trial must not become part of a trace
-            other.submit(trial).result()
-    except Exception as error:  # a compiler, a driver or a device may fail in any way
-        return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-    return ""
 
 
 @cache

@@ -43,7 +43,6 @@ from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.choices import MAX_STEPS
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import (
     State,
@@ -56,10 +55,6 @@ from jaxgran.model.state import (
 from jaxgran.model.status import Status
 
 T = TypeVar("T")
-NEEDS_EVENTS = (
-    "derivatives in reverse mode (jax.grad, jax.vjp) need the length of the loop: take advance(flow, state, steps, "
-    "events=int(count_events(flow, state, steps))), or forward mode (jax.jvp, jax.jacfwd), which needs nothing."
-)
 
 
 def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
@@ -98,7 +93,6 @@ def observe_by_jax(
     flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
     """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
-    flow, solver, state = forward_only((flow, solver, state), NEEDS_EVENTS)
     options = AdvanceOptions(solver, contact_buffers(flow.grains), observe=observe)
     loop = _event_loop(flow, state, steps, True, options)
     end = loop.end()
@@ -144,8 +138,6 @@ def count_events(
     """
     require_advance(flow, state, steps)
     require_solver(solver)
-    words = "count_events returns a whole number, which has no derivative."
-    flow, solver, state = forward_only((flow, solver, state), words)
     options = AdvanceOptions(solver)  # as in the loop of fixed length
     return _event_loop(flow, state, steps, free_flight, options).length()
 

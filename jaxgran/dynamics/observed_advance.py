@@ -20,12 +20,11 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
 from jaxgran.dynamics.collision import Observe
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
-from jaxgran.dynamics.jax_engine import NEEDS_EVENTS, ended, observe_by_jax
+from jaxgran.dynamics.jax_engine import ended, observe_by_jax
 from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 
@@ -42,7 +41,6 @@ def advance_observed(
     Raises:
       InputError: the engine asked for cannot do this, or the function returns something else than sums.
     """
-    flow, numerics, state = forward_only((flow, numerics, state), NEEDS_EVENTS)
     engine = select_engine(flow, numerics, state, "observe")
     if isinstance(engine, Jax) or _depends_on_traced(observe, flow, state):
         return observe_by_jax(flow, numerics.solver, state, steps, observe)

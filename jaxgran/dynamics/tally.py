@@ -199,7 +199,8 @@ class RunningSums(NamedTuple):
 
 def sums_from_row(numbers: Float[Array, " numbers"], status: Int[Array, ""]) -> RunningSums:
     """The running sums of an engine that keeps them in one row."""
-    return RunningSums(*(numbers[span_of(kind)] for kind in KINDS), numbers[place_of("read_until")], status)
+    flight, contact, solve, largest, instant = (numbers[span_of(kind)] for kind in KINDS)
+    return RunningSums(flight, contact, solve, largest, instant, numbers[place_of("read_until")], status)
 
 
 def empty_sums(dtype: jnp.dtype) -> RunningSums:

@@ -136,7 +136,7 @@ class MapParameters:
     engine: Any = field(
         default=None,
         metadata=row(
-            "Program that advances the flows; pallas is experimental, not run on a device.",
+            "Program that advances the flows.",
             get_args(EngineName),
             default="auto",
         ),

@@ -3,9 +3,9 @@
 from typing import Literal
 
 Activation = Literal["midpoint", "touching"]
-EngineName = Literal["auto", "numba", "jax", "pallas"]  # on the command line and in files
+EngineName = Literal["auto", "numba", "jax"]  # on the command line and in files
 FileFormat = Literal["png", "pdf", "svg"]  # of a figure
-SolverName = Literal["nesterov", "barzilai-borwein", "jacobi", "jacobi-count", "jacobi-diagonal"]
+SolverName = Literal["nesterov", "barzilai-borwein", "jacobi"]
 
 MAX_PACKING_FRACTION = 0.83
 MIN_GRAINS = 16

@@ -1,13 +1,12 @@
-"""Text of an object: one line for ``repr``, a small HTML table for a notebook.
+"""Text of an object: one line for ``repr``.
 
-Both forms use the same list of rows. An array of many values is shown by its shape and its range, so a batch of a
-thousand replicas needs no more space than one. A traced value is shown by its type.
+An array of many values is shown by its shape and its range, so a batch of a thousand replicas needs no more space than
+one. A traced value is shown by its type.
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from html import escape
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,33 +17,19 @@ _LONGEST_REPR = 100  # characters of a value that is not a number
 _LEAST_SHOWN = 1e-6  # relative error; digits below it are not shown
 _TWO_DIGITS = 3.55  # an error that begins with less has two digits
 _SMALLEST_PLAIN, _LARGEST_ROUNDED = -4, 5  # powers of ten of numbers without an exponent
-_CELL_STYLE = "text-align: left; padding: 0.1em 0.8em"
 
 
 class Row(NamedTuple):
-    """One property to show: unit "" for a dimensionless number, error None where it is not known."""
+    """One property to show, and its error, None where it is not known."""
 
     name: str
     value: Any
-    unit: str = ""
     error: Any = None
 
 
 def text_of(title: str, rows: Sequence[Row]) -> str:
     """One line: the title, then the rows as ``name=value`` in brackets."""
     return f"{title}({', '.join(f'{row.name}={value_text(row.value, row.error)}' for row in rows)})"
-
-
-def html_of(title: str, rows: Sequence[Row], note: str = "") -> str:
-    """An HTML table with one row a property and a note below it; all text is escaped."""
-    lines = [
-        f'<tr><th style="{_CELL_STYLE}">{escape(row.name.replace("_", " "))}</th>'
-        f'<td style="{_CELL_STYLE}">{escape(_plain_text(row))}</td>'
-        f'<td style="{_CELL_STYLE}">{escape(row.unit)}</td></tr>'
-        for row in rows
-    ]
-    foot = f"<div>{escape(note)}</div>" if note else ""
-    return f"<div><b>{escape(title)}</b><table>{''.join(lines)}</table>{foot}</div>"
 
 
 def value_text(value: Any, error: Any = None) -> str:
@@ -98,10 +83,6 @@ def unit_text(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _plain_text(row: Row) -> str:
-    return row.value if isinstance(row.value, str) else value_text(row.value, row.error)
-
-
 def _numbers(value: Any) -> np.ndarray | None:
     """The value as an array of numbers; None if it is not numeric, or traced."""
     if isinstance(value, (bool, str, bytes)) or value is None:
@@ -111,16 +92,6 @@ def _numbers(value: Any) -> np.ndarray | None:
     except Exception:  # JAX raises for a traced value, NumPy for a value that is no array
         return None
     return array if array.dtype.kind in "iuf" else None
-
-
-def display_methods(title: str, rows: Callable[[Any], list[Row]]) -> tuple[Callable, Callable]:
-    """The methods ``__repr__`` and ``_repr_html_`` of a class, from the function that lists its rows."""
-    return lambda self: text_of(title, rows(self)), lambda self: html_of(title, rows(self), _UNITS)
-
-
-_UNITS = (
-    "σ mean diameter, m mass of a grain of that diameter unless grains have their own, t unit of time (1/γ̇ at γ̇ = 1)"
-)
 
 
 def statuses(codes: np.ndarray) -> str:

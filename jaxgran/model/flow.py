@@ -21,14 +21,13 @@ from jaxgran.model.checks import (
     short_repr,
 )
 from jaxgran.model.choices import MAX_GRAINS, MAX_PACKING_FRACTION, MAX_STEPS, MIN_GRAINS, Activation
-from jaxgran.model.display import Row, display_methods
+from jaxgran.model.display import Row, text_of
 
 _LOOK_AHEAD = {"midpoint": 0.5, "touching": 0.0}  # θ of the activation rules
-_UNITS = {"timestep": "t", "shear_rate": "1/t", "polydispersity": "σ"}
 
 
 def _rows(flow: "ShearFlow") -> list[Row]:
-    return [Row(name, getattr(flow, name), _UNITS.get(name, "")) for name in flow.__dataclass_fields__]
+    return [Row(name, getattr(flow, name)) for name in flow.__dataclass_fields__]
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class ShearFlow(Indexable):
     restitution       –                  α in [0, 1], normal velocity after a collision over that before
     packing_fraction  –                  ν in (0, 0.83], area of the grains over area of the cell
     timestep          1/shear_rate = 1   dt, at most 0.1
-    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free, see ``cooling``
+    shear_rate        1/time             γ̇ ≥ 0; 0 in free cooling, where the unit of time is free
     polydispersity    σ                  Δ in [0, 0.5]: diameters uniform in σ ± Δ; not used with ``own_grains``
     activation        –                  "midpoint": contact if the grains overlap after half a step of free flight;
                                          "touching": contact if the grains overlap now; or θ, 0.5 or 0
@@ -74,7 +73,9 @@ class ShearFlow(Indexable):
     activation: Activation | float | jax.Array = "midpoint"
 
     __eq__, __hash__ = equal_values, hash_of_values
-    __repr__, _repr_html_ = display_methods("ShearFlow", _rows)
+
+    def __repr__(self) -> str:
+        return text_of("ShearFlow", _rows(self))
 
     def __post_init__(self):
         require_whole("grains", self.grains, MIN_GRAINS, MAX_GRAINS, "as memory is limited")
@@ -193,7 +194,7 @@ def steps_of_blocks(steps: Any, blocks: int) -> Any:
 
 def require_sheared(flow: ShearFlow) -> None:
     """Raise an InputError if the shear rate is zero, for functions that measure time in strain."""
-    words = "above 0 where strain is counted (for a flow without shear there is cooling)"
+    words = "above 0 where strain is counted (a flow without shear is advanced by jg.advance)"
     require("shear_rate", flow.shear_rate, lambda x: x > 0, words)
 
 

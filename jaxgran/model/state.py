@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.checks import InputError, is_traced
-from jaxgran.model.display import Row, arrays, display_methods, rounded
+from jaxgran.model.display import Row, arrays, rounded, text_of
 from jaxgran.model.flow import ShearFlow, require_flow
 from jaxgran.model.grains import Grains
 from jaxgran.model.status import Status
@@ -22,7 +22,7 @@ _ROUNDING = 1e-5  # of a packing fraction or a diameter in float32, with some ro
 def _rows(state: "State") -> list[Row]:
     known = arrays(state.grains.radii, state.grains.masses, state.velocities)
     if not known or known[-1].ndim < 2:
-        return [Row("positions", state.positions), Row("side", state.side, "σ"), Row("tilt", state.tilt)]
+        return [Row("positions", state.positions), Row("side", state.side), Row("tilt", state.tilt)]
     radii, masses, velocities = known
     *replicas, grains, _ = velocities.shape
     temperature = np.sum(masses[..., None] * velocities**2, axis=(-2, -1)) / (2 * grains)
@@ -30,8 +30,8 @@ def _rows(state: "State") -> list[Row]:
         *[Row("replicas", count) for count in replicas],
         Row("grains", grains),
         Row("packing_fraction", rounded(np.sum(np.pi * radii**2, axis=-1) / np.asarray(state.side) ** 2)),
-        Row("granular_temperature", rounded(temperature), "mσ²/t²"),
-        Row("side", rounded(state.side), "σ"),
+        Row("granular_temperature", rounded(temperature)),
+        Row("side", rounded(state.side)),
         Row("tilt", rounded(state.tilt)),
         Row("precision", str(velocities.dtype)),
     ]
@@ -60,7 +60,9 @@ class State(Indexable):
     tilt: Float[Array, ""]
 
     __eq__ = equal_values
-    __repr__, _repr_html_ = display_methods("State", _rows)
+
+    def __repr__(self) -> str:
+        return text_of("State", _rows(self))
 
     @property
     def _axes(self) -> tuple[int, ...]:

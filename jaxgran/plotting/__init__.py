@@ -1,4 +1,4 @@
 """Figures from datasets and snapshots. Nothing here starts a simulation.
 
-It imports `inference`, `maps` and the folders below them. Begin with `ratio`; `drawing` holds what figures share.
+It imports `maps` and the folders below them. Begin with `ratio`; `drawing` holds what figures share.
 """

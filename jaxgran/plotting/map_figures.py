@@ -14,7 +14,6 @@ from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
 from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
-from jaxgran.plotting.friction import friction_figure, has_friction_law
 from jaxgran.plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from jaxgran.plotting.size import averages_against_grains
 from jaxgran.plotting.theory import cluster_shares, has_clusters, has_theory, theory_errors
@@ -35,7 +34,6 @@ FIGURES = {
     "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),
     "factors": MapFigure(enskog_factors, lambda data: is_plane(data) and has_factors(data)),
     "clusters": MapFigure(cluster_shares, has_clusters),
-    "rheology": MapFigure(friction_figure, has_friction_law),
 }
 """All figures of a map by the ending of their files, in the order in which they are drawn."""
 
@@ -58,8 +56,6 @@ def save_figures(
     `{stem}_theory.png`      `theory_errors`             a plane as for the contours, and the predictions of the theory
     `{stem}_factors.png`     `enskog_factors`            a plane, and the factors of the error of the theory
     `{stem}_clusters.png`    `cluster_shares`            the shares of the clusters
-    `{stem}_rheology.png`    `friction_figure`           enough dense points for
-                                                         :func:`jaxgran.inference.friction_law.friction_law`
     =======================  ==========================  ===============================================================
 
     Args:

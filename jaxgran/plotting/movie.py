@@ -35,13 +35,9 @@ _Follow = Callable[[Sequence], Iterable]  # passes items on, and may report how 
 
 
 class Frames:
-    """The frames of a film, kept as they are recorded; a recording that starts again at step 0 empties them.
+    """The frames of a movie, kept as they are recorded; a recording that starts again at step 0 empties them."""
 
-    ``view`` is what is kept of a snapshot.
-    """
-
-    def __init__(self, view: Callable[[Snapshot], Any] = scene_of):
-        self._view = view
+    def __init__(self):
         self._begin()
 
     def _begin(self) -> None:
@@ -57,7 +53,7 @@ class Frames:
         if len(self.scenes) == MOST_DRAWN:
             self.scenes, self.strains, self._stride = self.scenes[::2], self.strains[::2], 2 * self._stride
         if self._recorded % self._stride == 0:
-            self.scenes.append(self._view(seen))
+            self.scenes.append(scene_of(seen))
             self.strains.append(step * (np.asarray(seen.timestep) * np.asarray(seen.shear_rate)).flat[0].item())
         self._recorded += 1
 

@@ -35,7 +35,6 @@ RATIO = "force_ratio"
 THEORIES = {
     "gaussian_moments": "moments of an anisotropic Gaussian",
     "garzo_dufty": "Garzó and Dufty",
-    "jenkins_richman": "Jenkins and Richman",
 }
 """What the theory of the series is called."""
 

@@ -28,7 +28,6 @@ from jaxgran.model.cell import cell_side
 from jaxgran.model.checks import InputError, is_traced, require_key
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.flow import ShearFlow, require_flow
-from jaxgran.model.forward_mode import forward_only
 from jaxgran.model.grains import Grains, polydisperse, require_grains
 from jaxgran.model.state import State
 
@@ -71,10 +70,6 @@ def pack(flow: ShearFlow, key: Array, grains: Grains | None = None) -> tuple[Sta
     """
     require_flow(flow)
     require_key(key)
-    message = (
-        "a packing has no derivatives in reverse mode (jax.grad, jax.vjp): differentiate what follows from its state."
-    )
-    flow, grains = forward_only((flow, grains), message)
     size_key, place_key = jax.random.split(key)
     generated = grains is None
     if grains is None:

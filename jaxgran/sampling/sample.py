@@ -27,7 +27,7 @@ from jaxgran.model.checks import (
     short_repr,
     two_digits,
 )
-from jaxgran.model.display import Row, arrays, display_methods, rounded, statuses, unit_text
+from jaxgran.model.display import Row, arrays, rounded, statuses, text_of
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_match, require_state
 from jaxgran.sampling.averages import averages
@@ -61,7 +61,7 @@ def _rows(sample: "Sample") -> list[Row]:
         *[Row("replicas", count) for count in np.shape(here.area)],
         Row("grains", here.grains),
         Row("strain", rounded(here.strain)),
-        *(Row(name, averages[name], unit_text(OBSERVABLES[name].unit), errors.get(name)) for name in _SHOWN),
+        *(Row(name, averages[name], errors.get(name)) for name in _SHOWN),
         Row("status", statuses(np.asarray(here.status))),
     ]
 
@@ -92,7 +92,9 @@ class Sample(Averages, Indexable):
     grains: int = field(metadata={"static": True})
 
     __eq__ = equal_values
-    __repr__, _repr_html_ = display_methods("Sample", _rows)
+
+    def __repr__(self) -> str:
+        return text_of("Sample", _rows(self))
 
     @property
     def _axes(self) -> tuple[int, ...]:
@@ -295,8 +297,7 @@ def sample(
       callback: called after each block with the state and the sample so far; if its result is true, the sample ends.
         One block is then compiled at a time, and neither batches nor JAX transformations apply.
       solver: solves the contacts of each step, by default ``BarzilaiBorwein()``. New numbers in it do not recompile.
-      engine: ``Jax()``, ``Numba()`` or ``Pallas()`` (experimental, not run on a device); None for the fastest that can
-        do this, see ``advance``.
+      engine: ``Jax()`` or ``Numba()``; None for the fastest that can do this, see ``advance``.
 
     Returns:
       The final state and the sample; those of a batch have a leading (replicas,) axis.

@@ -36,7 +36,6 @@ from jaxgran.model.flow import ShearFlow, one_of, require_sheared, steps_of_bloc
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
 from jaxgran.model.status import GIVEN_UP, Status
-from jaxgran.model.vmapped_in_python import vmapped_in_python
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.batch import (
     AdvanceBatch,
@@ -77,8 +76,8 @@ _LARGEST_STEADY_DRIFT = 0.1  # in ln T and ln P; a smaller drift is accepted
 _LARGEST_STEADY_ERROR = 0.1  # of the drift, in ln T and ln P; above it the test is undecided until the last chunk
 _LARGEST_LAST_RATIO = 4.0  # of the drift over the error of the noise, after the last chunk
 _UNCOMPILED = (
-    "{} cannot be transformed by jax.jit or jax.grad, since it decides in Python: call it before, and pass its state "
-    "to what is transformed."
+    "{} cannot be transformed by jax.jit, jax.vmap or jax.grad, since it decides in Python: call it before, with a "
+    "batch of keys for many states, and pass its state to what is transformed."
 )
 
 
@@ -104,7 +103,7 @@ def prepare(
 ) -> State:
     """A flow in its steady state at its time step, ready for ``sample``; or many of them at once.
 
-    A batch of keys gives as many states, each to rounding that of its own flow and key alone, as does ``jax.vmap``.
+    A batch of keys gives as many states, each to rounding that of its own flow and key alone.
 
     Args:
       flow: parameters of one flow; or numbers (replicas,) of several flows.
@@ -123,7 +122,7 @@ def prepare(
       InputError: (a ValueError) the flow is not sheared, a grain of thermal speed would cross more than a tenth of a
         diameter in one step, float32 positions cannot resolve the step, ``pack`` does not accept the grains, or the
         engine cannot do this. Or this function, which decides in Python when a flow is steady, is called within
-        ``jax.jit`` or a derivative.
+        ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: the flow, or one of the batch, did not become steady or ended with a bad status.
 
     Examples:
@@ -133,11 +132,7 @@ def prepare(
       ((16, 2), (2,))
     """
     if is_traced(flow, key, grains):
-
-        def of_batch(flow: ShearFlow, key: Array, grains: Grains | None) -> State:
-            return prepare(flow, key, equilibrate, grains, solver=solver, engine=engine)
-
-        return vmapped_in_python(of_batch, _UNCOMPILED.format("prepare"), flow, key, grains)
+        raise InputError(_UNCOMPILED.format("prepare"))
     flows, keys, discs, single = _replicas("prepare", flow, key, grains)
     if equilibrate is not None:
         words = "None or a number of at least 0 and at most 1e6"
@@ -240,11 +235,11 @@ def heated(flow: ShearFlow, key: Array, temperature: float = 1.0, grains: Grains
 
     Raises:
       InputError: (a ValueError) the temperature is not a positive number, ``pack`` does not accept the grains, or this
-        function is called within ``jax.jit`` or a derivative.
+        function is called within ``jax.jit``, ``jax.vmap`` or a derivative.
       RuntimeError: no packing was found.
     """
     if is_traced(flow, key, temperature, grains):
-        return vmapped_in_python(heated, _UNCOMPILED.format("heated"), flow, key, temperature, grains)
+        raise InputError(_UNCOMPILED.format("heated"))
     flows, keys, discs, single = _replicas("heated", flow, key, grains)
 
     def accepted(x: np.ndarray) -> Any:

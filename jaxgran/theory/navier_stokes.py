@@ -1,45 +1,12 @@
-"""Kinetic theories of monodisperse discs to Navier-Stokes order.
+"""Kinetic theory of monodisperse discs to Navier-Stokes order, that of Garzó and Dufty, for any restitution.
 
-The theory of Jenkins and Richman is for nearly elastic grains, that of Garzó and Dufty for any restitution. Both
-neglect correlations between the velocities of neighbours, so they fail near jamming and in dense flow at small
+It neglects correlations between the velocities of neighbours, so it fails near jamming and in dense flow at small
 restitution. Units: ``steady_shear``.
 """
 
 import jax.numpy as jnp
 
 from jaxgran.theory.steady_shear import Scalar, SteadyShear, as_floats, contact_value, maxwellian_collision_rate
-
-
-def jenkins_richman(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:
-    """Steady shear of nearly elastic, monodisperse discs.
-
-    ================  ====  =======================================================
-    name              unit  meaning
-    ================  ====  =======================================================
-    restitution       –     0 ≤ α < 1, meant for α near 1
-    packing_fraction  –     0 < ν < 1
-    shear_rate        1/t   γ̇ > 0
-    returns                 SteadyShear
-    ================  ====  =======================================================
-
-    At α = 1 nothing balances the work of the shear, and the temperature is infinite.
-
-    Source: J. T. Jenkins and M. W. Richman, Phys. Fluids 28, 3485 (1985).
-    """
-    alpha, nu, rate = as_floats(restitution, packing_fraction, shear_rate)
-    chi = contact_value(nu)
-    density = 4 / jnp.pi * nu
-    # Energy balance for T: viscosity √T γ̇² = cooling T^{3/2}
-    viscosity = 4 / jnp.pi * (jnp.sqrt(jnp.pi) / 8) * (1 / chi + 2 * nu + (1 + 8 / jnp.pi) * nu**2 * chi)
-    cooling = 4 / jnp.pi * (4 / jnp.sqrt(jnp.pi)) * (1 - alpha**2) * nu**2 * chi
-    temperature = viscosity / cooling * rate**2
-    return SteadyShear(
-        granular_temperature=temperature,
-        pressure=density * temperature * (1 + (1 + alpha) * nu * chi),
-        shear_stress=viscosity * jnp.sqrt(temperature) * rate,
-        collision_rate=maxwellian_collision_rate(density, chi, temperature) / rate,
-        dissipation_rate=cooling * temperature**1.5,
-    )
 
 
 def garzo_dufty(restitution: Scalar, packing_fraction: Scalar, shear_rate: Scalar = 1.0) -> SteadyShear:

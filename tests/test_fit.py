@@ -1,0 +1,93 @@
+"""A restitution is found from states at both ends of short windows, and longer windows are refused."""
+
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flows import GRAINS
+from synthetic import refused
+
+import jaxgran as jg
+
+TRUTH, GUESS, WINDOWS, STEPS = 0.73, 0.5, 3, 500
+POSITION, VELOCITY = 1e-3, 1e-2  # standard deviations of the noise
+FLOW = jg.ShearFlow(GRAINS, TRUTH, 0.6, 1e-4)
+
+
+@cache
+def starts() -> jg.State:
+    """States of four sets of windows."""
+    keys = jax.random.split(jax.random.key(0), 4 * WINDOWS)
+    return jg.prepare(replace(FLOW, timestep=1e-3), keys, equilibrate=2.0)
+
+
+def noisy(state: jg.State, seed: int) -> jg.State:
+    rng, shape = np.random.default_rng(seed), state.positions.shape
+    positions, velocities = state.positions + POSITION * rng.normal(size=shape), VELOCITY * rng.normal(size=shape)
+    return replace(state, positions=positions, velocities=state.velocities + velocities)
+
+
+def fit(seed: int, steps: int = STEPS, **options) -> tuple[jg.TrajectoryFit, jg.State]:
+    start = starts()[seed * WINDOWS : (seed + 1) * WINDOWS]
+    end, _ = jax.jit(jg.advance)(FLOW, start, jnp.int32(steps))
+    seen = noisy(start, 10 + seed) if "velocities" in options else start
+    options = {"events": 60, **options}  # compiled for all seeds
+    flow = replace(FLOW, restitution=GUESS)
+    return jg.fit_trajectory(flow, seen, noisy(end, seed), steps, POSITION, VELOCITY, **options), start
+
+
+def test_restitution_is_found_within_its_error_bar() -> None:
+    found = [fit(seed)[0] for seed in range(4)]
+    pulls = [(one.restitution - TRUTH) / one.stderr for one in found]
+    assert np.sum(np.abs(pulls) < 2) >= 3 and np.max(np.abs(pulls)) < 4, pulls
+    for one in found:
+        assert 1e-4 < one.stderr < 0.02
+        assert one.misfit[0] > 5 * one.misfit[-1] and one.misfit[-1] == pytest.approx(1, abs=0.5)
+        assert one.velocities is None and one.positions is None
+
+
+def test_states_at_the_start_are_found_better_than_they_were_seen() -> None:
+    found, start = fit(1, velocities=True, positions=True)
+    assert abs(found.restitution - TRUTH) < 4 * found.stderr
+    assert found.stderr > fit(1)[0].stderr  # what is not known costs precision
+    assert found.velocities is not None and found.positions is not None
+    assert np.std(found.velocities - start.velocities) < 0.9 * VELOCITY
+    assert np.std(found.positions - start.positions) < 0.9 * POSITION
+
+
+def test_windows_beyond_the_horizon_are_refused() -> None:
+    with refused("steps must be fewer"):
+        fit(0, 12_000, events=900)
+
+
+def test_a_window_with_more_contacts_than_events_is_refused() -> None:
+    with refused("events must be more than 2: "):
+        fit(0, events=2)
+
+
+def test_windows_that_no_restitution_explains_are_refused() -> None:
+    start = starts()[:WINDOWS]
+    flow = replace(FLOW, restitution=GUESS)
+    with refused("must follow from one restitution"):
+        jg.fit_trajectory(flow, start, noisy(start, 0), STEPS, POSITION, VELOCITY, events=60)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"flow": replace(FLOW, restitution=1.0)}, "restitution must be one first guess"),
+        ({"position_noise": 0.0}, "position_noise must be above 0"),
+        ({"steps": 0.5}, "steps must be a whole number"),
+        ({"iterations": 1}, "iterations must be a whole number of at least 10"),
+    ],
+)
+def test_a_mistake_is_a_sentence(changed: dict, words: str) -> None:
+    start = starts()[:WINDOWS]
+    given = {"flow": FLOW, "start": start, "end": start, "steps": STEPS, "position_noise": 1e-3, "velocity_noise": 1e-2}
+    with refused(words):
+        jg.fit_trajectory(**given | changed)
+    with refused("start and end must be states with the same axis"):
+        jg.fit_trajectory(**given | {"start": start[0], "end": start[0]})
