@@ -180,8 +180,8 @@ def _minimised(
         unknowns, memory = carry
         slopes, seen = jax.grad(objective, has_aux=True)(unknowns, iteration < int(_ROBUST * iterations))
         updates, memory = optimiser.update(slopes, memory, unknowns)
-        unknowns = optax.apply_updates(unknowns, updates)
-        return (unknowns | {"restitution": jnp.clip(unknowns["restitution"], 0, 1)}, memory), seen
+        moved: Any = optax.apply_updates(unknowns, updates)
+        return (moved | {"restitution": jnp.clip(moved["restitution"], 0, 1)}, memory), seen
 
     (unknowns, _), (misfit, status) = lax.scan(step, (unknowns, optimiser.init(unknowns)), jnp.arange(iterations))
     return unknowns, misfit, status

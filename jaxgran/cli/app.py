@@ -62,7 +62,7 @@ COMMANDS = {  # with their help here, as python -OO leaves docstrings out
     ),
     "run": (
         run_command,
-        "Run one flow, average it, film it.",
+        "Run one flow, and average it.",
         "Run one flow to its steady state, sample it, and print its averages with their errors.",
         RUN_EXAMPLES,
     ),
