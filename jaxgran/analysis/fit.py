@@ -20,6 +20,7 @@ from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.jax_engine import count_events, require_advance
 from jaxgran.dynamics.replicas import checked_batch
+from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
 from jaxgran.model.checks import InputError, require_number, require_untraced, require_whole
 from jaxgran.model.choices import MAX_STEPS
@@ -34,6 +35,7 @@ _MOST_ITERATIONS = 100_000
 _SOLVER = BarzilaiBorwein(tolerance=1e-9, max_steps=20_000)
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrajectoryFit:
     """A fit of the restitution to windows of a flow.
@@ -54,6 +56,8 @@ class TrajectoryFit:
     misfit: Float[np.ndarray, " iterations"]
     velocities: Float[np.ndarray, "windows grains 2"] | None = None
     positions: Float[np.ndarray, "windows grains 2"] | None = None
+
+    __eq__ = equal_values
 
 
 def fit_trajectory(

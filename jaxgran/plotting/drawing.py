@@ -21,7 +21,6 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
@@ -205,17 +204,6 @@ def add_ring_legend(figure: Figure, data: xr.Dataset, place: Any = "outside uppe
 
 
 # ---------------------------------------------------------------------------------------------- forces
-
-
-def force_lines(
-    starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray, widths: np.ndarray, **style: Any
-) -> LineCollection:
-    """Return lines from ``starts`` (pairs, 2) along ``branches`` (pairs, 2), of given widths (pairs,) in points.
-
-    They are repeated at each of the ``shifts`` (images, 2), lattice vectors that include zero.
-    """
-    images = image_segments(starts, branches, shifts)
-    return LineCollection(list(images), linewidths=np.tile(widths, len(shifts)), **style)
 
 
 def image_segments(starts: np.ndarray, branches: np.ndarray, shifts: np.ndarray) -> np.ndarray:
