@@ -98,9 +98,11 @@ def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
 def test_arrays_broadcast_with_the_shear_rate() -> None:
     alphas, nus, rates = np.array([[0.3], [0.6]]), np.array([0.2, 0.5, 0.7]), [1.0, 2.0, 3.0]
     flow, compiled = LAW(alphas, nus, rates), jax.jit(LAW)(alphas, nus, np.array(rates))
-    for one, same in zip(flow, compiled, strict=True):
-        assert one.shape == (2, 3)
-        np.testing.assert_allclose(one, same, rtol=1e-5)
+    averages, half_widths = np.split(np.stack(flow), 2)
+    same, same_half_widths = np.split(np.stack(compiled), 2)
+    assert averages.shape[1:] == (2, 3)
+    np.testing.assert_allclose(averages, same, rtol=1e-7)
+    np.testing.assert_allclose(half_widths / averages, same_half_widths / averages, atol=1e-6)  # small differences
     assert flow.pressure[1, 2] == pytest.approx(LAW(0.6, 0.7, 3.0).pressure)
 
 

@@ -85,7 +85,8 @@ def fit_trajectory(
       velocity_noise: standard deviation of each component of the peculiar velocities, in σ/t.
       velocities: whether to fit the velocities at the start, seen with the same noise.
       positions: whether to fit the positions at the start, seen with the same noise.
-      events: most steps with contacts in a window, see ``advance``; None for half as many again as at the guess.
+      events: most steps with contacts in a window, see ``advance``, at least as many as at the guess; None for half as
+        many again.
       iterations: of Adam.
 
     Raises:
@@ -102,9 +103,9 @@ def fit_trajectory(
     batch = checked_batch(require_advance, flow, start, steps)
     if batch is None or np.shape(end.positions) != np.shape(start.positions):
         raise InputError("start and end must be states with the same axis (windows,), such as prepare returns.")
-    if events is None:
-        events = 8 + int(1.5 * np.max(lax.map(lambda x: count_events(*x, solver=_SOLVER), batch)))
-    require_whole("events", events, 1, MAX_STEPS)
+    needed = int(np.max(lax.map(lambda x: count_events(*x, solver=_SOLVER), batch)))
+    events = 8 + 3 * needed // 2 if events is None else events
+    require_whole("events", events, needed, MAX_STEPS, "the most steps of an advance")
     noises = jnp.asarray([position_noise, velocity_noise])
     chosen = [name for name, given in (("velocities", velocities), ("positions", positions)) if given]
     unknowns = {name: jnp.zeros_like(start.positions) for name in chosen}
