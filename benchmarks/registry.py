@@ -230,7 +230,7 @@ BENCHMARKS = (
         "coverage",
         "How often do 95 % intervals hold, against the sampled strain and the number of seeds?",
         (6, 0.5),
-        ("coverage.json",),
+        ("coverage.json", "coverage_error.json"),
         options=(Option("--error", "judge samples that end at this error, into coverage_error.json", float),),
         one_core=True,
     ),
