@@ -19,15 +19,14 @@ from jax import lax
 import jaxgran as jg
 from benchmarks.output import Output
 from benchmarks.timing import timed
-from jaxgran.model.control_flow import AXIS
 
 POINTS = ((0.9, 0.5), (0.5, 0.7), (0.3, 0.75))
 GRAINS, TIMESTEP, REPLICAS, STEPS, GRADIENT_STEPS = 64, 1e-3, 16, 200, 20
 
 
-def by_vmap(engine, axis_name=None):
+def by_vmap(engine):
     """The advance of a batch by ``vmap``."""
-    return jax.vmap(partial(jg.advance, engine=engine), (0, 0, None), axis_name=axis_name)
+    return jax.vmap(partial(jg.advance, engine=engine), (0, 0, None))
 
 
 def by_map(engine):
@@ -45,7 +44,6 @@ WAYS = {
     "lax.map": by_map(None),
     "lax.map, Jax": by_map(jg.Jax()),
     "vmap, Jax": by_vmap(jg.Jax()),
-    'vmap, axis name "replica", Jax': by_vmap(jg.Jax(), AXIS),
 }
 
 

@@ -22,9 +22,8 @@ Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis.
         print("α = {:.1f}, ν = {:.1f}: {:.3f} ± {:.3f}".format(*row))
 
 ``sample``, ``advance`` and ``snapshot_series`` take a batch directly, also by ``jax.vmap`` and ``jax.lax.map``;
-``prepare`` and ``heated`` take a batch of keys. Leave ``engine`` out: on a processor the
-numba engine is then chosen, also under a plain ``vmap``, and nothing is faster there. A ``vmap`` with
-``axis_name="jaxgran_replica"`` takes the engine ``Jax`` in lockstep, for accelerators, far slower on a processor.
+``prepare`` and ``heated`` take a batch of keys. Leave ``engine`` out: on a processor the numba engine is then chosen,
+also under ``vmap``, and nothing is faster there.
 
 Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pairs,)``, of contacts ``(contacts,)``.
 

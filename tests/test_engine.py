@@ -17,8 +17,6 @@ from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_en
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import choices_of
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.control_flow import AXIS, in_batch
-from jaxgran.sampling import batch
 
 STEPS = jnp.int32(100)
 SETTINGS = MapSettings((0.5, 0.9), (0.6,), grains=64, seeds=1, strain=2.0)
@@ -51,11 +49,6 @@ def test_auto_takes_the_machine_code_where_it_can_and_jax_elsewhere(flowing) -> 
     assert selected(state, solver=jg.Nesterov()) == "jax"
     assert selected(single(state)) == "jax"
     assert selected(state, "events") == "jax"
-    found = []
-    batch = jax.tree.map(lambda x: x[None], state)
-    jax.vmap(lambda one: found.append(selected(one)), axis_name=AXIS)(batch)
-    jax.vmap(lambda one: found.append(selected(one)))(batch)
-    assert found == ["jax", "numba"]
 
 
 def test_a_state_of_several_precisions_is_one_sentence(flowing) -> None:
@@ -83,12 +76,6 @@ IMPOSSIBLE = {
     "single precision": (
         lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
         "in float32, not numba: it computes in float64",
-    ),
-    "a named axis": (
-        lambda state: jax.vmap(lambda one: jg.advance(of(), one, STEPS, engine=jg.Numba()), axis_name=AXIS)(
-            jax.tree.map(lambda x: x[None], state)
-        ),
-        "in a vmap with the axis name 'jaxgran_replica', not numba",
     ),
     "every step": (
         lambda state: jg.advance(of(), state, STEPS, free_flight=False, engine=jg.Numba()),
@@ -136,18 +123,12 @@ def test_the_machine_code_by_name_is_auto_to_the_bit(flowing) -> None:
 
 
 def test_jax_by_name_is_the_plain_advance(flowing, monkeypatch) -> None:
-    monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments: arguments)
+    monkeypatch.setattr(advance, "advance_by_jax", lambda *arguments, **_: arguments)
+    monkeypatch.setattr(advance, "in_batch", lambda: True)  # so that nothing is traced
     for numerics in ({"engine": jg.Jax()}, {"solver": jg.Jacobi()}, {"engine": jg.Jax(), "solver": jg.Jacobi()}):
         solver = numerics.get("solver", jg.BarzilaiBorwein())
         arguments = jg.advance(of(), flowing(0.7), STEPS, **numerics)
         assert arguments == (of(), solver, flowing(0.7), STEPS, True, None, False)
-
-
-def test_jax_by_name_advances_a_batch_in_lockstep_on_a_processor_too(flowing) -> None:
-    program = batch.batch_program(lambda x: jnp.full_like(x, in_batch()))
-    for engine, together in ((None, False), (jg.Numba(), False), (jg.Jax(), True)):
-        found = program(jnp.ones(2), lockstep=in_lockstep(engine))
-        np.testing.assert_array_equal(found, together)
 
 
 # What stands in a dataset

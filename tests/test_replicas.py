@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from synthetic import refused
 from test_docs import python_of
 
 import jaxgran as jg
+from jaxgran.dynamics import engine
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.replicas import over_replicas
 from jaxgran.model.control_flow import in_batch
@@ -78,12 +80,12 @@ def test_snapshots_take_a_batch(states: State) -> None:
     assert_same(series(FLOWS, states), jax.vmap(series)(FLOWS, states))
 
 
-@pytest.mark.parametrize(
-    ("numerics", "together"), [({}, False), ({"engine": jg.Jax()}, True), ({"solver": jg.Jacobi()}, False)]
-)
-def test_only_the_engine_in_jax_by_name_has_the_axis_of_lockstep(states: State, numerics: Any, together: bool) -> None:
+@pytest.mark.parametrize("numerics", [{}, {"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
+@pytest.mark.parametrize("platform", ["cpu", "accelerator"])
+def test_replicas_advance_together_on_an_accelerator_only(states: State, numerics: Any, platform: str, monkeypatch):
+    monkeypatch.setattr(engine, "_device", lambda: SimpleNamespace(platform=platform))
     found = over_replicas(lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states))
-    np.testing.assert_array_equal(found, ALPHAS * float(together))
+    np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 
 
 def test_more_replicas_up_to_a_power_of_two_compile_nothing(states: State, monkeypatch) -> None:

@@ -4,6 +4,8 @@ XLA calls the numba engine through its foreign function interface, so ``jit``, `
 engines.
 """
 
+from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -11,10 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
-from jaxgran.dynamics.engine import Engine, Jax, checked_numerics, select_engine
+from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
+from jaxgran.dynamics.engine import Engine, Numba, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
+from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
@@ -36,10 +40,10 @@ def advance(
 
     Without an ``engine``, ``Numba`` is taken on a processor, if the solver is a ``BarzilaiBorwein`` and
     ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. Both engines solve the same
-    steps to the same tolerance, and differ by rounding and within the tolerance only. On a
-    processor ``Numba`` takes a tenth or less of the time of ``Jax``, and far less of that of a ``vmap`` of ``Jax``; the
-    page "Many replicas at once" of the documentation has measurements. This function does not compile itself: call it
-    within ``jax.jit``.
+    steps to the same tolerance, and differ by rounding and within the tolerance only; on a processor ``Numba`` is
+    several times faster. Under ``vmap``, replicas take a processor in turn by ``Jax``, on all cores by ``Numba``, and
+    an accelerator in lockstep, with the same bits as alone. This function does not compile itself: call it within
+    ``jax.jit``.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
     (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
@@ -64,8 +68,8 @@ def advance(
       with a number that is not finite stops with the status ``nonfinite``.
 
     Raises:
-      InputError: the axes of a batch differ, the engine cannot do this, or a derivative in reverse mode lacks
-        ``events``.
+      InputError: the axes of a batch differ, or the engine cannot do this.
+      NotImplementedError: by JAX, where a derivative in reverse mode lacks ``events``.
     """
     numerics = checked_numerics(solver, engine)
     options = {"free_flight=False": not free_flight, "events": events is not None, "moving_contacts": moving_contacts}
@@ -77,20 +81,26 @@ def advance(
 
         return over_replicas(advance_one, numerics, batch, option)
     selected = select_engine(flow, numerics, state, option)
-    if isinstance(selected, Jax):
+    if isinstance(selected, Numba):
+        return _numba_engine(flow, numerics.solver, state, steps)
+    if events is not None or in_batch():
         return advance_by_jax(flow, numerics.solver, state, steps, free_flight, events, moving_contacts)
-    return _advance_compiled(flow, numerics.solver, state, steps)
+    arrays = jax.tree.map(jnp.asarray, (flow, numerics.solver, state, steps, free_flight))
+    return _jax_engine(moving_contacts)(*arrays)
 
 
-@jax.custom_jvp
-def _advance_compiled(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
-    """The advance by the numba engine; its derivatives are those of the engine ``Jax``."""
-    return advance_by_numba(flow, solver, state, steps)
+@cache
+def _jax_engine(moving_contacts: bool) -> Callable[..., tuple[State, Tally]]:
+    """The engine ``Jax`` with batches and forward derivatives; reverse mode needs ``events``, and the plain engine."""
 
+    def engine(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array, free_flight: Array):
+        return advance_by_jax(flow, solver, state, steps, free_flight, moving_contacts=moving_contacts)
 
-@_advance_compiled.defjvp
-def _advance_compiled_jvp(primals: tuple, tangents: tuple) -> tuple[tuple[State, Tally], tuple[State, Tally]]:
-    return jax.jvp(advance_by_jax, primals, tangents)
+    def of_replica(arguments: tuple) -> tuple[State, Tally]:
+        return engine(*arguments)
+
+    batched = with_own_batching(of_replica)
+    return with_forward_derivative(lambda *arguments: batched(arguments), engine)
 
 
 def register_numba() -> None:
@@ -134,6 +144,9 @@ def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
     from jaxgran.dynamics.numba_engine import layout
 
     return jax.ShapeDtypeStruct((1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64)
+
+
+_numba_engine = with_forward_derivative(advance_by_numba, advance_by_jax)
 
 
 def call_numba(

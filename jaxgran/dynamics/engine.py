@@ -30,7 +30,6 @@ from jaxgran.contact.projected_methods import (
 )
 from jaxgran.environment import precision
 from jaxgran.model.checks import InputError, short_repr
-from jaxgran.model.control_flow import AXIS, in_batch
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
@@ -44,7 +43,7 @@ _SINGLE_PRECISION = (
 class Jax:
     """The engine in JAX: every backend, precision and solver, and derivatives.
 
-    A map or a batch that names this engine advances its replicas in lockstep by ``vmap``, also on a processor.
+    The replicas of a batch advance one after another on a processor, and in lockstep on an accelerator.
 
     Examples:
       >>> Jax()
@@ -134,7 +133,7 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     if why is None:
         return Numba()
     if requested is None:
-        other = option or not _is_default(numerics.solver) or in_batch() or device.platform != Numba.platform
+        other = option or not _is_default(numerics.solver) or device.platform != Numba.platform
         if state is not None and not other and precision() == "float32":
             _warn_once(_SINGLE_PRECISION)
         return Jax()
@@ -142,13 +141,12 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     raise InputError(f"engine must be jax or chosen automatically {where}, not {Numba.name}: {reason}.")
 
 
-def in_lockstep(engine: Engine | None = None) -> bool:
-    """Whether the replicas of a batch advance together: on an accelerator, and with the engine ``Jax`` on any device.
+def in_lockstep() -> bool:
+    """Whether the replicas of a batch advance together, as one array program that waits for its slowest replica.
 
-    The batch is then one array program and waits for its slowest replica. On a processor an automatic choice of the
-    engine advances one replica after another, which is faster, also where it selects ``Jax``.
+    They do on an accelerator. On a processor they advance one after another, which is faster.
     """
-    return isinstance(engine, Jax) or _device().platform != "cpu"
+    return _device().platform != "cpu"
 
 
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
@@ -176,8 +174,6 @@ def _why_unsupported(solver: ProjectedMethod, state: State | None, option: str, 
         return f"with the solver {solver_name(solver)}", "it has a contact solve of its own"
     if _dtype(state) != jnp.float64:
         return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
-    if in_batch():
-        return f"in a vmap with the axis name {AXIS!r}", "it takes a vmap without a name"
     return None
 
 

@@ -72,7 +72,7 @@ def over_replicas(function: Callable, numerics: Numerics, batch: Arguments, opti
     Where it is chosen automatically on a processor, they advance in turn by ``lax.map``, which is faster.
     """
     flow, state, *_ = batch
-    if in_lockstep(numerics.engine):
+    if in_lockstep():
         return jax.vmap(function, axis_name=AXIS)(*batch)
     if isinstance(select_engine(flow, numerics, state, option), Jax):
         return lax.map(lambda one: function(*one), batch)
@@ -98,7 +98,7 @@ def compiled_for_few_sizes(program: Callable[..., Any], numerics: Numerics, batc
     """
     count = len(batch[-1])
     size = 1 << (count - 1).bit_length()
-    if size == count or in_lockstep(numerics.engine) or is_traced(batch):
+    if size == count or in_lockstep() or is_traced(batch):
         return waited(program(*batch))
     *others, number = jax.tree.map(lambda x: np.asarray(x)[np.minimum(np.arange(size), count - 1)], batch)
     filled = waited(program(*others, np.where(np.arange(size) < count, number, 0)))

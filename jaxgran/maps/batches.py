@@ -79,7 +79,7 @@ def batches(settings: MapSettings, workers: int, without: Container[Key] = ()) -
     flows = settings.flows()
     costs = [predicted_cost(flow) for flow in flows]
     order = sorted(range(len(costs)), key=lambda point: -costs[point])
-    lockstep, chosen = in_lockstep(settings.engine), set(points_of_part(settings))
+    lockstep, chosen = in_lockstep(), set(points_of_part(settings))
     tasks: list[list[Key]] = []
     for grains in {flow.grains: None for flow in flows}:
         points = [point for point in order if flows[point].grains == grains and point in chosen]

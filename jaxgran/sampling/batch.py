@@ -193,14 +193,14 @@ def advance_batch(
       InputError: the engine cannot do this.
     """
     program = _advance_replicas if observe is None else _observe_replicas(observe)
-    return program(flow, numerics, state, steps, lockstep=in_lockstep(numerics.engine))
+    return program(flow, numerics, state, steps, lockstep=in_lockstep())
 
 
 def advance_on_all_cores(flow: ShearFlow, numerics: Numerics, state: State, steps: Array) -> tuple[State, Tally]:
     """``advance_batch`` with the same bits; replicas that advance in turn are shared out to threads."""
     count = len(steps)
     threads = min(usable_threads(), count)
-    if threads == 1 or in_lockstep(numerics.engine) or jax.device_count() > 1:
+    if threads == 1 or in_lockstep() or jax.device_count() > 1:
         return advance_batch(flow, numerics, state, steps)
     batch = jax.tree.map(np.asarray, (flow, numerics, state, steps))
 

@@ -112,8 +112,7 @@ def prepare(
         checked here. A map gives the status ``not_steady`` if it is shorter than the correlation strain of the flow.
       grains: given discs, see ``own_grains``, those of all replicas or with a leading (replicas,) axis; None for
         diameters uniform in σ ± ``polydispersity``.
-      solver, engine: as in ``sample``, for all replicas. With ``Jax()`` those of a batch advance in lockstep by
-        ``vmap``.
+      solver, engine: as in ``sample``, for all replicas.
 
     Returns:
       The state after packing, heating, shearing and relaxing; that of a batch has a leading (replicas,) axis.
@@ -165,7 +164,7 @@ def prepare_batch(
     check_timestep(flow, theory, grains)
     expected = expected_temperature(theory.granular_temperature, flow.packing_fraction, flow.shear_rate)
     temperature = expected.astype(theory.granular_temperature.dtype)
-    state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep(numerics.engine))
+    state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep())
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
     coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains=grains))
