@@ -140,14 +140,6 @@ def test_number_of_grains_that_was_chosen_by_point_stands_at_its_point() -> None
     assert map_data(data)["grains"] is None
 
 
-def test_time_steps_that_were_chosen_by_point_stand_there_and_no_excess_is_contoured() -> None:
-    data = ratio_dataset(2, 2)
-    page = map_data(data.assign_coords(point_timestep=(data.force_ratio.dims, [[1e-3, 2e-3], [3e-4, 4e-4]])))
-    assert page["timesteps"] == [1e-3, 2e-3, 3e-4, 4e-4] and page["excessLevels"] == []
-    assert any("do not compare" in note for note in page["notes"])
-    assert map_data(data)["timesteps"] is None and map_data(data)["excessLevels"]
-
-
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
     page = map_data(ratio_dataset(1000, 1000))
     axes = [axis["values"] for axis in page["axes"][2:]]

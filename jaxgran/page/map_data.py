@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.parameters import default, options
-from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, has_one_timestep, path_of, require_map
+from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, path_of, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
@@ -28,12 +28,11 @@ _AXES = {
     "packing_fraction": "packing fraction ν",
     "restitution": "restitution α",
 }
-_SEVERAL_TIMESTEPS = "Time steps differ between points. The force ratio depends on them: its values do not compare."
 _PLANE = ("packing_fraction", "restitution")
 _COMPANIONS = ("_stderr", "_ci95")
 _FIRST = ("force_ratio", "excess")  # the page opens with the second
-_GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
-_LEFT_OUT = ("status", "point_grains", "point_timestep")
+_GROUPS = ("stresses/", "theory/", "diagnostics/")
+_LEFT_OUT = ("status", "point_grains")
 _NAMED = {name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)}  # choices of a run
 
 
@@ -48,8 +47,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses
-    grains,        the number of grains and the time step of each point, if they were chosen by point
-    timesteps
+    grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
     reference      what the reference map says of each packing fraction and restitution, see ``verdicts``
     again          what the command needs that measures a point again, if the map was made by this program
@@ -74,16 +72,15 @@ def map_data(data: MapData) -> dict[str, Any]:
         "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
         "observables": observables,
         "status": _statuses(data, dims),
-        "grains": _by_point(data, "point_grains", dims),
-        "timesteps": _by_point(data, "point_timestep", dims),
+        "grains": numbers(_column(data["point_grains"], data, dims)) if "point_grains" in data else None,
         "meanings": MEANINGS,
-        "excessLevels": list(EXCESS_LEVELS) if has_one_timestep(data) else [],
+        "excessLevels": list(EXCESS_LEVELS),
         "instants": instants,
         "encoding": ENCODING,
         "again": _again(data, dims),
         "reference": verdicts(data["packing_fraction"].values, data["restitution"].values),
         "about": _about(data),
-        "notes": notes + more + ([] if has_one_timestep(data) else [_SEVERAL_TIMESTEPS]),
+        "notes": notes + more,
     }
 
 
@@ -244,11 +241,6 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
     strain = _column(data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims)
     return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
-
-
-def _by_point(data: xr.Dataset, name: str, dims: list[str]) -> list[float | None] | None:
-    """The numbers of grains or the time steps of all points, if they were chosen by point."""
-    return numbers(_column(data[name], data, dims)) if name in data else None
 
 
 def _about(data: xr.Dataset) -> str:
