@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import random_instant, random_replica
+from synthetic import random_replica, random_state
 
 from jaxgran.maps.conventions import CONVENTIONS
 from jaxgran.maps.dataset import map_dataset, run_attributes
@@ -40,7 +40,7 @@ def made(**choices) -> xr.DataTree:
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), seeds=2, strain=2.0, snapshots=True, **choices)
     rng, points = np.random.default_rng(0), len(settings.flows())
     found = {
-        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(instant=random_instant(point))
+        (point, seed): random_replica(rng, settings, Status.ok, point)._replace(state=random_state(point))
         for point in range(points)
         for seed in range(2)
     }

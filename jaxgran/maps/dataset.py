@@ -15,7 +15,6 @@ from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
-from jaxgran.maps.instants import first_of_points, instant_variables
 from jaxgran.maps.own_observables import identity_of, own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
 from jaxgran.maps.provenance import made_with
@@ -23,6 +22,7 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
 from jaxgran.maps.seeds import NOT_RUN, STATUS_FLAGS, replica_statuses, seed_coordinate, seed_variables, worst_status
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.states import first_of_points, state_variables
 from jaxgran.maps.sums import sum_variables
 from jaxgran.maps.theory_variables import theory_variables
 from jaxgran.model.status import Status
@@ -42,7 +42,7 @@ _TITLES = {
     "diagnostics": "quality of the contact solves, conservation of momentum and energy, correlation of samples",
     "seeds": "replicas of each point",
     "sums": "running sums of each replica, from which all averages follow",
-    "snapshots": "one instant of every point",
+    "states": "last state of one replica of every point",
 }
 
 
@@ -74,7 +74,7 @@ def map_dataset(
     diagnostics                   see ``diagnostic_variables``
     seeds                         see ``seed_variables``
     sums                          see ``sum_variables``
-    snapshots                     only with the setting ``snapshots``, see ``instant_variables``
+    states                        only with the setting ``snapshots``, see ``state_variables``
     ============================  ===================================================================================
 
     ============================  ====================  =============================================================
@@ -110,7 +110,7 @@ def map_dataset(
     if any(replicas.values()):
         groups["sums"] = xr.Dataset(sum_variables(settings, grid, replicas))
     if settings.snapshots:
-        groups["snapshots"] = xr.Dataset(instant_variables(grid, first_of_points(replicas)))
+        groups["states"] = xr.Dataset(state_variables(grid, first_of_points(replicas)))
     tree = {name: follow_conventions(group, name) for name, group in groups.items()}
     tree = {name: group.assign_attrs(title=_TITLES[name]) if name in _TITLES else group for name, group in tree.items()}
     ran = {} if "engine" in run else what_runs(settings)

@@ -149,7 +149,7 @@ class MapParameters:
     snapshots: bool = field(
         default=False,
         metadata=row(
-            "Keep a snapshot of every point: its grains, and the forces between them over a strain of 0.002.",
+            "Keep the last state of every point, from which `explore` draws its grains and forces.",
             bool,
             commands=("map",),
             off=True,

@@ -119,7 +119,7 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
     dims = set(variable.dims) - set(FINEST)
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
     belongs |= name.startswith("theory/") and path_of(name.removeprefix("theory/")) in data
-    apart = name in _LEFT_OUT or name.startswith("snapshots/") or "flag_values" in variable.attrs
+    apart = name in _LEFT_OUT or name.startswith("states/") or "flag_values" in variable.attrs
     return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES}) and not (belongs or apart)
 
 
@@ -186,34 +186,26 @@ def _statuses(data: xr.Dataset, dims: list[str]) -> list[str]:
 
 def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
     """Grains and forces of every point, and a sentence if some are left out; None if the map has none."""
-    names = ("x", "y", "radius", "speed", "pair_i", "pair_j", "force", "clustered", "side", "tilt", "window")
-    if not all(f"snapshots/{name}" in data for name in names):
+    if not any(name.startswith("states/") for name in map(str, data.data_vars)):
         return None, []
-    columns = {}
-    for name in names:
-        variable = data[f"snapshots/{name}"].transpose(*dims, ...).values
-        columns[name] = variable.reshape(-1, *variable.shape[len(dims) :])
+    from jaxgran.maps.states import VARIABLES, instant_at, state_of  # here, as only this needs JAX
+
+    timesteps, values = _axis(data, "timestep"), {name: data.get(f"states/{name}") for name in VARIABLES}
+    activation = data.attrs.get("activation")
+    if not timesteps or activation not in _NAMED["activation"] or any(x is None for x in values.values()):
+        return None, []
     found, large = [], 0
-    for point in zip(*columns.values(), strict=True):
-        here = dict(zip(names, point, strict=True))
-        grains, pairs = int(np.isfinite(here["radius"]).sum()), int((here["pair_i"] >= 0).sum())
-        large += grains > MOST_GRAINS
-        if not 0 < grains <= MOST_GRAINS:
+    for place in np.ndindex(*(data.sizes[name] for name in dims)):
+        here = dict(zip(dims, place, strict=True))
+        state = state_of({name: variable.isel(here).values for name, variable in values.items()})  # type: ignore[union-attr]
+        large += state is not None and len(state.grains.radii) > MOST_GRAINS
+        if state is None or len(state.grains.radii) > MOST_GRAINS:
             found.append(None)
             continue
-        speed, force = here["speed"][:grains], here["force"][:pairs]
-        found.append(
-            grain_data(
-                positions=np.stack([here["x"], here["y"]], axis=-1)[:grains],
-                radii=here["radius"][:grains],
-                speed=speed,
-                pairs=np.stack([here["pair_i"], here["pair_j"]], axis=-1)[:pairs],
-                force=force,
-                clustered=here["clustered"][:pairs] > 0,
-                **{name: float(here[name]) for name in ("side", "tilt", "window")},
-                scale=scale_of(speed, force),
-            )
-        )
+        alpha, nu = (data[name].values[here[name]] for name in ("restitution", "packing_fraction"))
+        timestep = timesteps[here.get("timestep", 0)]
+        one = instant_at(state, float(alpha), float(nu), timestep, activation)
+        found.append(grain_data(**one._asdict(), scale=scale_of(one.speed, one.force)))
     return found, [f"Instants of more than {MOST_GRAINS} grains are not drawn."] if large else []
 
 
