@@ -24,6 +24,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -218,8 +219,8 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
         sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
         state = None
         if f"state-{row}-0" in arrays:
-            radii, masses, *others = (arrays[f"state-{row}-{k}"] for k in range(6))
-            state = State(Grains(radii, masses), *others)
+            found: list[Any] = [arrays[f"state-{row}-{k}"] for k in range(6)]  # the leaves of a state
+            state = State(Grains(*found[:2]), *found[2:])
         replicas[point, seed] = Replica(sample, status, float(strain), state)
     return replicas
 

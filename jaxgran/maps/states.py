@@ -66,10 +66,9 @@ def state_of(here: Mapping[str, np.ndarray], dtype: Any = float) -> State | None
     if not np.isfinite(here["side"]):
         return None
     grains = np.isfinite(here["radii"])
-    of_grains = {name: np.asarray(here[name][grains], dtype) for name in _OF_GRAINS}
-    discs = Grains(of_grains["radii"], of_grains["masses"])
-    side, tilt = (np.asarray(here[name], dtype) for name in _OF_CELL)
-    return State(discs, of_grains["positions"], of_grains["velocities"], side, tilt)
+    found: dict[str, Any] = {name: np.asarray(here[name][grains], dtype) for name in _OF_GRAINS}
+    found |= {name: np.asarray(here[name], dtype) for name in _OF_CELL}
+    return State(Grains(found.pop("radii"), found.pop("masses")), **found)
 
 
 def states_of(data: xr.Dataset, count: int, dtype: Any = float) -> dict[int, State]:
