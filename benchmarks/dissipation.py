@@ -126,7 +126,8 @@ def compared(data: xr.Dataset) -> Points:
     local, length = value("local_granular_temperature"), value("theory/correlation_length")
     by_pressure, chaos = value("theory/correlation_length_from_pressure"), value("theory/enskog_factor_pressure_chaos")
     of_temperature = value("theory/enskog_factor_pressure_local_temperature")
-    contact, enskog = value("stresses/contact_pressure"), value("theory/enskog_pressure")
+    stress, enskog = value("stresses/contact_stress"), value("theory/enskog_pressure")
+    contact = (stress[..., 0, 0] + stress[..., 1, 1]) / 2
     return {
         "alpha": alpha,
         "nu": nu,

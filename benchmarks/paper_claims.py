@@ -79,7 +79,7 @@ def spread(sample: jg.Sample) -> dict[str, Any]:
 def order(quick: bool) -> list[dict]:
     """Overall and local hexatic order over the map, of points at random, and with and without polydispersity."""
     data = jg.open_map(RESULTS / "paper.nc")
-    instants = data["snapshots"].to_dataset()
+    instants = data["states"].to_dataset()
     rows = []
     for nu in data.packing_fraction.values:
         here = instants.sel(packing_fraction=nu)
@@ -113,7 +113,7 @@ def order(quick: bool) -> list[dict]:
 
 def instant(point: Any) -> tuple[np.ndarray, float, float]:
     """Positions, side and tilt of one point of a map."""
-    return np.stack([point.x.values, point.y.values], axis=1).astype(float), float(point.side), float(point.tilt)
+    return point.positions.values, float(point.side), float(point.tilt)
 
 
 def hexatic(positions: np.ndarray, side: float, tilt: float) -> tuple[float, float]:

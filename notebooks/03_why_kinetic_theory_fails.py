@@ -61,7 +61,8 @@ print(f"α = {restitution[2]}, ν = {packing_fraction[1]}, N = {grains}, dt = 3e
 for name in names:
     print(f"{name:18s} {text(point, f'theory/enskog_factor_pressure_{name}')}")
 product = np.prod([float(point[f"theory/enskog_factor_pressure_{name}"]) for name in names])
-whole = float(point["stresses/contact_pressure"] / point["theory/enskog_pressure"])
+contact = point["stresses/contact_stress"].values
+whole = float(np.trace(contact) / 2 / point["theory/enskog_pressure"])
 print(f"measured over Enskog's contact pressure: {whole:.4f}; product of the factors: {product:.4f}")
 
 # %% [markdown]
@@ -84,11 +85,11 @@ jg.enskog_factors(data)
 timesteps = [1e-3, 3e-4] if quick else [1e-3, 1e-4, 3e-5]
 size = min(grains, 256)
 fine = jg.ratio_map([0.2, 0.5], [0.6, 0.65], timestep=timesteps, grains=size, seeds=1 if quick else 2)
-whole, below = fine["stresses/contact_pressure"], fine["theory/enskog_pressure"]
-ratio = whole / below
-stderr = ratio * np.hypot(
-    fine["stresses/contact_pressure_stderr"] / whole, fine["theory/enskog_pressure_stderr"] / below
-)  # as if the two were independent
+below = fine["theory/enskog_pressure"]
+xx, yy = (fine["stresses/contact_stress"].isel(axis_a=k, axis_b=k) for k in (0, 1))
+errors = [fine["stresses/contact_stress_stderr"].isel(axis_a=k, axis_b=k) for k in (0, 1)]
+ratio = (xx + yy) / 2 / below
+stderr = ratio * np.hypot(sum(errors) / (xx + yy), fine["theory/enskog_pressure_stderr"] / below)  # as if independent
 for alpha in (0.2, 0.5):
     for timestep in timesteps:
         one = {"restitution": alpha, "packing_fraction": 0.6, "timestep": timestep}

@@ -80,7 +80,7 @@ def write_few_variables(patch: pytest.MonkeyPatch, *more: str) -> None:
     """Files of maps have the ratios and what is named: to write and read all variables takes a second or two."""
     whole, names = results.write_dataset, ("force_ratio", "stress_ratio", *more)
     kept = {f"{name}{end}" for name in names for end in ("", "_stderr", "_ci95")}
-    kept |= {"status", "seeds/status", "seeds/strain", "seeds/sample_timestep"}
+    kept |= {"status", "seeds/status", "seeds/strain"}
     patch.setattr(results, "write_dataset", lambda data, path: whole(with_variables(data, *kept), path))
 
 

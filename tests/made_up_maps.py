@@ -4,7 +4,6 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.plotting.enskog_factors import PANELS
-from jaxgran.sampling.enskog_factors import RATES
 
 FLAGS = "ok iteration_limit not_steady deep_overlap infeasible capacity nonfinite"
 RATE = 8.0  # of the growth of the synthetic excess with 1 − α and with 2ν
@@ -31,7 +30,7 @@ def ratio_dataset(alphas: int = 5, nus: int = 6, relative_error: float = 0.05) -
         },
         coords={"packing_fraction": nu, "restitution": alpha},
         attrs={
-            "format_version": 2,
+            "format_version": 3,
             "timestep": 3e-4,
             "activation": "midpoint",
             "grains": 256,
@@ -92,22 +91,22 @@ def theory_dataset(alphas: int = 5, nus: int = 6) -> xr.Dataset:
     """Return a synthetic map with stresses, what a theory predicts of them, and shares of clusters."""
     data = ratio_dataset(alphas, nus)
     x, nu = 1.0 - data.restitution.values[None, :], data.packing_fraction.values[:, None]
+    tensors = {f"stresses/{part}_stress": np.zeros((*data.force_ratio.shape, 2, 2)) for part in ("kinetic", "binary")}
     added = {}
     for scale, name in ((3.0, "pressure"), (1.0, "shear_stress")):
         measured = scale * np.exp(2.0 * nu) * np.ones_like(x)
         binary = measured * np.exp(assumption_of(x, nu))
-        parts = {
-            name: measured,
-            f"stresses/kinetic_{name}": 0.3 * measured,
-            f"stresses/binary_{name}": binary - 0.3 * measured,
-        }
-        added |= {key: (DIMS, value) for key, value in parts.items()}
-        added |= {f"{key}_stderr": (DIMS, STDERR * value) for key, value in parts.items()}
+        added |= {name: (DIMS, measured), f"{name}_stderr": (DIMS, STDERR * measured)}
+        for tensor, part in zip(tensors.values(), (0.3 * measured, binary - 0.3 * measured), strict=True):
+            for a, b in ((0, 0), (1, 1)) if name == "pressure" else ((0, 1), (1, 0)):
+                tensor[..., a, b] = part if a == b else -part
         added[f"theory/{name}"] = (DIMS, binary * np.exp(closure_of(x, nu)))
-    shown = {f"enskog_factor_{rate}_{factor}": k for rate in RATES for k, factor in enumerate(PANELS)}
+    shown = {f"enskog_factor_pressure_{factor}": k for k, factor in enumerate(PANELS)}
     for name, k in (shown | {"correlation_length_from_pressure": len(PANELS)}).items():
         value = np.exp(factor_of(k, x, nu)) * np.ones(data.force_ratio.shape)
         added |= {f"theory/{name}": (DIMS, value), f"theory/{name}_stderr": (DIMS, STDERR * value)}
+    added |= {name: ((*DIMS, "axis_a", "axis_b"), tensor) for name, tensor in tensors.items()}
+    added |= {f"{name}_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * np.abs(x)) for name, x in tensors.items()}
     ratio = np.ones((*data.force_ratio.shape, 2, 2))
     added |= {"stress_ratio": ((*DIMS, "axis_a", "axis_b"), ratio)}
     added |= {"stress_ratio_stderr": ((*DIMS, "axis_a", "axis_b"), STDERR * ratio)}

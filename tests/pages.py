@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import random_instant, random_replica
+from synthetic import random_replica, random_state
 
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.settings import MapSettings
@@ -37,8 +37,8 @@ def page_map() -> xr.DataTree:
     for point in range(len(flows)):
         status = Status.deep_overlap if point == 7 else Status.ok
         if point != 8:
-            instant = random_instant(point, 64, 12)._replace(force=np.geomspace(1, 100, 12))
-            results[point, 0] = random_replica(rng, settings, status)._replace(instant=instant)
+            state = random_state(point, 64)
+            results[point, 0] = random_replica(rng, settings, status)._replace(state=state)
             results[point, 1] = random_replica(rng, settings, status)
     data = map_dataset(settings, results, {"title": MARKUP})
     own = data.force_ratio.assign_attrs(long_name=MARKUP, units="<i>σ</i>") ** 2

@@ -57,6 +57,14 @@ def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
     )
 
 
+def random_state(seed: int, grains: int = 20, side: float = 10.0) -> State:
+    """Return grains of random sizes and velocities at random places of a cell."""
+    rng = np.random.default_rng(seed)
+    radii = rng.uniform(0.3, 0.7, grains)
+    positions, velocities = rng.uniform(-side / 2, side / 2, (grains, 2)), rng.normal(size=(grains, 2))
+    return State(Grains(radii, 4 * radii**2), positions, velocities, np.float64(side), np.float64(0.2))
+
+
 def one_sentence(message: str) -> bool:
     """Whether a message is one line that starts with a word and ends with a full stop."""
     return message.count("\n") == 0 and message.endswith(".") and not message.endswith("..")

@@ -198,7 +198,7 @@ def test_what_can_be_no_argument_is_refused_in_one_sentence(argument: str) -> No
     function = {**NUMBERS, **OBJECTS}[argument]
     for value in NEVER:
         suits = (value is SEEN and argument == "fields_at seen") or (value is KEYS and argument == "prepare key")
-        suits |= argument in ("ratio_map attributes", "ratio_map observe_units") and isinstance(value, dict)
+        suits |= argument == "ratio_map attributes" and isinstance(value, dict)
         if not suits:
             assert verdict(function, value)
 

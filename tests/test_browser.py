@@ -239,7 +239,7 @@ def test_controls_do_what_they_say(map_page) -> None:
         set_control(map_page, "levels", levels)
         sizes.append(trace(map_page, "plane", "observable")["contours"]["size"])
     assert sizes[0] > 2 * sizes[1]
-    choose(map_page, observable=names(map_page).index("contact_force"))
+    choose(map_page, observable=names(map_page).index("coordination_number"))
     assert not map_page.find_element("id", "choose-quotient").is_enabled()  # nothing predicts it
 
 

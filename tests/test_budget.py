@@ -13,7 +13,7 @@ RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 MEASURED = {
     "force_ratio": 1.3,
     "pressure": 2.0,
-    "contact_pressure": 1.5,
+    "contact_stress": np.array([[1.7, -0.5], [-0.5, 1.3]]),
     "shear_stress": 0.8,
     "granular_temperature": 0.4,
     "local_granular_temperature": 0.3,

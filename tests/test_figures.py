@@ -13,7 +13,6 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from jaxgran.model.checks import InputError
 from jaxgran.plotting.map_figures import save_figures
 from jaxgran.plotting.ratio import EXCESS_LEVELS, ratio_against_timestep, ratio_contours, ratio_curves
 
@@ -151,18 +150,6 @@ def test_points_of_bad_status_are_ringed_and_explained() -> None:
     for figure in (curves, contours):
         assert "status not ok" in legend_texts(figure)
         assert "Status not ok: not steady (1), iteration limit (1)" in caption(figure)
-
-
-def test_force_ratios_at_several_time_steps_are_neither_contoured_nor_joined(tmp_path: Path) -> None:
-    data = ratio_dataset(3, 3)
-    timesteps = np.linspace(1e-4, 9e-4, 9).reshape(3, 3)
-    data = data.assign_coords(point_timestep=(data.force_ratio.dims, timesteps))
-    data.attrs["timestep_by_point"] = timesteps.ravel()
-    with pytest.raises(InputError, match=r"^a contour of the force ratio needs .* at 0.0001 to 0.0009 / shear rate"):
-        ratio_contours(data)
-    curves = [one[0] for one in ratio_curves(data).axes[0].containers if isinstance(one, ErrorbarContainer)]
-    assert {line.get_linestyle() for line in curves} == {"None"}
-    assert [path.name for path in save_figures(data, tmp_path / "map")] == ["map_curves.png"]
 
 
 def test_missing_points_leave_the_rest() -> None:

@@ -13,7 +13,7 @@ import xarray as xr
 from command_line import in_a_process
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_instant, random_replica, refused
+from synthetic import random_replica, random_state, refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics.engine import Numba
@@ -42,7 +42,7 @@ def replicas() -> dict[Key, Replica]:
     )
     keys = [(point, seed) for point in range(6) for seed in range(3)]
     made = {key: random_replica(rng, SETTINGS, bad.get(key, Status.ok), key[0]) for key in keys}
-    return {key: one._replace(instant=random_instant(10 * key[0] + key[1])) for key, one in made.items()}
+    return {key: one._replace(state=random_state(10 * key[0] + key[1])) for key, one in made.items()}
 
 
 def of_seeds(replicas: dict[Key, Replica], first: int, count: int, **change: Any) -> xr.DataTree:

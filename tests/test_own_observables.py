@@ -13,9 +13,6 @@ from jaxgran.contact.projected_methods import Jacobi
 from jaxgran.dynamics.engine import Numba
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import checkpoint, journal
-from jaxgran.maps.dataset import map_dataset
-from jaxgran.maps.merge import merge_maps
-from jaxgran.maps.own_names import RESERVED
 from jaxgran.maps.own_observables import identity_of
 from jaxgran.maps.ratio_map import ratio_map
 from jaxgran.maps.results import choices_of, open_map
@@ -64,14 +61,11 @@ def test_what_repeats_a_built_in_average_has_its_values_and_errors(observed) -> 
         np.testing.assert_allclose(own, built_in, rtol=1e-9)
         own, built_in = observed[f"own_stress{end}"], observed[f"stresses/contact_stress{end}"]
         np.testing.assert_allclose(own, built_in, rtol=1e-9)
-    np.testing.assert_allclose(observed["seeds/contacts_per_grain"], observed["seeds/coordination_number"], rtol=1e-12)
-    np.testing.assert_allclose(observed["seeds/own_stress"], observed["seeds/contact_stress"], rtol=1e-12)
 
 
 def test_variables_have_the_dimensions_of_what_is_returned(observed) -> None:
     point = ("packing_fraction", "restitution")
     assert observed.own_stress.dims == (*point, "own_stress_dim_0", "own_stress_dim_1")
-    assert observed["seeds/own_stress"].dims == (*point, "seed", "own_stress_dim_0", "own_stress_dim_1")
     assert "units" not in observed.own_stress.attrs
     interval = observed.contacts_per_grain_ci95
     np.testing.assert_allclose(interval.sel(error_source="sampling"), 1.96 * observed.contacts_per_grain_stderr)
@@ -110,45 +104,6 @@ def test_an_unfinished_map_goes_on_to_the_same_bits_with_the_same_function_only(
         ratio_map(**MAP, output=output, resume=True)
     with refused("must be a function that is passed to `ratio_map`"):
         MapSettings(**choices_of(data))
-
-
-UNITS = {"own_stress": "m / t^2", "contacts_per_grain": "1"}
-
-
-def assert_units(data: xr.DataTree) -> None:
-    """Values, errors and those of the seeds have the units, as CF asks (see ``conventions``)."""
-    for end in ("", "_stderr", "_ci95"):
-        assert (data[f"own_stress{end}"].units, data[f"own_stress{end}"].reduced_unit) == ("1", "m / t^2")
-        assert data[f"contacts_per_grain{end}"].units == "1"
-    assert data["seeds/own_stress"].reduced_unit == "m / t^2" and data["seeds/contacts_per_grain"].units == "1"
-
-
-def test_units_are_labels_in_the_file_and_no_part_of_what_is_resumed(observed, tmp_path) -> None:
-    output = tmp_path / "map.nc"
-    data = ratio_map(**MAP, observe=observe, observe_units=UNITS, output=output)
-    assert_units(data)
-    assert_units(open_map(output))
-    assert_same_variables(data, observed)
-    again = ratio_map(**MAP, observe=observe, observe_units={"own_stress": "N"}, output=output, resume=True)
-    assert again.own_stress.reduced_unit == "N"
-    assert_same_variables(again, observed)
-    one = {**MAP, "seeds": 1, "observe": observe, "observe_units": UNITS}
-    assert_units(merge_maps([ratio_map(**one), ratio_map(**one, first_seed=1)], observe))
-
-
-@pytest.mark.parametrize(
-    ("units", "words"),
-    [
-        ({"torque": "1"}, "names that observe returns, which are contacts_per_grain, own_stress, not 'torque'"),
-        ({"own_stress": 3}, "must be a dictionary of units by name"),
-        (["m"], "must be a dictionary of units by name"),
-    ],
-)
-def test_units_of_what_is_not_observed_are_refused_before_the_map_runs(units: Any, words: str) -> None:
-    with refused(words):
-        ratio_map(**MAP, observe=observe, observe_units=units)
-    with pytest.raises(InputError, match="and there are none, not 'a'"):
-        ratio_map(**MAP, observe_units={"a": "1"})
 
 
 def test_what_a_function_computes_counts_and_not_its_place() -> None:
@@ -191,7 +146,7 @@ REFUSED = {
         (lambda seen: {"a": seen.impulses}, "must return sums over the contacts"),
         (lambda _: {"of all": 1.0}, "names without spaces and signs, not .'of all'."),
         (lambda _: {"pressure": 1.0}, "names that a map does not have, not 'pressure'"),
-        (lambda _: {"a": np.ones(2), "a_dim_0": 1.0}, "names that a map does not have, not 'a_dim_0'"),
+        (lambda _: {"a_ci95": 1.0}, "names that a map does not have, not 'a_ci95'"),
     ]
 }
 
@@ -205,11 +160,3 @@ def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None
 def test_an_engine_that_cannot_observe_is_refused() -> None:
     with pytest.raises(InputError, match="with the solver jacobi, not numba"):
         ratio_map(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)
-
-
-def test_no_name_of_a_map_is_free() -> None:
-    settings = MapSettings(**{**MAP, "grains": (32, 64), "timestep": (1e-3, 1e-4), "snapshots": True})
-    data = map_dataset(settings, {}, {})
-    names = {*data.children, *data.dims, *data.coords, *data.data_vars}
-    names |= {name for group in data.children.values() for name in (*group.dims, *group.coords)}
-    assert {*names, *data["seeds"].data_vars} <= RESERVED

@@ -61,7 +61,7 @@ def test_a_plane_in_any_order_is_sorted_with_the_grains_of_its_points() -> None:
     mixed = {"packing_fraction": (0.7, 0.6), "restitution": (0.9, 0.1, 0.5)}
     grains = dict(zip(product((1e-3, 1e-4), *mixed.values()), range(16, 28), strict=True))
     given = {**GOOD, **mixed, "timestep": (1e-3, 1e-4), "grains_by_point": list(grains.values())}
-    settings, _ = chosen(**given, tolerance="auto")
+    settings, _ = chosen(**given)
     assert settings.axes == {"timestep": (1e-3, 1e-4), "packing_fraction": (0.6, 0.7), "restitution": (0.1, 0.5, 0.9)}
     for flow in settings.flows():
         assert grains[flow.timestep, flow.packing_fraction, flow.restitution] == flow.grains
@@ -95,39 +95,29 @@ def test_automatic_time_step_does_not_depend_on_the_numbers_of_grains() -> None:
     assert several == (replace(one[0], grains=(64, 1024)), one[1])
 
 
-def test_each_point_has_its_own_automatic_time_step_which_is_that_of_its_own_map() -> None:
+def test_the_automatic_time_step_is_the_shortest_that_a_point_needs() -> None:
     plane = {"restitution": (0.9, 0.2), "packing_fraction": (0.6, 0.82)}
     given = {**GOOD, "timestep": "auto", "grains": (64, 256), "strain": None}
     settings, sentence = chosen(**{**given, **plane})
-    for flow in settings.flows():
-        alone, _ = chosen(**{**given, "restitution": [flow.restitution], "packing_fraction": [flow.packing_fraction]})
-        assert alone.timestep_by_point is None and alone.timestep == flow.timestep
-    steps = [flow.timestep for flow in settings.flows()]
-    assert settings.timestep == min(steps) < max(steps)
-    assert f"timestep {min(steps):g} to {max(steps):g} / shear rate" in sentence
-    assert all(flow.timestep <= 1 / 160 for flow in chosen(**{**given, **plane, "strain": 1.0})[0].flows())
-
-
-@pytest.mark.parametrize("wrong", [(1e-3,), 1e-3, (1e-3, -1.0), (1e-3, 5e-3)])
-def test_time_steps_by_point_are_one_for_each_and_short_enough(wrong: Any) -> None:
-    assert [flow.timestep for flow in chosen(**GOOD, timestep_by_point=(1e-3, 1e-4))[0].flows()] == [1e-3, 1e-4]
-    with refused("timestep"):
-        chosen(**GOOD, timestep_by_point=wrong)
+    alone = [
+        chosen(**{**given, "restitution": [alpha], "packing_fraction": [nu]})[0].timestep
+        for alpha, nu in product(*plane.values())
+    ]
+    assert {flow.timestep for flow in settings.flows()} == {min(alone)} < {*alone}
+    assert f"timestep {min(alone):g} / shear rate" in sentence
+    assert chosen(**{**given, **plane, "strain": 1e-3})[0].timestep <= 1e-3 / 160
 
 
 def test_automatic_choices_are_finer_for_a_smaller_error() -> None:
-    given = {**GOOD, "restitution": (0.1, 0.9), "strain": None, "timestep": "auto", "tolerance": "auto"}
+    given = {**GOOD, "restitution": (0.1, 0.9), "strain": None, "timestep": "auto"}
     found = [chosen(**given, error=error) for error in (0.1, 0.01, 0.001)]
-    timesteps, tolerances = zip(*((settings.timestep, settings.solver.tolerance) for settings, _ in found), strict=True)
-    assert list(timesteps) == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
-    assert list(tolerances) == sorted(set(tolerances), reverse=True)
+    timesteps = [settings.timestep for settings, _ in found]
+    assert timesteps == sorted(timesteps, reverse=True) and timesteps[-1] < timesteps[0]
     assert all("restitution 0.9 and packing fraction 0.6" in sentence for _, sentence in found)
 
 
 def test_given_numbers_stay_as_they_are() -> None:
     assert chosen(**GOOD) == (MapSettings(**GOOD), "")
-    settings, sentence = chosen(**{**GOOD, "tolerance": "auto"})
-    assert settings.timestep == GOOD["timestep"] and "timestep" not in sentence
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array])
@@ -158,7 +148,7 @@ def test_numbers_of_grains_may_be_given_by_point() -> None:
 def test_a_given_tolerance_is_that_of_the_solver() -> None:
     settings, _ = chosen(**{**GOOD, "solver": Jacobi(relaxation=1.5), "tolerance": 1e-3})
     assert settings.solver == Jacobi(tolerance=1e-3, relaxation=1.5)
-    for value in (0.0, 1.0, "small"):
+    for value in (0.0, 1.0, "auto"):
         with pytest.raises(InputError, match="tolerance must be between"):
             chosen(**{**GOOD, "tolerance": value})
 
@@ -168,9 +158,7 @@ def test_the_command_and_the_function_start_alike() -> None:
     python = {one.name for one in fields(RunParameters)}
     python_only = {
         "observe",
-        "observe_units",
         "grains_by_point",
-        "timestep_by_point",
         "progress",
         "record",
         "attributes",
@@ -189,14 +177,14 @@ def test_the_command_and_the_function_start_alike() -> None:
             with_start(wrong)
 
 
-def test_an_error_chooses_grains_by_point_time_step_and_tolerance() -> None:
+def test_an_error_chooses_grains_by_point_and_one_time_step() -> None:
     given = {"restitution": (0.2, 0.9), "packing_fraction": (0.6, 0.82), "error": 0.2, "seeds": 1}
-    settings, sentence = chosen(**given, grains="auto", timestep="auto", tolerance="auto")
+    settings, sentence = chosen(**given, grains="auto", timestep="auto")
     for flow in settings.flows():
         assert size_error(float(flow.restitution), float(flow.packing_fraction), flow.grains) <= 0.6 * 0.2
     assert len({flow.grains for flow in settings.flows()}) > 1
     assert f"{settings.grains} grains, 1 seed" in sentence and "error of 0.2" in sentence
-    assert settings.timestep_by_point is None  # so that the force ratios of its points compare
+    assert {flow.timestep for flow in settings.flows()} == {settings.timestep}
 
 
 def test_an_error_that_needs_too_many_grains_names_the_smallest_one() -> None:

@@ -106,26 +106,18 @@ def with_observed(observed: Any) -> Sample:
     return replace(SAMPLES, tally=replace(SAMPLES.tally, observed=observed))
 
 
-def test_dataset_of_a_sample_has_what_was_observed_with_its_units() -> None:
+def test_dataset_of_a_sample_has_what_was_observed() -> None:
     rng = np.random.default_rng(3)
     sums = {"torque": rng.uniform(1, 2, (2, BLOCKS)), "fabric": rng.uniform(1, 2, (2, BLOCKS, 3))}
     samples = with_observed(sums)
-    data = samples.to_dataset(observe_units={"torque": "m sigma^2 / t^2"})
+    data = samples.to_dataset()
     assert data.fabric.dims == ("replica", "fabric_dim_0") and samples[0].to_dataset().fabric.dims == ("fabric_dim_0",)
     for name, x in sums.items():
         steps = SAMPLES.tally.steps.sum(axis=1).reshape(2, *[1] * (x.ndim - 2))
         np.testing.assert_allclose(data[name], x.sum(axis=1) / steps, rtol=1e-12)
         np.testing.assert_array_equal(data[f"{name}_stderr"][1], samples[1].observed()[1][name])
-    for end in ("", "_stderr"):
-        assert data[f"torque{end}"].attrs["reduced_unit"] == "m sigma^2 / t^2"
-        assert "units" not in data[f"fabric{end}"].attrs
-    for observed, units, words in (
-        (sums, {"spin": "1"}, "names that observe returns, which are torque, fabric, not 'spin'"),
-        (None, {"spin": "1"}, "and there are none, not 'spin'"),
-        ({"pressure": sums["torque"]}, {}, "names that a sample does not have, not 'pressure'"),
-    ):
-        with pytest.raises(InputError, match=words):
-            with_observed(observed).to_dataset(units)
+    with pytest.raises(InputError, match="names that a sample does not have, not 'pressure'"):
+        with_observed({"pressure": sums["torque"]}).to_dataset()
 
 
 def test_observed_tells_what_is_missing() -> None:

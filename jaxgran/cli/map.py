@@ -17,7 +17,7 @@ from jaxgran.model.display import with_error
 
 MAP_EXAMPLES = {
     "Restitutions 0.2 to 0.8 and packing fractions 0.5 to 0.79, half a minute on two cores": "jaxgran map",
-    "Another plane, each point at its automatic time step": "jaxgran map --restitution 0.1,0.5,0.9 "
+    "Another plane, at the automatic time step": "jaxgran map --restitution 0.1,0.5,0.9 "
     "--packing-fraction 0.5:0.8:4 --timestep auto --output ratio.nc",
     "Until relative errors are below 10 %, and again after an interruption": "jaxgran map --error 0.1 --resume",
 }
@@ -95,10 +95,6 @@ def print_tables(data) -> None:
             continue
         print_table(_ratio_table(part, "Force ratio", part.force_ratio, part.force_ratio_stderr))
         print_table(_ratio_table(part, "Shear-stress ratio", *shear_stress_ratio(part)))
-    if "grains" in data.dims:
-        for part in parts(data.isel(grains=-1)):
-            if np.isfinite(part.force_ratio).any():
-                print_table(_large_system_table(part))
     print_budget(data)
 
 
@@ -124,13 +120,11 @@ plot_command = command(PLOT_OPTIONS, run_plot_command, argument=FILE)
 
 def _ratio_table(data, name: str, ratio, stderr) -> Table:
     """A ratio of a map with standard errors; * marks a bad status."""
-    from jaxgran.maps.schema import has_one_timestep, timestep_text
-
     rule = data.attrs["activation"]
     size = f"{data.attrs['grains']} grains, " if "grains" in data.coords else ""
-    title = f"{name} at {size}dt = {timestep_text(data)} / shear rate, {rule} activation; a column is a restitution"
-    if not has_one_timestep(data):
-        title += "\ndt differs between points, and the ratio depends on it: values are not comparable"
+    title = (
+        f"{name} at {size}dt = {data.attrs['timestep']:g} / shear rate, {rule} activation; a column is a restitution"
+    )
     table = Table(title, ["packing fraction", *(f"{alpha:g}" for alpha in data.restitution.values)])
     for nu in data.packing_fraction.values:
         row = {"packing_fraction": nu}
@@ -138,24 +132,4 @@ def _ratio_table(data, name: str, ratio, stderr) -> Table:
         cells = zip(ratio.sel(row).values, stderr.sel(row).values, strict=True)
         texts = (with_error(value, error) if math.isfinite(value) else "no value" for value, error in cells)
         table.rows.append([f"{nu:g}", *(text + mark for text, mark in zip(texts, marks, strict=True))])
-    return table
-
-
-def _large_system_table(data) -> Table:
-    """The estimates for a large system, a row for each point."""
-    from jaxgran.maps.large_system import BOUNDS, CONVERGED
-    from jaxgran.maps.schema import timestep_text
-
-    title = f"Large systems at dt = {timestep_text(data)} / shear rate; ± bounds the error of sampling and size"
-    columns = ["packing fraction", "restitution", *(name.replace("_", " ") for name in BOUNDS)]
-    table = Table(title, columns, keys=2)
-    for nu in data.packing_fraction.values:
-        for alpha in data.restitution.values:
-            point = data.sel(packing_fraction=nu, restitution=alpha)
-            cells = []
-            for name in BOUNDS:
-                value, error = (float(point[f"large_system/{name}{end}"]) for end in ("", "_ci95"))
-                no_limit = int(point[f"large_system/{name}_converged"]) == CONVERGED["not_converged"]
-                cells.append("not converged" if no_limit else with_error(value, error))
-            table.rows.append([f"{nu:g}", f"{alpha:g}", *cells])
     return table

@@ -171,7 +171,12 @@ def _entries(data) -> dict[str, Entry]:
     }
     for name, one in OBSERVABLES.items():
         path = path_of(name)
-        entries[name] = Entry(point[path].values, one.meaning, one.unit, point[f"{path}_stderr"].values)
+        entries[name] = Entry(
+            point[path].values,
+            one.meaning,
+            one.unit,
+            point[f"{path}_stderr"].values if f"{path}_stderr" in point else None,
+        )
     ratio, error = shear_stress_ratio(point)
     meaning = "contact shear stress over binary shear stress"
     entries["shear_stress_ratio"] = Entry(ratio.values, meaning, "1", error.values)
@@ -207,7 +212,8 @@ def _summary_table(data, all: bool) -> Table:
         for name in names:
             if OBSERVABLES[name].tensor:
                 continue
-            value = with_error(number(path_of(name)), number(f"{path_of(name)}_stderr"))
+            value, error = number(path_of(name)), number(f"{path_of(name)}_stderr")
+            value = with_error(value, error) if group != "diagnostics" else f"{value:.3g}"
             samples = strain / correlated.get(name, math.nan)
             theory = number(f"theory/{name}")
             texts = ["" if math.isnan(x) else f"{x:.3g}" for x in (samples, theory)]

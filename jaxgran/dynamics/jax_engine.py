@@ -70,7 +70,7 @@ def advance_by_jax(
     solver: ProjectedMethod,
     state: State,
     steps: Int[Array, ""],
-    free_flight: bool = True,
+    free_flight: bool | Array = True,
     events: int | None = None,
     moving_contacts: bool = False,
 ) -> tuple[State, Tally]:
@@ -186,7 +186,7 @@ class EventLoop(NamedTuple):
         return lax.while_loop(going, lambda at: (at[0] + 1, self.next(at[1])), (jnp.int32(0), self.start))[0]
 
 
-def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool, options: AdvanceOptions):
+def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool | Array, options: AdvanceOptions):
     """Start and body of the loop of an advance, and whether it has to continue."""
     grains, side, observe = state.grains, state.side, options.observe
     observe = None if observe is None else partial(observe, flow)

@@ -29,7 +29,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxgran.analysis.instant import Instant
 from jaxgran.contact.projected_methods import solver_text
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import precision
@@ -40,6 +39,8 @@ from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
+from jaxgran.model.grains import Grains
+from jaxgran.model.state import State
 from jaxgran.sampling.sample import Sample
 
 try:
@@ -193,7 +194,7 @@ class Checkpoint:
 
 
 def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
-    """Replicas as arrays for a file, in which each instant has arrays of its own."""
+    """Replicas as arrays for a file, in which each state has arrays of its own."""
     tallies = [flat_tally(one.sample.tally, np.shape(one.sample.tally.steps)) for one in replicas.values()]
     arrays = {
         "keys": np.array([(*key, one.status) for key, one in replicas.items()], np.int64).reshape(-1, 3),
@@ -201,8 +202,9 @@ def _arrays_of(replicas: Mapping[Key, Replica]) -> dict[str, np.ndarray]:
         "numbers": np.array([(one.strain, one.sample.area, one.sample.shear_rate) for one in replicas.values()], float),
     }
     for row, one in enumerate(replicas.values()):
-        if one.instant is not None:
-            arrays |= {f"{name}-{row}": np.asarray(x) for name, x in one.instant._asdict().items()}
+        if one.state is not None:
+            leaves = enumerate(jax.tree.leaves(one.state))
+            arrays |= {f"state-{row}-{k}": np.asarray(x) for k, x in leaves}
     return arrays
 
 
@@ -215,11 +217,11 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
     ):
         tallies = tally_from_flat(tally, dtype, own_sums)
         sample = Sample(tallies, dtype.type(area), dtype.type(shear_rate), flows[point].grains)
-        instant = None
-        if f"side-{row}" in arrays:
-            found: dict[str, Any] = {name: arrays[f"{name}-{row}"] for name in Instant._fields}
-            instant = Instant(**{name: x if x.ndim else x.item() for name, x in found.items()})
-        replicas[point, seed] = Replica(sample, status, float(strain), instant)
+        state = None
+        if f"state-{row}-0" in arrays:
+            found: list[Any] = [arrays[f"state-{row}-{k}"] for k in range(6)]  # the leaves of a state
+            state = State(Grains(*found[:2]), *found[2:])
+        replicas[point, seed] = Replica(sample, status, float(strain), state)
     return replicas
 
 

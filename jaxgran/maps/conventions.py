@@ -6,11 +6,11 @@ attribute              of                                   meaning
 units                  all numbers but flags                "1": all are in units of m, σ and t, so they have no
                                                             dimension
 reduced_unit           numbers that are not pure numbers    this unit, such as "m sigma / t^2"
-ancillary_variables    values with errors, values by seed   names of their errors and of their status, "/status" where
+ancillary_variables    values with errors                   names of their errors and of their status, "/status" where
                                                             it is in the root
 cell_methods           averages                             what a value is averaged over; a realization is a seed
 coordinates            all, in the file                     number of grains and time step where a map has one of each
-flag_values,           statuses, convergence                numbers and their meanings
+flag_values,           statuses                             numbers and their meanings
 flag_meanings
 standard_name          seed, statuses                       the name of CF
 =====================  ===================================  ==========================================================
@@ -25,8 +25,7 @@ import xarray as xr
 from jaxgran.sampling.observables import GROUPS, OBSERVABLES, unit_attributes
 
 CONVENTIONS = "CF-1.11"
-_AVERAGES = {**GROUPS, "seeds": tuple(OBSERVABLES)}
-_COMPANIONS = ("stderr", "ci95", "converged")
+_COMPANIONS = ("stderr", "ci95")
 _STATUS_NAMES = {"/": "aggregate_quality_flag", "seeds": "quality_flag"}
 
 
@@ -41,17 +40,15 @@ def follow_conventions(data: xr.Dataset, group: str) -> xr.Dataset:
         if name == "status":
             about["standard_name"] = _STATUS_NAMES[group]
         linked = [f"{name}_{ending}" for ending in _COMPANIONS if f"{name}_{ending}" in data]
-        is_average = name in _AVERAGES.get(group, ())
+        is_average = name in GROUPS.get(group, ())
         if linked or is_average:
-            status = [] if group == "large_system" else ["status" if "status" in data else "/status"]
-            about["ancillary_variables"] = " ".join(linked + status)
+            about["ancillary_variables"] = " ".join([*linked, "status" if "status" in data else "/status"])
         if is_average:
-            about["cell_methods"] = _cell_methods(name, "time:" if group == "seeds" else "realization: time:")
+            about["cell_methods"] = _cell_methods(name)
     return data
 
 
-def _cell_methods(name: str, over: str) -> str:
+def _cell_methods(name: str) -> str:
     """How an observable is an average, in the vocabulary of CF."""
-    if OBSERVABLES[name].extreme:
-        return f"{over} maximum"
-    return f"{over} median" if name.startswith("median_") else f"{over} mean (ratio of sums over time steps)"
+    how = "maximum" if OBSERVABLES[name].extreme else "mean (ratio of sums over time steps)"
+    return f"realization: time: {how}"

@@ -15,8 +15,6 @@ from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.confidence import confidence_variables
 from jaxgran.maps.conventions import CONVENTIONS, follow_conventions
 from jaxgran.maps.diagnostics import diagnostic_variables, observable_coordinate
-from jaxgran.maps.instants import first_of_points, instant_variables
-from jaxgran.maps.large_system import large_system_variables
 from jaxgran.maps.own_observables import identity_of, own_variables
 from jaxgran.maps.points import PointAverages, PointGrid, point_averages
 from jaxgran.maps.provenance import made_with
@@ -24,6 +22,7 @@ from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import ERROR_SOURCES, FORMAT_VERSION
 from jaxgran.maps.seeds import NOT_RUN, STATUS_FLAGS, replica_statuses, seed_coordinate, seed_variables, worst_status
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.states import first_of_points, state_variables
 from jaxgran.maps.sums import sum_variables
 from jaxgran.maps.theory_variables import theory_variables
 from jaxgran.model.status import Status
@@ -43,8 +42,7 @@ _TITLES = {
     "diagnostics": "quality of the contact solves, conservation of momentum and energy, correlation of samples",
     "seeds": "replicas of each point",
     "sums": "running sums of each replica, from which all averages follow",
-    "snapshots": "one instant of every point",
-    "large_system": "estimates for a large system",
+    "states": "last state of one replica of every point",
 }
 
 
@@ -76,8 +74,7 @@ def map_dataset(
     diagnostics                   see ``diagnostic_variables``
     seeds                         see ``seed_variables``
     sums                          see ``sum_variables``
-    snapshots                     only with the setting ``snapshots``, see ``instant_variables``
-    large_system                  only with several numbers of grains, see ``large_system_variables``
+    states                        only with the setting ``snapshots``, see ``state_variables``
     ============================  ===================================================================================
 
     ============================  ====================  =============================================================
@@ -86,7 +83,7 @@ def map_dataset(
     packing_fraction,             of their own          values of the plane
     restitution
     grains, timestep              of their own or none  values of a list, or the one of all points
-    point_grains, point_timestep  point                 number of grains, time step, if it was chosen by point
+    point_grains                  point                 number of grains, if it was chosen by point
     error_source                  of its own            total, sampling, timestep, size, tolerance
     seed                          of its own            0, 1, …: number of the replica, from ``first_seed`` on
     observable                    of its own            name of an observable, in ``diagnostics``
@@ -113,9 +110,7 @@ def map_dataset(
     if any(replicas.values()):
         groups["sums"] = xr.Dataset(sum_variables(settings, grid, replicas))
     if settings.snapshots:
-        groups["snapshots"] = xr.Dataset(instant_variables(grid, first_of_points(replicas)))
-    if "grains" in settings.axes:
-        groups["large_system"] = xr.Dataset(large_system_variables(settings, grid, averages))
+        groups["states"] = xr.Dataset(state_variables(grid, first_of_points(replicas)))
     tree = {name: follow_conventions(group, name) for name, group in groups.items()}
     tree = {name: group.assign_attrs(title=_TITLES[name]) if name in _TITLES else group for name, group in tree.items()}
     ran = {} if "engine" in run else what_runs(settings)
@@ -141,15 +136,10 @@ def _core(settings: MapSettings, grid: PointGrid, averages: PointAverages, statu
 def _coordinates(settings: MapSettings, grid: PointGrid) -> dict[str, xr.Variable]:
     """The coordinates of the root."""
     single: dict[str, Any] = {"timestep": settings.timestep, "grains": settings.grains}
-    by_point = {
-        name: values
-        for name, values in (("grains", grid.grains), ("timestep", np.asarray(grid.batch.timestep)))
-        if getattr(settings, f"{name}_by_point") is not None
-    }
     coordinates = {name: xr.Variable(name, list(values), _AXES[name]) for name, values in settings.axes.items()}
     for name, value in single.items():
-        if name in by_point:
-            coordinates[f"point_{name}"] = grid.variable(by_point[name], _AXES[name])
+        if name == "grains" and settings.grains_by_point is not None:
+            coordinates["point_grains"] = grid.variable(grid.grains, _AXES[name])
         elif name not in settings.axes:
             coordinates[name] = xr.Variable((), value, _AXES[name])
     labels = {

@@ -13,14 +13,14 @@ def diagnostic_variables(grid: PointGrid, averages: PointAverages) -> dict[str, 
     ===========================  ====================================================================================
     variable                     meaning
     ===========================  ====================================================================================
-    NAME, NAME_stderr            each observable of this group
+    NAME                         each observable of this group
     correlation_strain           strain of one independent sample of each scalar average, along ``observable``
     friction_error_correlation   correlation of the errors of macroscopic_friction and inertial_number
     ===========================  ====================================================================================
     """
     by_name = averages.observable_correlation
     friction = {"long_name": "correlation of the errors of macroscopic friction and inertial number", "units": "1"}
-    return grid.averages(GROUPS["diagnostics"], averages.values, averages.stderrs) | {
+    return grid.averages(GROUPS["diagnostics"], averages.values) | {
         "correlation_strain": grid.variable(
             np.stack(list(by_name.values()), axis=-1),
             {"long_name": "strain of one independent sample of an observable", "units": "1"},

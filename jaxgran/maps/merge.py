@@ -88,7 +88,7 @@ def _joined(
 ) -> "xr.DataTree":
     """The map of all replicas."""
     from jaxgran.maps.dataset import map_dataset
-    from jaxgran.maps.own_observables import identity_of, label_units, sums_by_name, units_of
+    from jaxgran.maps.own_observables import identity_of
     from jaxgran.maps.sums import replicas_of
 
     if identity_of(settings) != chosen[0].get("observe"):
@@ -103,9 +103,7 @@ def _joined(
                 where = f"seed {key[1] + settings.first_seed} of point {point}"
                 raise InputError(f"maps must have no replica in common, and {origin[key]} and {name} have {where}.")
             replicas[key], origin[key] = replica, name
-    merged_map = map_dataset(settings, replicas, _attributes(opened))
-    label_units(merged_map, units_of(opened[0], sums_by_name(settings) or ()))
-    return merged_map
+    return map_dataset(settings, replicas, _attributes(opened))
 
 
 def _require_same(first: str, here: Any, name: str, there: Any, keys: Sequence[str], but: Sequence[str] = ()) -> None:

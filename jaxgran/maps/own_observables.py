@@ -1,17 +1,17 @@
-"""Observables of the user's in a map: what identifies their function, and their variables."""
+"""Observables of the user's in a map: the check of their function, what identifies it, and their variables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from jaxgran.maps.schema import ERROR_SOURCES
+from jaxgran.model.checks import InputError, refused, short_repr
 from jaxgran.model.choices import HALF_INTERVAL
-from jaxgran.model.status import GIVEN_UP
-from jaxgran.sampling.observables import unit_attributes
+from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.observe import digest_of, dimensions_of, observed_shapes
 from jaxgran.sampling.sample import observed_estimates
 
@@ -19,9 +19,32 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from jaxgran.maps.points import PointGrid
-    from jaxgran.maps.replica import Key, Replica
     from jaxgran.maps.settings import MapSettings
+    from jaxgran.model.flow import ShearFlow
     from jaxgran.sampling.sample import Sample
+
+_TAKEN = {*OBSERVABLES, "status", "correlation_strain", *("grains", "timestep", "packing_fraction", "restitution")}
+_TAKEN |= {"point_grains", "error_source", "axis_a", "axis_b", "stresses", "theory", "diagnostics", "seeds", "sums"}
+_TAKEN |= {"states"}
+
+
+def require_observe(observe: Any, flow: ShearFlow) -> None:
+    """Raise an InputError unless a function returns numbers or arrays, summed over contacts, by names of its own."""
+    if not callable(observe):
+        raise refused("observe", observe, "must be a function that is passed to `ratio_map`, or None")
+    try:
+        hash(observe)
+    except TypeError:
+        raise refused("observe", observe, "must be hashable") from None
+    shapes = observed_shapes(observe, flow)
+    names = list(shapes) if isinstance(shapes, dict) else []
+    if not names or not all(isinstance(x, jax.ShapeDtypeStruct) for x in shapes.values()):
+        raise InputError("observe must return a dictionary of numbers or arrays by name.", field="observe")
+    if not all(isinstance(name, str) and name.isidentifier() for name in names):
+        raise InputError(f"observe must return names without spaces and signs, not {short_repr(names)}.")
+    taken = [name for name in names if name in _TAKEN or name.endswith(("_stderr", "_ci95"))]
+    if taken:
+        raise InputError(f"observe must return names that a map does not have, not {short_repr(taken[0])}.")
 
 
 def sums_by_name(settings: MapSettings) -> dict[str, jax.ShapeDtypeStruct] | None:
@@ -64,36 +87,4 @@ def own_variables(
         variables[f"{name}_stderr"] = grid.variable(stderr, about, *dims)
         about = {"long_name": f"half-width of the 95 % interval of the mean of {name}, known for sampling only"}
         variables[f"{name}_ci95"] = grid.variable(interval, about, *dims, "error_source")
-    return variables
-
-
-def label_units(data: xr.DataTree, units: Mapping[str, str]) -> None:
-    """Give the variables of the user's observables the attributes of their units, as built-in ones have them."""
-    for name, unit in units.items():
-        for group in (data, data["seeds"]):
-            for variable in (name, f"{name}_stderr", f"{name}_ci95"):
-                if variable in group.data_vars:
-                    group[variable].attrs.update(unit_attributes(unit))
-
-
-def units_of(data: xr.DataTree, names: Iterable[str]) -> dict[str, str]:
-    """The units that ``label_units`` gave a map, by name."""
-    attributes = {name: data[name].attrs for name in names}
-    return {name: about.get("reduced_unit", "1") for name, about in attributes.items() if "units" in about}
-
-
-def own_seed_variables(
-    settings: MapSettings, grid: PointGrid, replicas: Mapping[Key, Replica | None]
-) -> dict[str, xr.Variable]:
-    """The variable NAME in the group ``seeds``, for what ``observe`` returns, if the map has several seeds."""
-    if settings.observe is None or settings.seeds == 1:
-        return {}
-    totals = {key: one.sample.tally.total(axis=0) for key, one in replicas.items() if one and one.status < GIVEN_UP}
-    variables = {}
-    for name, sums in (sums_by_name(settings) or {}).items():
-        value = np.full((len(grid.flows), settings.seeds, *sums.shape), np.nan)
-        for key, total in totals.items():
-            value[key] = np.asarray(total.observed[name]) / np.maximum(total.steps, 1)
-        about = {"long_name": f"mean of {name} over all time steps", "cell_methods": "time: mean"}
-        variables[name] = grid.variable(value, about, "seed", *dimensions_of(name, sums.shape))
     return variables

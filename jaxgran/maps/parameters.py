@@ -14,16 +14,13 @@ This module loads neither JAX nor xarray, so that the command line can print its
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 from jaxgran.maps.presets import PRESETS
 from jaxgran.model.choices import Activation, EngineName, SolverName
-
-BY_POINT = ("grains_by_point", "timestep_by_point")
-"""Parameters with a number for each point."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -93,8 +90,8 @@ class MapParameters:
     timestep: float | Sequence[float] | Literal["auto"] = field(
         default=1e-3,
         metadata=row(
-            'Time step of the sample; "auto" takes for each point the longest one that changes its stresses by at most '
-            "2 %, or for all points the longest one that changes them by at most a share of `error`.",
+            'Time step of the sample; "auto" takes the longest one that changes the stresses of no point by more than '
+            "2 %, or a share of `error`.",
             several=True,
             auto=True,
             unit="1/shear rate",
@@ -117,11 +114,10 @@ class MapParameters:
             range=_ERROR,
         ),
     )
-    tolerance: float | Literal["auto"] | None = field(
+    tolerance: float | None = field(
         default=None,
         metadata=row(
             "Relative residual of a contact solve, in place of that of the solver.",
-            auto=True,
             range=_TOLERANCE,
             default="1e-4, or that of the solver",
         ),
@@ -153,7 +149,7 @@ class MapParameters:
     snapshots: bool = field(
         default=False,
         metadata=row(
-            "Keep a snapshot of every point: its grains, and the forces between them over a strain of 0.002.",
+            "Keep the last state of every point, from which `explore` draws its grains and forces.",
             bool,
             commands=("map",),
             off=True,
@@ -167,15 +163,6 @@ class MapParameters:
         metadata=row(
             "A function as in `sample` that returns numbers or arrays by name; each is averaged into a variable of "
             "this name.",
-            commands=(),
-        ),
-    )
-    timestep_by_point: Sequence[float] | None = field(
-        default=None,
-        metadata=row(
-            "Time step of each point, in the order of packing fractions and restitutions, the last one fastest; "
-            "`timestep` is then the shortest.",
-            unit="1/shear rate",
             commands=(),
         ),
     )
@@ -262,14 +249,6 @@ class RunParameters(MapParameters):
     record: Any = field(
         default=None,
         metadata=row("Wraps the function that advances a sampled batch, such as that of a recorder.", commands=()),
-    )
-    observe_units: Mapping[str, str] | None = field(
-        default=None,
-        metadata=row(
-            'Units of what `observe` returns, by name, such as {"torque": "m sigma^2 / t^2"}; "1" for pure numbers. '
-            "They are labels, and do not decide whether a map is resumed.",
-            commands=(),
-        ),
     )
     attributes: dict[str, Any] | None = field(
         default=None, metadata=row("More attributes of the dataset.", commands=())

@@ -49,16 +49,17 @@ class PointGrid:
         return xr.Variable((*self.dims, *further), values.reshape(*self.shape, *values.shape[1:]), dict(attrs))
 
     def averages(
-        self, names: Iterable[str], values: Mapping[str, np.ndarray], stderrs: Mapping[str, np.ndarray]
+        self, names: Iterable[str], values: Mapping[str, np.ndarray], stderrs: Mapping[str, np.ndarray] | None = None
     ) -> dict[str, xr.Variable]:
-        """The variables NAME and NAME_stderr of some observables."""
+        """The variables NAME and, where errors are given, NAME_stderr of some observables."""
         variables = {}
         for name in names:
             one = OBSERVABLES[name]
             about = {"long_name": one.meaning, "units": one.unit}
             variables[name] = self.variable(values[name], about, *one.axes)
-            about = {"long_name": one.meaning_of_error, "units": one.unit}
-            variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *one.axes)
+            if stderrs is not None:
+                about = {"long_name": one.meaning_of_error, "units": one.unit}
+                variables[f"{name}_stderr"] = self.variable(stderrs[name], about, *one.axes)
         return variables
 
 

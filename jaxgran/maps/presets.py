@@ -65,16 +65,15 @@ def combined(start: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, An
     }
     left_out = {name for option, names in replaced.items() if given.get(option) is not None for name in names}
     kept = {name: value for name, value in start.items() if name not in left_out}
-    for name, other in (("grains", "timestep"), ("timestep", "activation")):
-        if f"{name}_by_point" in kept and given.keys() & {name, other, "restitution", "packing_fraction", "error"}:
-            del kept[f"{name}_by_point"]
-            kept[name] = "auto"  # chosen again, for the points that are given
+    if "grains_by_point" in kept and given.keys() & {"grains", "timestep", "restitution", "packing_fraction", "error"}:
+        del kept["grains_by_point"]
+        kept["grains"] = "auto"  # chosen again, for the points that are given
     return kept | for_error(given) | dict(given)
 
 
 def for_error(given: Mapping[str, Any]) -> dict[str, Any]:
     """What a requested error implies unless it is given; a longer sample is cheaper than a second seed."""
-    automatic = {"grains": "auto", "timestep": "auto", "tolerance": "auto", "seeds": 1}
+    automatic = {"grains": "auto", "timestep": "auto", "seeds": 1}
     return automatic if given.get("error") is not None else {}
 
 

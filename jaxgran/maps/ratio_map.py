@@ -21,14 +21,12 @@ from jaxgran.maps.batches import points_of_part
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance
 from jaxgran.maps.interruption import Interrupted, is_interruption
-from jaxgran.maps.own_observables import label_units, sums_by_name
 from jaxgran.maps.parameters import RunParameters, takes
 from jaxgran.maps.presets import with_start
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.run_replicas import run_replicas
 from jaxgran.maps.settings import MapSettings, chosen_settings
 from jaxgran.model.checks import InputError, refused, require_flag, require_whole, short_repr
-from jaxgran.sampling.observe import require_units
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -55,7 +53,7 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
     Returns:
       The DataTree described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with
-      standard errors and values by seed. Lists of numbers of grains and of time steps add the dimensions grains and
+      standard errors. Lists of numbers of grains and of time steps add the dimensions grains and
       timestep in front. It also has the status of each point, and all parameters as attributes.
 
     Raises:
@@ -78,9 +76,6 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
     settings, automatic_choice = chosen_settings(run)
     settings.require_engine()
     _require_own_attributes(run, settings)
-    units = {} if run.observe_units is None else run.observe_units
-    if run.observe_units is not None:
-        require_units(units, sums_by_name(settings) or ())
     workers = _workers(run)
     if automatic_choice:
         _tell(run, f"chosen: {automatic_choice}")
@@ -98,7 +93,6 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
             if earlier is not None and finished and not difference and not started:
                 complete = True
                 _tell(run, f"{output} is finished and is read from its file.")
-                label_units(earlier, units)
                 return earlier
             _tell_resumed(run, settings, checkpoint)
         results, attributes, interruption = _run(run, settings, workers, None if run.record else checkpoint)
@@ -107,7 +101,6 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
         attributes |= {"automatic_choice": automatic_choice, **(run.attributes or {})}
         data = map_dataset(settings, results, attributes)
-        label_units(data, units)
         if output is not None and any(results.values()) and not (interruption and finished):
             write_dataset(data, output)
         if interruption is not None:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from jax.typing import ArrayLike
 
-from jaxgran.analysis.instant import Instant
+from jaxgran.model.state import State
 from jaxgran.sampling.sample import Sample
 
 Key = tuple[int, int]  # number of the point, in the order of ``MapSettings.flows``; seed
@@ -20,9 +20,9 @@ class Advance(NamedTuple):
 
 
 class Replica(NamedTuple):
-    """Result of one replica: its sample, its worst status, its strain before the sample, and maybe an instant of it."""
+    """Result of one replica: its sample, its worst status, its strain before the sample, and maybe its last state."""
 
     sample: Sample
     status: int
     strain: float
-    instant: Instant | None = None
+    state: State | None = None

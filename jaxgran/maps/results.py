@@ -15,7 +15,6 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.files import atomic_write, other_version
-from jaxgran.maps.parameters import BY_POINT
 from jaxgran.maps.schema import FORMAT_VERSION, RATIO, what_lacks
 from jaxgran.model.checks import InputError, refused, short_repr
 
@@ -99,7 +98,7 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
         chosen |= {"solver": _solver_of(data), "engine": engine_named(data.attrs["engine_requested"])}
         return chosen | {
             name: tuple(np.atleast_1d(chosen[name]).tolist())
-            for name in ("restitution", "packing_fraction", *BY_POINT, "diameters")
+            for name in ("restitution", "packing_fraction", "grains_by_point", "diameters")
             if name in chosen
         }
     except KeyError as missing:

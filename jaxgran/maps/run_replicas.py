@@ -21,7 +21,6 @@ from jaxgran.io.atomic import CorruptFile
 from jaxgran.maps.batches import remaining_batches
 from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.cluster import Provenance, run_on_cluster
-from jaxgran.maps.instants import first_instants
 from jaxgran.maps.journal import Journal
 from jaxgran.maps.replica import Advance, Key, Replica
 from jaxgran.maps.settings import MapSettings
@@ -136,8 +135,11 @@ def _measured(
     error = None if settings.error is None else sampling_error(settings.error) * math.sqrt(settings.seeds)
     sampling = advance if settings.observe is None else partial(advance, observe=settings.observe)
     batch, sample = sample_batch(batch, settings.strain, sampling if record is None else record(sampling), error)
-    instants = first_instants(batch, task) if settings.snapshots else [None] * len(task)
-    numbers = zip(batch.status.tolist(), strain_before.tolist(), instants, strict=True)
+    states = [None] * len(task)
+    if settings.snapshots:
+        whole = jax.tree.map(np.asarray, batch.state)
+        states = [jax.tree.map(lambda x, k=k: x[k], whole) for k in range(len(task))]
+    numbers = zip(batch.status.tolist(), strain_before.tolist(), states, strict=True)
     return [
         (key, Replica(jax.tree.map(lambda x, k=k: x[k], sample), *one))
         for k, (key, one) in enumerate(zip(task, numbers, strict=True))

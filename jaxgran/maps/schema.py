@@ -15,7 +15,7 @@ import xarray as xr
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Version of the groups and names in the data of a map; a file of another one is refused."""
 
 MapData: TypeAlias = xr.DataTree | xr.Dataset
@@ -107,25 +107,6 @@ def parts(data: MapData) -> list[xr.Dataset]:
             values = found[0][name].values.tolist()
             found = [part.isel({name: k}).assign_attrs({name: x}) for part in found for k, x in enumerate(values)]
     return found
-
-
-def timestep_text(data: MapData) -> str:
-    """The time step of a map, or the range of those that were chosen by point, in units of 1/γ̇."""
-    if has_one_timestep(data):
-        return f"{data.attrs['timestep']:g}"
-    return " to ".join(f"{float(limit(data.point_timestep)):g}" for limit in (np.min, np.max))
-
-
-def has_one_timestep(data: MapData) -> bool:
-    """Whether all points have one time step, without which their force ratios are not comparable."""
-    return "point_timestep" not in data
-
-
-def require_one_timestep(data: MapData, what: str) -> None:
-    """Raise an InputError if the force ratios of a map are not comparable."""
-    if not has_one_timestep(data):
-        reason = f"force ratios at one time step, and those of this map are at {timestep_text(data)} / shear rate"
-        raise InputError(f"{what} needs {reason}: make a map with a number for `timestep`.")
 
 
 def relative_ci95(data: MapData, name: str) -> dict[str, np.ndarray]:

@@ -1,16 +1,14 @@
-"""The replicas of a map: the status, strain and time step of each seed, and its averages where there are several."""
+"""The replicas of a map: the status and the strains of each seed."""
 
 from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
 
-from jaxgran.maps.own_observables import own_seed_variables
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.settings import MapSettings
-from jaxgran.model.status import GIVEN_UP, Status
-from jaxgran.sampling.observables import OBSERVABLES
+from jaxgran.model.status import Status
 
 NOT_RUN = -1  # status of a replica without a result
 STATUS_FLAGS = {
@@ -44,35 +42,21 @@ def seed_variables(
     status                status of the replica
     strain                sampled strain
     equilibration_strain  strain before the sample
-    sample_timestep       time step of the sample
-    NAME                  average of each observable, also of the user's, over the replica; only if the map has
-                          several seeds, and NaN from the status ``infeasible`` on
     ====================  ===========================================================================================
     """
     shape = (len(grid.flows), settings.seeds)
-    strain, equilibration, timestep = (np.full(shape, np.nan) for _ in range(3))
-    values = {name: np.full((*shape, *one.shape), np.nan) for name, one in OBSERVABLES.items()}
+    strain, equilibration = (np.full(shape, np.nan) for _ in range(2))
     for key, replica in replicas.items():
         if replica is None:
             continue
-        tally = replica.sample.tally
         equilibration[key] = replica.strain
-        strain[key] = tally.duration.sum() * replica.sample.shear_rate
-        timestep[key] = strain[key] / tally.steps.sum() if tally.steps.any() else np.nan
-        if settings.seeds > 1 and replica.status < GIVEN_UP:
-            for name, value in replica.sample.averages.items():
-                values[name][key] = value
+        strain[key] = replica.sample.tally.duration.sum() * replica.sample.shear_rate
     about = {
         "strain": (strain, {"long_name": "sampled strain", "units": "1"}),
         "equilibration_strain": (equilibration, {"long_name": "strain sheared before the sample", "units": "1"}),
-        "sample_timestep": (timestep, {"long_name": "time step of the sample", "units": "1 / shear rate"}),
     }
     variables = {"status": grid.variable(statuses, {"long_name": "status", **STATUS_FLAGS}, "seed")}
-    variables |= {name: grid.variable(column, attrs, "seed") for name, (column, attrs) in about.items()}
-    for name, one in OBSERVABLES.items() if settings.seeds > 1 else ():
-        attrs = {"long_name": one.meaning, "units": one.unit}
-        variables[name] = grid.variable(values[name], attrs, "seed", *one.axes)
-    return variables | own_seed_variables(settings, grid, replicas)
+    return variables | {name: grid.variable(column, attrs, "seed") for name, (column, attrs) in about.items()}
 
 
 def seed_coordinate(settings: MapSettings) -> xr.Variable:

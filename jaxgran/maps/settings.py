@@ -14,8 +14,8 @@ import numpy as np
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, require_solver
 from jaxgran.dynamics.engine import Numerics, checked_numerics, select_engine
-from jaxgran.maps.own_names import require_observe
-from jaxgran.maps.parameters import BY_POINT, MapParameters, default
+from jaxgran.maps.own_observables import require_observe
+from jaxgran.maps.parameters import MapParameters, default
 from jaxgran.model.checks import InputError, refused, require_flag, require_number, require_whole, two_digits
 from jaxgran.model.choices import MAX_GRAINS, MAX_REPLICAS, MAX_STEPS, SHORTEST_TIMESTEP
 from jaxgran.model.flow import ShearFlow
@@ -25,12 +25,12 @@ from jaxgran.sampling.budget import SHARES, fewest_grains, size_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
 from jaxgran.sampling.packing import require_room
 from jaxgran.sampling.prediction import predicted
-from jaxgran.sampling.timestep import automatic_timestep, automatic_tolerance, expected_temperature, longest_timestep
+from jaxgran.sampling.timestep import automatic_timestep, expected_temperature, longest_timestep
 
 _FEWEST_STEPS = 160  # of a sample: five time steps in each of its 32 blocks
 _LARGEST_SEED = 2**30
 _AUTOMATIC_ERROR = 0.02  # of the stresses from an automatic time step, where no error is given
-_SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6, "tolerance": None}  # all flows accept these for "auto"
+_SAFE: dict[str, Any] = {"grains": 256, "timestep": 1e-6}  # all flows accept these for "auto"
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ class MapSettings(MapParameters):
         require_whole("first_seed", self.first_seed, 0, _LARGEST_SEED, "to fit into 32 bits with all that follow")
         require_flag("snapshots", self.snapshots)
         plane = len(self.packing_fraction) * len(self.restitution)
-        self._require_by_point("grains", len(self._timesteps) * plane)
-        self._require_by_point("timestep", plane)
+        self._require_grains_by_point(len(self._timesteps) * plane)
         self._sort_plane()
         count = math.prod(map(len, self.axes.values())) * self.seeds
         if count > MAX_REPLICAS:
@@ -72,7 +71,7 @@ class MapSettings(MapParameters):
         flows = stack_of_any_size(self._checked_flows())
         if self.observe is not None:
             require_observe(self.observe, self._checked_flows()[0])
-        shortest, longest = (float(limit(flow.timestep for flow in self._checked_flows())) for limit in (min, max))
+        shortest, longest = min(self._timesteps), max(self._timesteps)
         if shortest < SHORTEST_TIMESTEP:
             raise refused("timestep", shortest, f"must be at least {SHORTEST_TIMESTEP:g} / shear rate")
         strain = LEAST_SAMPLE if self.strain is None else self.strain
@@ -125,20 +124,19 @@ class MapSettings(MapParameters):
         if self.engine is not None:
             select_engine(self.flows()[0], self.numerics, option="" if self.observe is None else "observe")
 
-    def _require_by_point(self, name: str, points: int) -> None:
-        """Raise an InputError unless what is given by point is given for all points, and not as a list too."""
-        values = getattr(self, f"{name}_by_point")
+    def _require_grains_by_point(self, points: int) -> None:
+        """Raise an InputError unless grains by point are given for all points, and not as a list too."""
+        values = self.grains_by_point
         listed = isinstance(values, tuple) and len(values) == points and _are_numbers(values)
-        if values is not None and (not listed or name in self.axes):
-            raise refused(f"{name}_by_point", values, f"must be a list of {points} numbers, one for each point")
+        if values is not None and (not listed or "grains" in self.axes):
+            raise refused("grains_by_point", values, f"must be a list of {points} numbers, one for each point")
 
     def _sort_plane(self) -> None:
-        """Put restitutions and packing fractions, and what is given by their points, in ascending order."""
-        for name in BY_POINT:
-            if getattr(self, name) is not None:
-                by_point = np.reshape(getattr(self, name), (-1, len(self.packing_fraction), len(self.restitution)))
-                by_point = by_point[:, np.argsort(self.packing_fraction)][..., np.argsort(self.restitution)]
-                object.__setattr__(self, name, tuple(by_point.ravel().tolist()))
+        """Put restitutions and packing fractions, and the grains of their points, in ascending order."""
+        if self.grains_by_point is not None:
+            by_point = np.reshape(self.grains_by_point, (-1, len(self.packing_fraction), len(self.restitution)))
+            by_point = by_point[:, np.argsort(self.packing_fraction)][..., np.argsort(self.restitution)]
+            object.__setattr__(self, "grains_by_point", tuple(by_point.ravel().tolist()))
         for name in ("restitution", "packing_fraction"):
             object.__setattr__(self, name, tuple(sorted(getattr(self, name))))
 
@@ -185,8 +183,6 @@ class MapSettings(MapParameters):
     def _checked_flows(self) -> list[ShearFlow]:
         """New flows for all points; InputError if a number is out of range."""
         points = list(product(self._timesteps, self.packing_fraction, self.restitution))
-        if self.timestep_by_point is not None:
-            points = [(dt, *point) for dt, (_, *point) in zip(self.timestep_by_point, points, strict=True)]
         if self.grains_by_point is None:
             numbers = [(grains, *point) for grains in self.sizes for point in points]
         else:
@@ -219,7 +215,7 @@ def stack_of_any_size(flows: Sequence[ShearFlow]) -> ShearFlow:
 def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     """The settings of a map with numbers for "auto", and a sentence about these numbers, or "".
 
-    With an ``error``, the grains are chosen for each point, and time step and tolerance for their shares of it.
+    With an ``error``, the grains are chosen for each point, and the time step for its share of it.
 
     Raises:
       InputError: (a ValueError) a parameter is out of its range, or the error needs too many grains.
@@ -232,14 +228,11 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
     by_point = chosen["grains_by_point"]
     if isinstance(by_point, tuple) and by_point and all(isinstance(grains, int) for grains in by_point):
         chosen["grains"] = max(by_point)
-    by_point = chosen["timestep_by_point"]
-    if isinstance(by_point, tuple) and by_point and _are_numbers(by_point) and chosen["timestep"] != "auto":
-        chosen["timestep"] = min(by_point)
     automatic = {name for name in _SAFE if isinstance(chosen[name], str) and chosen[name] == "auto"}
     if not automatic:
         return MapSettings(**chosen), ""
     checked = MapSettings(**{**chosen, **{name: _SAFE[name] for name in automatic}, "strain": None})
-    chosen |= {name: getattr(checked, name) for name in ("restitution", "packing_fraction", *BY_POINT)}
+    chosen |= {name: getattr(checked, name) for name in ("restitution", "packing_fraction", "grains_by_point")}
     target = _AUTOMATIC_ERROR if checked.error is None else SHARES["timestep"] * checked.error
     notes = []
     if "grains" in automatic:
@@ -254,22 +247,11 @@ def chosen_settings(asked: MapParameters) -> tuple[MapSettings, str]:
         steps = automatic_timestep(_temperature(checked, flows), flows.packing_fraction, checked.activation, target)
         if isinstance(chosen["strain"], int | float):
             steps = np.minimum(steps, chosen["strain"] / _FEWEST_STEPS)
-        plane = len(checked.packing_fraction) * len(checked.restitution)  # the same for all numbers of grains
-        by_point = [float(two_digits(dt, up=False)) for dt in steps[:plane]]
-        chosen["timestep"] = min(by_point)
-        note = f"timestep {min(by_point):g}"
-        if checked.error is None and max(by_point) > min(by_point):  # with an error, so that force ratios compare
-            chosen["timestep_by_point"] = tuple(by_point)
-            note += f" to {max(by_point):g}"
-        notes.append(f"{note} / shear rate, the shortest at {_point(flows, int(np.argmin(steps)))}")
-    if "tolerance" in automatic:
-        chosen["tolerance"] = float(two_digits(automatic_tolerance(target), up=False))
-        notes.append(f"tolerance {chosen['tolerance']:g}")
+        shortest = int(np.argmin(steps))  # one for all points, so that their force ratios compare
+        chosen["timestep"] = float(two_digits(steps[shortest], up=False))
+        notes.append(f"timestep {chosen['timestep']:g} / shear rate, which {_point(flows, shortest)} needs")
     aim = f"{target:g} from the time step" if checked.error is None else f"{checked.error:g}"
-    sentence = f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
-    if chosen["timestep_by_point"] is not None:
-        sentence += " Force ratios at different time steps are not comparable, so they have no contours."
-    return MapSettings(**chosen), sentence
+    return MapSettings(**chosen), f"{'; '.join(notes)}: for a relative error of {aim} in the stresses."
 
 
 def _grains_for(settings: MapSettings, error: float) -> tuple[int, ...]:

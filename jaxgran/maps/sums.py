@@ -6,13 +6,13 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.dynamics.tally import flat_tally, tally_from_flat
-from jaxgran.maps.instants import instants_of
 from jaxgran.maps.own_observables import sums_by_name
 from jaxgran.maps.points import PointGrid
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.schema import flattened
 from jaxgran.maps.seeds import NOT_RUN
 from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.states import states_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import GIVEN_UP, Status
 from jaxgran.sampling.sample import Sample
@@ -41,10 +41,9 @@ def sum_variables(
         sums[key], area[key] = numbers, replicas[key].sample.area  # type: ignore[union-attr]
     about = {"long_name": "running sums of each block of a sample, in the order of the fields of Tally", "units": "1"}
     about_area = {"long_name": "area of the cell", "units": "sigma^2"}
-    return {
-        "tally": grid.variable(sums, about, "seed", "block", "quantity"),
-        "area": grid.variable(area, about_area, "seed"),
-    }
+    tally = grid.variable(sums, about, "seed", "block", "quantity")
+    tally.encoding = {"zlib": True, "shuffle": True, "complevel": 4}
+    return {"tally": tally, "area": grid.variable(area, about_area, "seed")}
 
 
 def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica | None]:
@@ -67,7 +66,7 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
     sums = numbers["sums/tally"].values
     sums = sums.reshape(*shape, *sums.shape[-2:])
     dtype, own_sums = np.dtype(str(data.attrs["precision"])), sums_by_name(settings)
-    instants = instants_of(data["snapshots"].to_dataset(), len(flows)) if settings.snapshots else {}
+    states = states_of(data["states"].to_dataset(), len(flows), dtype) if settings.snapshots else {}
     found: dict[Key, Replica | None] = {}
     for point, seed in np.argwhere(status >= Status.ok).tolist():
         key = point, seed
@@ -77,6 +76,6 @@ def replicas_of(data: xr.DataTree, settings: MapSettings) -> dict[Key, Replica |
         tally = tally_from_flat(sums[key], dtype, own_sums)
         shear_rate = dtype.type(flows[point].shear_rate)
         sample = Sample(tally, dtype.type(area[key]), shear_rate, flows[point].grains)
-        instant = instants.pop(point, None) if status[key] < GIVEN_UP else None
-        found[key] = Replica(sample, int(status[key]), float(strain[key]), instant)
+        state = states.pop(point, None) if status[key] < GIVEN_UP else None
+        found[key] = Replica(sample, int(status[key]), float(strain[key]), state)
     return found

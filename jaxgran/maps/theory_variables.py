@@ -16,6 +16,7 @@ from jaxgran.sampling.prediction import kinetic_theory
 from jaxgran.sampling.sample import Sample
 
 THEORY = ("granular_temperature", "pressure", "shear_stress", "dissipation_rate", "collision_rate")  # predicted
+ENSKOG = ("pressure", "dissipation_rate")  # rates of Enskog's theory
 LENGTHS = {
     "correlation_length": "Enskog's dissipation rate over the measured one, at the local temperature",
     "correlation_length_from_pressure": "the same quotient of the dissipation rates over the contact pressures",
@@ -31,9 +32,9 @@ def theory_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -
     variable                      meaning
     ============================  ===================================================================================
     NAME                          prediction of kinetic theory, for the names in ``THEORY``
-    enskog_RATE                   contact pressure, contact shear stress and dissipation rate of Enskog's theory at the
-                                  measured granular temperature, with ``_stderr``
-    enskog_factor_RATE_FACTOR     factors whose product times enskog_RATE is the measured rate, see
+    enskog_pressure,              contact pressure and dissipation rate of Enskog's theory at the measured granular
+    enskog_dissipation_rate       temperature, with ``_stderr``
+    enskog_factor_pressure_…      factors whose product times enskog_pressure is the measured contact pressure, see
                                   ``sampling.enskog_factors``, with ``_stderr``
     correlation_length,           L and L′ of ``sampling.enskog_factors``, with ``_stderr``
     correlation_length_
@@ -60,12 +61,14 @@ def _predictions(flows: ShearFlow, classes: Grains | None) -> dict[str, np.ndarr
 def _enskog_variables(grid: PointGrid, samples: Mapping[int, Sequence[Sample]]) -> dict[str, xr.Variable]:
     """Enskog's rates, the factors between them and the measured ones, correlation lengths, and standard errors."""
     attrs = {
-        f"enskog_{rate}": (f"{words} of Enskog's theory at the measured granular temperature", OBSERVABLES[rate].unit)
-        for rate, words in RATES.items()
+        f"enskog_{rate}": (
+            f"{RATES[rate]} of Enskog's theory at the measured granular temperature",
+            OBSERVABLES[rate].unit,
+        )
+        for rate in ENSKOG
     }
-    for rate, words in RATES.items():
-        for factor, (measured, assumed) in FACTORS.items():
-            attrs[f"{rate}_{factor}"] = (f"{words} with {measured} over that with {assumed}", "1")
+    for factor, (measured, assumed) in FACTORS.items():
+        attrs[f"pressure_{factor}"] = (f"contact pressure with {measured} over that with {assumed}", "1")
     attrs |= {name: (words, "sigma") for name, words in LENGTHS.items()}
     values, stderrs = ({name: np.full(len(grid.flows), np.nan) for name in attrs} for _ in range(2))
     for point, seeds in samples.items():

@@ -16,7 +16,7 @@ const pointAt = (row, column) => {
   const part = Math.max(chosen.grains, 0) * Math.max(timesteps.length, 1) + chosen.timestep;
   return (part * fractions.length + row) * restitutions.length + column;
 };
-const timestepAt = (point) => plain(pageData.timesteps?.[point] ?? timesteps[chosen.timestep]);
+const timestepAt = (point) => plain(timesteps[chosen.timestep]);
 const grainsAt = (point) => pageData.grains?.[point] ?? sizes[Math.max(chosen.grains, 0)];
 const overPlane = (what) => fractions.map((_, row) => restitutions.map((_, column) => what(pointAt(row, column), row, column)));
 const words = (status) => status.replace(/_/g, " ") + (pageData.meanings[status] ? `: ${pageData.meanings[status]}` : "");
@@ -181,7 +181,7 @@ function startMap() {
   element("title").textContent = pageData.title;
   const belongs = [];
   if (sizes.length) belongs.push(pageData.grains ? `N chosen by point, up to ${sizes[0]}` : `N = ${sizes.join(", ")}`);
-  if (timesteps.length) belongs.push(pageData.timesteps ? "dt chosen by point" : `dt = ${timesteps.map(plain).join(", ")}/γ̇`);
+  if (timesteps.length) belongs.push(`dt = ${timesteps.map(plain).join(", ")}/γ̇`);
   if (pageData.about) belongs.push(pageData.about);
   element("about").textContent = `${belongs.join(", ")}. Error bars are one standard error of sampling. ` +
     `${ratio ? "The excess is the force ratio − 1. " : ""}Choose a point by a click, or with the arrow keys.`;

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from jaxgran.maps.parameters import default, options
-from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, has_one_timestep, path_of, require_map
+from jaxgran.maps.schema import FINEST, TENSOR_AXES, MapData, path_of, require_map
 from jaxgran.model.checks import InputError
 from jaxgran.model.display import unit_text
 from jaxgran.model.status import MEANINGS
@@ -28,12 +28,11 @@ _AXES = {
     "packing_fraction": "packing fraction ν",
     "restitution": "restitution α",
 }
-_SEVERAL_TIMESTEPS = "Time steps differ between points. The force ratio depends on them: its values do not compare."
 _PLANE = ("packing_fraction", "restitution")
 _COMPANIONS = ("_stderr", "_ci95")
 _FIRST = ("force_ratio", "excess")  # the page opens with the second
-_GROUPS = ("stresses/", "theory/", "diagnostics/", "large_system/")
-_LEFT_OUT = ("status", "point_grains", "point_timestep")
+_GROUPS = ("stresses/", "theory/", "diagnostics/")
+_LEFT_OUT = ("status", "point_grains")
 _NAMED = {name: one.kind for name, one in options("run").items() if isinstance(one.kind, tuple)}  # choices of a run
 
 
@@ -48,8 +47,7 @@ def map_data(data: MapData) -> dict[str, Any]:
     observables    name, meaning and unit; values; and where the map has them standard errors, whole
                    errors, predictions of kinetic theory and numbers of effective samples
     status         the status of each point; meanings of the statuses
-    grains,        the number of grains and the time step of each point, if they were chosen by point
-    timesteps
+    grains         the number of grains of each point, if it was chosen by point
     instants       grains and forces of each point, see ``grain_data``
     reference      what the reference map says of each packing fraction and restitution, see ``verdicts``
     again          what the command needs that measures a point again, if the map was made by this program
@@ -74,16 +72,15 @@ def map_data(data: MapData) -> dict[str, Any]:
         "axes": [{"name": name, "label": label, "values": _axis(data, name)} for name, label in _AXES.items()],
         "observables": observables,
         "status": _statuses(data, dims),
-        "grains": _by_point(data, "point_grains", dims),
-        "timesteps": _by_point(data, "point_timestep", dims),
+        "grains": numbers(_column(data["point_grains"], data, dims)) if "point_grains" in data else None,
         "meanings": MEANINGS,
-        "excessLevels": list(EXCESS_LEVELS) if has_one_timestep(data) else [],
+        "excessLevels": list(EXCESS_LEVELS),
         "instants": instants,
         "encoding": ENCODING,
         "again": _again(data, dims),
         "reference": verdicts(data["packing_fraction"].values, data["restitution"].values),
         "about": _about(data),
-        "notes": notes + more + ([] if has_one_timestep(data) else [_SEVERAL_TIMESTEPS]),
+        "notes": notes + more,
     }
 
 
@@ -122,7 +119,7 @@ def _is_shown(data: xr.Dataset, name: str) -> bool:
     dims = set(variable.dims) - set(FINEST)
     belongs = any(name.endswith(end) and name.removesuffix(end) in data for end in _COMPANIONS)
     belongs |= name.startswith("theory/") and path_of(name.removeprefix("theory/")) in data
-    apart = name in _LEFT_OUT or name.startswith("snapshots/") or "flag_values" in variable.attrs
+    apart = name in _LEFT_OUT or name.startswith("states/") or "flag_values" in variable.attrs
     return variable.dtype.kind in "iuf" and dims in ({*_PLANE}, {*_PLANE, *TENSOR_AXES}) and not (belongs or apart)
 
 
@@ -189,34 +186,26 @@ def _statuses(data: xr.Dataset, dims: list[str]) -> list[str]:
 
 def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | None] | None, list[str]]:
     """Grains and forces of every point, and a sentence if some are left out; None if the map has none."""
-    names = ("x", "y", "radius", "speed", "pair_i", "pair_j", "force", "clustered", "side", "tilt", "window")
-    if not all(f"snapshots/{name}" in data for name in names):
+    if not any(name.startswith("states/") for name in map(str, data.data_vars)):
         return None, []
-    columns = {}
-    for name in names:
-        variable = data[f"snapshots/{name}"].transpose(*dims, ...).values
-        columns[name] = variable.reshape(-1, *variable.shape[len(dims) :])
+    from jaxgran.maps.states import VARIABLES, instant_at, state_of  # here, as only this needs JAX
+
+    timesteps, values = _axis(data, "timestep"), {name: data.get(f"states/{name}") for name in VARIABLES}
+    activation = data.attrs.get("activation")
+    if not timesteps or activation not in _NAMED["activation"] or any(x is None for x in values.values()):
+        return None, []
     found, large = [], 0
-    for point in zip(*columns.values(), strict=True):
-        here = dict(zip(names, point, strict=True))
-        grains, pairs = int(np.isfinite(here["radius"]).sum()), int((here["pair_i"] >= 0).sum())
-        large += grains > MOST_GRAINS
-        if not 0 < grains <= MOST_GRAINS:
+    for place in np.ndindex(*(data.sizes[name] for name in dims)):
+        here = dict(zip(dims, place, strict=True))
+        state = state_of({name: variable.isel(here).values for name, variable in values.items()})  # type: ignore[union-attr]
+        large += state is not None and len(state.grains.radii) > MOST_GRAINS
+        if state is None or len(state.grains.radii) > MOST_GRAINS:
             found.append(None)
             continue
-        speed, force = here["speed"][:grains], here["force"][:pairs]
-        found.append(
-            grain_data(
-                positions=np.stack([here["x"], here["y"]], axis=-1)[:grains],
-                radii=here["radius"][:grains],
-                speed=speed,
-                pairs=np.stack([here["pair_i"], here["pair_j"]], axis=-1)[:pairs],
-                force=force,
-                clustered=here["clustered"][:pairs] > 0,
-                **{name: float(here[name]) for name in ("side", "tilt", "window")},
-                scale=scale_of(speed, force),
-            )
-        )
+        alpha, nu = (data[name].values[here[name]] for name in ("restitution", "packing_fraction"))
+        timestep = timesteps[here.get("timestep", 0)]
+        one = instant_at(state, float(alpha), float(nu), timestep, activation)
+        found.append(grain_data(**one._asdict(), scale=scale_of(one.speed, one.force)))
     return found, [f"Instants of more than {MOST_GRAINS} grains are not drawn."] if large else []
 
 
@@ -244,11 +233,6 @@ def _again(data: xr.Dataset, dims: list[str]) -> dict[str, Any] | None:
     words = [f"--{name} {value}" for name, value in chosen.items() if value != "auto"]
     strain = _column(data["seeds/strain"].mean("seed").where(np.isfinite(data.force_ratio)), data, dims)
     return {"seeds": seeds, "options": " ".join(words), "strain": numbers(strain)}
-
-
-def _by_point(data: xr.Dataset, name: str, dims: list[str]) -> list[float | None] | None:
-    """The numbers of grains or the time steps of all points, if they were chosen by point."""
-    return numbers(_column(data[name], data, dims)) if name in data else None
 
 
 def _about(data: xr.Dataset) -> str:

@@ -19,7 +19,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
-from jaxgran.maps.schema import has_one_timestep
 from jaxgran.plotting.drawing import SMALL_SIZE, mark_bad, padded, ring_key, suspect
 from jaxgran.plotting.encoding import EXCESS_LEVELS
 from jaxgran.plotting.interpolation import interpolated, refined_axes
@@ -145,12 +144,7 @@ def add_plane_legend(figure: Figure, data: xr.Dataset, measured: np.ndarray, ent
 
 
 def draw_excess(axes: Axes, data: xr.Dataset) -> list[float]:
-    """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess.
-
-    A map whose time steps differ between points has none.
-    """
-    if not has_one_timestep(data):
-        return []
+    """Draw the contours of the excess of the force ratio on top of another field, wider for a larger excess."""
     x, y = refined_axes(data)
     widths = [_excess_width(level) for level in EXCESS_LEVELS]
     style = {"colors": _EXCESS_COLOUR, "linewidths": widths, **_EXCESS_STYLE}

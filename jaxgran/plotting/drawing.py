@@ -320,10 +320,7 @@ def _run_description(attrs: dict) -> str:
         parts.append(f"$N={attrs['grains']}$")
     if attrs.get("seeds") is not None:
         parts.append("1 seed" if attrs["seeds"] == 1 else f"{attrs['seeds']} seeds")
-    if "timestep_by_point" in attrs:
-        limits = (scientific(float(limit(attrs["timestep_by_point"]))) for limit in (np.min, np.max))
-        parts.append(rf"$\mathrm{{d}}t={'$ to $'.join(limits)}/\dot{{\gamma}}$ by point")
-    elif np.ndim(attrs.get("timestep", ())) == 0:
+    if np.ndim(attrs.get("timestep", ())) == 0:
         parts.append(rf"$\mathrm{{d}}t={scientific(float(attrs['timestep']))}/\dot{{\gamma}}$")
     if "activation" in attrs:
         parts.append(f"{attrs['activation']} activation")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
@@ -25,7 +23,6 @@ from jaxgran.plotting.drawing import (
 )
 from jaxgran.plotting.interpolation import left_out_note
 from jaxgran.plotting.theory import draw_errors, noise_keys
-from jaxgran.sampling.enskog_factors import RATES
 
 PANELS = {
     "local_temperature": "(a) local temperature",
@@ -40,52 +37,42 @@ LENGTH_PANEL = r"(f) correlation length $L'/\sigma$"
 """Title of the last panel."""
 
 _NOTES = (
-    "{}: measured = Enskog × (a) × (b) × (c) × (d) × (e); (f) ratio of dissipation to pressure, Enskog over measured",
+    "Contact pressure: measured = Enskog × (a) × (b) × (c) × (d) × (e); (f) Γ over pressure, Enskog over measured",
     "Black contours: factor or length, or less one in % (dashed where negative)",
 )
-_LENGTH = "theory/correlation_length_from_pressure"
-
-
-def _drawn(rate: str) -> dict[str, str]:
-    """Return the names of the variables that :func:`enskog_factors` draws, and the titles of their panels."""
-    factors = {f"theory/enskog_factor_{rate}_{factor}": title for factor, title in PANELS.items()}
-    return factors | {_LENGTH: LENGTH_PANEL}
-
-
-def _needed(rate: str) -> list[str]:
-    """Return these names with those of the standard errors."""
-    return [f"{name}{end}" for name in _drawn(rate) for end in ("", "_stderr")]
+_DRAWN = {f"theory/enskog_factor_pressure_{factor}": title for factor, title in PANELS.items()}
+_DRAWN |= {"theory/correlation_length_from_pressure": LENGTH_PANEL}
+_NEEDED = [f"{name}{end}" for name in _DRAWN for end in ("", "_stderr")]
 
 
 def has_factors(data: xr.Dataset) -> bool:
     """Return whether a map has the variables that :func:`enskog_factors` draws."""
-    return not what_lacks(data, *RATIO, *_needed("pressure"))
+    return not what_lacks(data, *RATIO, *_NEEDED)
 
 
-def enskog_factors(data: MapData, rate: Literal["pressure", "shear_stress", "dissipation_rate"] = "pressure") -> Figure:
-    """Return the factors by which a contact stress or the dissipation rate differs from Enskog's, in the plane.
+def enskog_factors(data: MapData) -> Figure:
+    """Return the factors by which the contact pressure differs from Enskog's, in the plane.
 
-    Each factor is the rate with one more assumption replaced by what was measured, over the rate before; the last panel
-    is the correlation length L′: see ``jaxgran.sampling.enskog_factors``. The axes are 1 − α and ν. Black contours have
-    the factor as their label; they are dashed where it is below one. In dotted areas it differs from one by less than
-    its standard error. Green contours show the excess of the force ratio.
+    Each factor is the pressure with one more assumption replaced by what was measured, over the pressure before; the
+    last panel is the correlation length L′: see ``jaxgran.sampling.enskog_factors``. The axes are 1 − α and ν. Black
+    contours have the factor as their label; they are dashed where it is below one. In dotted areas it differs from one
+    by less than its standard error. Green contours show the excess of the force ratio.
 
     Args:
-      data: a map with `theory/enskog_factor_...` of the rate, `theory/correlation_length_from_pressure` and
+      data: a map with `theory/enskog_factor_pressure_...`, `theory/correlation_length_from_pressure` and
         `force_ratio`, with `_stderr`, and `status`.
-      rate: "pressure" or "shear_stress" of the contacts, or "dissipation_rate".
 
     Raises:
       InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
-    data = require_map(data, *RATIO, *_needed(rate))
+    data = require_map(data, *RATIO, *_NEEDED)
     require_plane(data)
-    data = finest(ordered(data, *_needed(rate)))
+    data = finest(ordered(data, *_NEEDED))
     figure = empty_figure(TWO_COLUMNS, height=5.3)
     grid = figure.subplots(2, 3, sharex=True, sharey=True)
-    measured = np.isfinite(data[f"theory/enskog_factor_{rate}_pairs"].values)
+    measured = np.isfinite(data["theory/enskog_factor_pressure_pairs"].values)
     fields, noisy, over = [], False, []
-    for axes, (name, title) in zip(grid.flat, _drawn(rate).items(), strict=True):
+    for axes, (name, title) in zip(grid.flat, _DRAWN.items(), strict=True):
         value, error = (data[f"{name}{end}"].values for end in ("", "_stderr"))
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(value > 0, np.log(value), np.nan)
@@ -98,7 +85,6 @@ def enskog_factors(data: MapData, rate: Literal["pressure", "shear_stress", "dis
     for axes in grid[:, 0]:
         axes.set_ylabel(NU_LABEL, fontsize=LABEL_SIZE)
     add_plane_legend(figure, data, measured, [*(noise_keys() if noisy else []), *excess_keys(over)])
-    notes = [note.format(RATES[rate].capitalize()) for note in _NOTES]
     found = left_out_note(data, fields, "each factor")
-    finish(figure, data, measured, [*notes, found, status_note(data), missing_note(measured, " (hatched)")])
+    finish(figure, data, measured, [*_NOTES, found, status_note(data), missing_note(measured, " (hatched)")])
     return figure

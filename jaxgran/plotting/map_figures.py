@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, get_args
 import xarray as xr
 from matplotlib.figure import Figure
 
-from jaxgran.maps.schema import RATIO, MapData, has_one_timestep, require_map
+from jaxgran.maps.schema import RATIO, MapData, require_map
 from jaxgran.model.checks import InputError, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
@@ -28,7 +28,7 @@ class MapFigure(NamedTuple):
 
 FIGURES = {
     "curves": MapFigure(ratio_curves, lambda data: True),
-    "contours": MapFigure(ratio_contours, lambda data: is_plane(data) and has_one_timestep(data)),
+    "contours": MapFigure(ratio_contours, is_plane),
     "timestep": MapFigure(ratio_against_timestep, lambda data: data.sizes.get("timestep", 1) >= 2),
     "size": MapFigure(averages_against_grains, lambda data: data.sizes.get("grains", 1) >= 2),
     "theory": MapFigure(theory_errors, lambda data: is_plane(data) and has_theory(data)),

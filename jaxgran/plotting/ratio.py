@@ -26,9 +26,7 @@ from jaxgran.maps.schema import (
     RATIO,
     MapData,
     finest,
-    has_one_timestep,
     require_map,
-    require_one_timestep,
     shear_stress_ratio,
     what_lacks,
 )
@@ -85,7 +83,7 @@ def ratio_curves(data: MapData) -> Figure:
 
     Returns:
       Two panels with one scale, or one where the map has no `stress_ratio`. Error bars are one standard error; a point
-      whose status is not `ok` is an open symbol in a ring. Points are not joined if their time steps differ.
+      whose status is not `ok` is an open symbol in a ring.
 
     Raises:
       InputError: (a ValueError) the data are not a map.
@@ -98,12 +96,11 @@ def ratio_curves(data: MapData) -> Figure:
     figure = empty_figure(TWO_COLUMNS, height=3.0)
     grid = figure.subplots(1, len(labels), sharey=True, squeeze=False)[0]
     handles: list[Line2D] = []
-    joined = {} if has_one_timestep(data) else {"linestyle": "none"}
     for axes, (name, label) in zip(grid, labels.items(), strict=True):
         axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=0)
         styles = zip(data.restitution.values, curve_styles(data.sizes["restitution"]), strict=True)
         handles = [
-            _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style | joined, f"{value:.4g}", name)
+            _draw_curve(axes, data.sel(restitution=value), "packing_fraction", style, f"{value:.4g}", name)
             for value, style in styles
         ]
         axes.set_xlim(padded(data.packing_fraction.values))
@@ -114,10 +111,7 @@ def ratio_curves(data: MapData) -> Figure:
     _set_ratio_scale(grid[0], np.concatenate([data[name].values for name in labels]))
     add_curve_legend(figure, data, handles, ALPHA_TITLE)
     measured = np.isfinite(data.force_ratio.values)
-    compare = (
-        "Time steps differ between points, and both ratios depend on them: they are not comparable" if joined else ""
-    )
-    finish(figure, data, measured, [compare, status_note(data), missing_note(measured)])
+    finish(figure, data, measured, [status_note(data), missing_note(measured)])
     return figure
 
 
@@ -137,12 +131,10 @@ def ratio_contours(data: MapData) -> Figure:
       The levels of `EXCESS_LEVELS` that the map reaches, labelled; the others are named under the axes.
 
     Raises:
-      InputError: (a ValueError) fewer than two restitutions or two packing fractions, or time steps that were chosen
-        by point.
+      InputError: (a ValueError) fewer than two restitutions or two packing fractions.
     """
     data = require_map(data, *RATIO)
     require_plane(data)
-    require_one_timestep(data, "a contour of the force ratio")
     data = finest(ordered(data))
     x, y = refined_axes(data)
     excess, stderr = data.force_ratio.values - 1.0, data.force_ratio_stderr.values

@@ -71,8 +71,10 @@ SHARE_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90)
 """Contour values of the share of clusters."""
 
 _QUANTITIES = {"pressure": "pressure", "shear_stress": "shear stress"}
-_PARTS = ("", "theory/", "stresses/kinetic_", "stresses/binary_")
-_STRESSES = [f"{part}{name}" for name in _QUANTITIES for part in _PARTS]
+_STRESSES = [
+    *(f"{part}{name}" for name in _QUANTITIES for part in ("", "theory/")),
+    *("stresses/kinetic_stress", "stresses/binary_stress"),
+]
 _STRESSES_NEEDED = (*_STRESSES, *(f"{name}_stderr" for name in _QUANTITIES), "stress_ratio", "stress_ratio_stderr")
 SHARES = [f"stresses/cluster_{name}_share{end}" for name in ("pressure", "shear") for end in ("", "_stderr")]
 _LEAST_EXCESS = 1e-5  # smallest excess that its logarithmic axis shows
@@ -109,14 +111,17 @@ def error_parts(data: xr.Dataset, quantity: str) -> dict[str, tuple[np.ndarray, 
     Binary is the measured kinetic stress plus the contact stress if all collisions were binary. The total is the sum of
     the other two. All are NaN where a quotient is not positive or not known.
     """
-    names = [f"{part}{quantity}" for part in _PARTS]
-    measured, theory, kinetic, collisional = (data[name].values for name in names)
-    stderr, _, kinetic_error, collisional_error = (
-        data[f"{name}_stderr"].values if f"{name}_stderr" in data else np.zeros(()) for name in names
-    )
     components = [(0, 0), (1, 1)] if quantity == "pressure" else [(0, 1)]
-    relative = np.abs(data.stress_ratio_stderr / data.stress_ratio)
-    ratio_error = np.mean([relative.isel(axis_a=a, axis_b=b).values for a, b in components], axis=0)
+
+    def part_of(tensor: xr.DataArray) -> np.ndarray:
+        return np.mean([tensor.isel(axis_a=a, axis_b=b).values for a, b in components], axis=0)
+
+    measured, theory, stderr = (data[name].values for name in (quantity, f"theory/{quantity}", f"{quantity}_stderr"))
+    sign = 1 if quantity == "pressure" else -1
+    kinetic, collisional = (sign * part_of(data[f"stresses/{name}_stress"]) for name in ("kinetic", "binary"))
+    errors = [f"stresses/{name}_stress_stderr" for name in ("kinetic", "binary")]
+    kinetic_error, collisional_error = (part_of(data[name]) if name in data else np.zeros(()) for name in errors)
+    ratio_error = part_of(np.abs(data.stress_ratio_stderr / data.stress_ratio))
     binary = kinetic + collisional
     with np.errstate(divide="ignore", invalid="ignore"):
         parts = {

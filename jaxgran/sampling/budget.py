@@ -144,7 +144,7 @@ def error_budget(
     ===========  ====================================================================================
 
     Args:
-      values, errors: averages and their standard errors, by name; also contact_pressure.
+      values, errors: averages and their standard errors, by name; also contact_stress, (..., 2, 2).
       restitution, packing_fraction, grains: of the flow.
       timestep: dt of the sample, in t.
       tolerance: relative residual of a contact solve.
@@ -152,7 +152,8 @@ def error_budget(
     temperature = np.asarray(values["granular_temperature"], float)
     with np.errstate(invalid="ignore", divide="ignore"):
         step = stress_error(np.asarray(timestep) * np.sqrt(temperature), packing_fraction)
-        in_contacts = np.asarray(values["contact_pressure"]) / np.asarray(values["pressure"])
+        contact = np.asarray(values["contact_stress"])
+        in_contacts = (contact[..., 0, 0] + contact[..., 1, 1]) / 2 / np.asarray(values["pressure"])
     solve = RESIDUAL_FACTOR * np.asarray(tolerance) * in_contacts
     budget = {}
     for name, law in BUDGET.items():

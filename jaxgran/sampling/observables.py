@@ -64,9 +64,6 @@ class Averages:
     """Every observable as an attribute, from the mapping ``averages``: this is the table of all observables."""
 
     force_ratio = Average("mean contact force over mean binary contact force")
-    contact_force = Average("mean force of a contact that carries an impulse", "m sigma / t^2")
-    binary_force = Average("mean force of such a contact if collisions were binary", "m sigma / t^2")
-    force_second_moment = Average("mean squared force of a contact that carries an impulse over its squared mean")
     stress_ratio = Average("contact stress over binary stress, by component", tensor=True)
     pressure = Average("pressure, contact and kinetic", STRESS_UNIT)
     shear_stress = Average("shear stress, contact and kinetic, positive", STRESS_UNIT)
@@ -84,16 +81,6 @@ class Averages:
         "stress of the contact forces if collisions were binary", STRESS_UNIT, group="stresses", tensor=True
     )
     kinetic_stress = Average("stress of the peculiar motion", STRESS_UNIT, group="stresses", tensor=True)
-    contact_pressure = Average("pressure of the contact forces", STRESS_UNIT, group="stresses")
-    binary_pressure = Average("pressure of the contact forces if collisions were binary", STRESS_UNIT, group="stresses")
-    kinetic_pressure = Average("pressure of the peculiar motion", STRESS_UNIT, group="stresses")
-    contact_shear_stress = Average("shear stress of the contact forces", STRESS_UNIT, group="stresses")
-    binary_shear_stress = Average(
-        "shear stress of the contact forces if collisions were binary", STRESS_UNIT, group="stresses"
-    )
-    kinetic_shear_stress = Average("shear stress of the peculiar motion", STRESS_UNIT, group="stresses")
-    bagnold_pressure = Average("pressure over mass of a mean grain times squared shear rate", group="stresses")
-    bagnold_shear_stress = Average("shear stress over mass of a mean grain times squared shear rate", group="stresses")
     dissipation_rate = Average("energy that contacts lose per unit area and time", "m / t^3", group="stresses")
     binary_dissipation_rate = Average(
         "energy that contacts would lose if collisions were binary", "m / t^3", group="stresses"
@@ -105,9 +92,7 @@ class Averages:
         "share of the contact shear stress in clusters of three or more grains", group="stresses"
     )
 
-    network_size = Average("contacts of a solved network, carrying an impulse or not", group="diagnostics")
     iterations = Average("solver iterations per solved network", group="diagnostics")
-    median_residual = Average("median relative residual of the solved networks", group="diagnostics")
     worst_residual = Average("largest relative residual of a solved network", group="diagnostics", extreme=True)
     unconverged_share = Average("share of the solved networks that ended above the tolerance", group="diagnostics")
     mean_overlap = Average("mean overlap of the contacts of a solved network", "sigma", group="diagnostics")

@@ -3,7 +3,7 @@
 import hashlib
 import re
 import traceback
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,7 +21,7 @@ from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.observer import nothing_observed, without_contacts
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.dynamics.tally import Tally
-from jaxgran.model.checks import InputError, refused, short_repr
+from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
@@ -58,16 +58,6 @@ def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:
 def dimensions_of(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     """The dimensions in a dataset of what a function observes by this name."""
     return tuple(f"{name}_dim_{k}" for k in range(len(shape)))
-
-
-def require_units(units: Any, names: Collection[str]) -> None:
-    """Raise an InputError unless these are units by the names of what a function observes."""
-    if not isinstance(units, dict) or not all(isinstance(x, str) for one in units.items() for x in one):
-        raise refused("observe_units", units, 'must be a dictionary of units by name, such as {"torque": "1"}')
-    unknown = [name for name in units if name not in names]
-    if unknown:
-        there = f"which are {', '.join(names)}" if names else "and there are none"
-        raise refused("observe_units", unknown[0], f"must have names that observe returns, {there}")
 
 
 def digest_of(observe: Observable, flow: ShearFlow) -> str:

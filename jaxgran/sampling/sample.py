@@ -139,24 +139,20 @@ class Sample(Averages, Indexable):
         each = [here[place].errors() for place in range(len(here.area))]
         return {name: np.stack([errors[name] for errors in each]) for name in each[0]}
 
-    def to_dataset(self, observe_units: Mapping[str, str] | None = None) -> "xr.Dataset":
+    def to_dataset(self) -> "xr.Dataset":
         """The averages as an ``xarray.Dataset``, named as in a map: NAME, NAME_stderr, and the strain and the status.
 
         A batch has the dimension ``replica``, and tensors have ``axis_a`` and ``axis_b``. ``long_name`` says what a
         variable is. ``reduced_unit`` is its unit in m, σ and t. If ``observe`` returned a dictionary of numbers or
         arrays, their means are there too; an array has the dimensions NAME_dim_0, NAME_dim_1, …
 
-        Args:
-          observe_units: units of what ``observe`` returned, by name; "1" for pure numbers.
-
         Raises:
-          InputError: JAX transforms this function, or ``observe`` returned a name that an average has, or
-            ``observe_units`` has a name that ``observe`` does not return.
+          InputError: JAX transforms this function, or ``observe`` returned a name that an average has.
         """
         require_untraced("to_dataset()", "take it of the finished sample", self)
         from jaxgran.sampling.sample_dataset import dataset_of
 
-        return dataset_of(self, {} if observe_units is None else observe_units)
+        return dataset_of(self)
 
     def observed(self, estimate: Callable[[Any], Any] = lambda means: means) -> tuple[Any, Any]:
         """Means over all time steps of what ``observe`` returned, and their standard errors, for one replica.

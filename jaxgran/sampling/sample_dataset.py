@@ -1,6 +1,5 @@
 """A sample as a dataset: its averages with errors and units, named as in the file of a map."""
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -10,13 +9,13 @@ import xarray as xr
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES, TENSOR_AXES, unit_attributes
-from jaxgran.sampling.observe import dimensions_of, require_units
+from jaxgran.sampling.observe import dimensions_of
 
 if TYPE_CHECKING:
     from jaxgran.sampling.sample import Sample
 
 
-def dataset_of(sample: "Sample", observe_units: Mapping[str, str]) -> xr.Dataset:
+def dataset_of(sample: "Sample") -> xr.Dataset:
     """The dataset of ``Sample.to_dataset``."""
     replicas = ("replica",) * np.ndim(sample.area)
     values, errors = sample.averages, sample.errors()
@@ -28,7 +27,7 @@ def dataset_of(sample: "Sample", observe_units: Mapping[str, str]) -> xr.Dataset
     flags = {"flag_values": np.array([*Status], np.int8), "flag_meanings": " ".join(status.name for status in Status)}
     variables["strain"] = replicas, sample.strain, _about("sampled strain", "1")
     variables["status"] = replicas, np.asarray(sample.status, np.int8), {"long_name": "status", **flags}
-    own = _own_variables(sample, replicas, observe_units)
+    own = _own_variables(sample, replicas)
     if taken := [name for name in own if name in variables]:
         raise InputError(f"observe must return names that a sample does not have, not {short_repr(taken[0])}.")
     variables |= own
@@ -36,22 +35,19 @@ def dataset_of(sample: "Sample", observe_units: Mapping[str, str]) -> xr.Dataset
     return xr.Dataset(variables, coordinates, {"grains": sample.grains})
 
 
-def _own_variables(sample: "Sample", replicas: tuple[str, ...], units: Mapping[str, str]) -> dict[str, Any]:
+def _own_variables(sample: "Sample", replicas: tuple[str, ...]) -> dict[str, Any]:
     """The means of what ``observe`` returned, with errors, if it is a dictionary of numbers or arrays."""
     sums = sample.observed_sums
-    named = isinstance(sums, dict) and all(isinstance(x, (np.ndarray, jax.Array)) for x in sums.values())
-    require_units(units, tuple(sums) if named else ())
-    if not named:
+    if not isinstance(sums, dict) or not all(isinstance(x, (np.ndarray, jax.Array)) for x in sums.values()):
         return {}
     each = [sample[k].observed() for k in range(len(sample))] if replicas else [sample.observed()]
     variables = {}
     for name in sums:
         means, errors = (np.stack([one[kind][name] for one in each]) for kind in (0, 1))
         dims = (*replicas, *dimensions_of(name, means.shape[1:]))
-        about = unit_attributes(units[name]) if name in units else {}
         for key, numbers, meaning in ((name, means, "mean"), (f"{name}_stderr", errors, "standard error of the mean")):
             values = numbers if replicas else numbers[0]
-            variables[key] = dims, values, {"long_name": f"{meaning} of {name} over all time steps", **about}
+            variables[key] = dims, values, {"long_name": f"{meaning} of {name} over all time steps"}
     return variables
 
 

@@ -1,4 +1,4 @@
-"""Errors that a time step and a tolerance cause, and the longest step and loosest tolerance for a given error.
+"""Errors that a time step causes, and the longest step for a given error.
 
 In one step dt a grain of thermal speed moves by x = dt √T/σ. The errors follow from x:
 
@@ -65,15 +65,6 @@ def automatic_timestep(
     crossing = target_error / stress_error(1.0, packing_fraction)
     accurate = crossing / np.sqrt(np.asarray(temperature))
     return np.minimum(accurate, longest_timestep(temperature, packing_fraction, activation))
-
-
-def automatic_tolerance(target_error: float) -> float:
-    """Loosest tolerance for which the stress error of 98 % of the contact solves is at most half the target.
-
-    In contact networks of flows these have a relative stress error of up to 34 times the residual, and the worst of
-    1500 solves one of 60 times. Over a run these errors mostly cancel, so this choice is on the safe side.
-    """
-    return float(np.clip(target_error / 70, 1e-10, 1e-2))
 
 
 def distance_to_jamming(packing_fraction: ArrayLike) -> np.ndarray:
