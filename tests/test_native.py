@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import advance as advance_module
-from jaxgran.dynamics.engine import Numba
+from jaxgran.dynamics.engine import Jax, Numba
 from jaxgran.dynamics.numba_engine import cluster_solver, layout
 from jaxgran.dynamics.numba_engine.ffi import object_file
 from jaxgran.dynamics.numba_engine.near_pairs import LIFE, find_near_pairs, skin_loss
