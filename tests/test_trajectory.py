@@ -506,7 +506,7 @@ def test_a_place_that_does_not_do_is_refused_in_one_sentence(name: str, tmp_path
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no limit of the size of a file")
-def test_a_full_disk_removes_the_trajectory_and_is_named(seen, tmp_path: Path) -> None:
+def test_a_full_disk_is_named_and_leaves_the_frames_that_are_whole(seen, tmp_path: Path) -> None:
     import resource
 
     path, before = tmp_path / "flow.gsd", resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -520,4 +520,5 @@ def test_a_full_disk_removes_the_trajectory_and_is_named(seen, tmp_path: Path) -
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)
-    assert failure.value.filename == str(path) and not list(tmp_path.iterdir())
+    assert failure.value.filename == str(path) and list(tmp_path.iterdir()) == [path]
+    assert len(read_trajectory(path).strain) == step

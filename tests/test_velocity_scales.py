@@ -99,11 +99,11 @@ def test_the_local_temperature_is_averaged_as_well_as_the_granular_temperature()
 
 
 def test_readings_of_both_engines_are_taken_in_the_same_steps(packed, engines):
-    """Until every grain has collided twice as often as between two readings, in a dense and hardly sheared flow."""
+    """Past one reading within the advance, in a dense and hardly sheared flow."""
     rng, flow = np.random.default_rng(0), flow_of(0.7, restitution=1.0, timestep=2e-3, shear_rate=1e-3)
     state = replace(packed(0.7), velocities=jnp.asarray(rng.normal(size=(GRAINS, 2))))
-    (_, numba), (end, plain) = (engines[name](flow, state, 1400) for name in ("numba", "jax"))
-    assert numba.collisions == plain.collisions > READ_AFTER * GRAINS
+    (_, numba), (end, plain) = (engines[name](flow, state, 1500) for name in ("numba", "jax"))
+    assert numba.collisions == plain.collisions > READ_AFTER * GRAINS / 2
     for name in ("local_kinetic", "wave_kinetic"):
         np.testing.assert_allclose(getattr(numba, name), getattr(plain, name), rtol=1e-4)
     last = plain.duration * wave_temperature(end)

@@ -101,7 +101,7 @@ def fit_trajectory(
     for name, noise in (("position_noise", position_noise), ("velocity_noise", velocity_noise)):
         require_number(name, noise, lambda x: (x > 0) & np.isfinite(x), "above 0")
     batch = checked_batch(require_advance, flow, start, steps)
-    if batch is None or np.shape(end.positions) != np.shape(start.positions):
+    if batch is None or not isinstance(end, State) or np.shape(end.positions) != np.shape(start.positions):
         raise InputError("start and end must be states with the same axis (windows,), such as prepare returns.")
     needed = int(np.max(lax.map(lambda x: count_events(*x, solver=_SOLVER), batch)))
     events = 8 + 3 * needed // 2 if events is None else events
@@ -113,7 +113,7 @@ def fit_trajectory(
     _require_short(_slopes(events, batch, end, noises, unknowns)[0] * position_noise)
     with jax.numpy_dtype_promotion("standard"):  # which optax needs
         unknowns, misfit, status = _minimised(events, iterations, batch, end, noises, unknowns)
-    if np.max(status) == Status.capacity:
+    if np.any(np.asarray(status) == Status.capacity):
         raise InputError(f"events must be more than {events}: some window has more steps with contacts.")
     size, information = _slopes(events, batch, end, noises, unknowns)
     _require_short(size * position_noise)

@@ -125,8 +125,7 @@ def print_budget(data) -> None:
         cells = [_percent(part) for part in ordered]
         cells[1] = "at its dt" if name == "force_ratio" else cells[1]
         table.rows.append([name.replace("_", " "), *cells])
-    if np.isfinite(data.force_ratio).any():
-        print_table(table)
+    print_table(table)
 
 
 def _percent(part) -> str:

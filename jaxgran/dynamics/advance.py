@@ -41,9 +41,9 @@ def advance(
     Without an ``engine``, ``Numba`` is taken on a processor, if the solver is a ``BarzilaiBorwein`` and
     ``free_flight``, ``events`` and ``moving_contacts`` are left out; otherwise ``Jax``. Both engines solve the same
     steps to the same tolerance, and differ by rounding and within the tolerance only; on a processor ``Numba`` is
-    several times faster. Under ``vmap``, replicas take a processor in turn by ``Jax``, on all cores by ``Numba``, and
-    an accelerator in lockstep, with the same bits as alone. This function does not compile itself: call it within
-    ``jax.jit``.
+    several times faster. Under ``vmap`` without ``events``, replicas take a processor in turn by ``Jax``, on all cores
+    by ``Numba``, and an accelerator in lockstep, with the same bits as alone. This function does not compile itself:
+    call it within ``jax.jit``.
 
     Forward-mode derivatives (``jax.jvp``, ``jax.jacfwd``) need no further argument. Reverse-mode derivatives
     (``jax.grad``, ``jax.vjp``) need the number of ``events``. Reverse mode stores the state and the lists of every
@@ -55,7 +55,7 @@ def advance(
       steps: number of time steps, traced; for a batch also (replicas,).
       free_flight: True jumps over steps without an approaching contact; False visits every step. The trajectory is the
         same.
-      events: number of visited steps, static, for a loop of fixed length; ``steps + 1`` is always enough, and
+      events: number of visited steps, static, for a loop of fixed length; ``2 * steps + 1`` is always enough, and
         ``count_events`` counts them. If they are too few, the status is ``capacity``, and numbers and derivatives are
         NaN. None visits as many as needed.
       moving_contacts: whether derivatives include the shift of the contacts in time, see

@@ -3,7 +3,7 @@
 =========  =====================================  ==========================================================
 engine     for                                    needs
 =========  =====================================  ==========================================================
-Numba      processors                             float64, the default solver, no ``vmap`` with a named axis
+Numba      processors                             float64, the default solver
 Jax        everything else, and as the reference  nothing: every backend, precision, solver and derivative
 =========  =====================================  ==========================================================
 

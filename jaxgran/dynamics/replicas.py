@@ -68,8 +68,8 @@ def _replicas(batch: Arguments) -> Iterator[Any]:
 def over_replicas(function: Callable, numerics: Numerics, batch: Arguments, option: str = "") -> Any:
     """The function of one replica for a batch, with the engine that ``select_engine`` takes for it.
 
-    A compiled engine advances the replicas by ``vmap``, and so does the engine ``Jax`` in lockstep, with a named axis.
-    Where it is chosen automatically on a processor, they advance in turn by ``lax.map``, which is faster.
+    On a processor ``Numba`` advances the replicas by ``vmap``, and ``Jax`` in turn by ``lax.map``. On an accelerator
+    they advance in lockstep, by ``vmap`` with a named axis.
     """
     flow, state, *_ = batch
     if in_lockstep():

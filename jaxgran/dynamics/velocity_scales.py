@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jaxgran.model.cell import wrap
 from jaxgran.model.state import State
 
-READ_AFTER = 32  # collisions of every grain between two readings
+READ_AFTER = 64  # collisions of every grain between two readings
 BOX_GRAINS = 25  # mean number of grains in a box, as nearly as equal boxes allow
 WAVES = ((1, 0), (0, 1), (1, 1), (1, -1))  # the longest waves, in reciprocal lattice vectors
 

@@ -116,7 +116,8 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
     """Append a frame to a trajectory; step 0 starts a new file, replacing an old one.
 
     Args:
-      path: GSD file, complete after every frame. It is removed where the file system fails to take a frame.
+      path: GSD file, complete after every frame. Where the file system fails to take a frame, it ends with the one
+        before.
       frame: one snapshot of the flow; or a series of every time step from the frame on, whose forces are averaged.
       step: time steps since the first frame.
 
@@ -124,10 +125,11 @@ def write_frame(path: Path, frame: Snapshot, step: int) -> None:
       OSError: with the name of the file.
     """
     if step:
+        size = path.stat().st_size
         try:
             _write(path, "r+", frame, step)
         except OSError as error:
-            path.unlink(missing_ok=True)
+            os.truncate(path, size)
             if error.errno:
                 error.filename = str(path)
             raise

@@ -74,10 +74,11 @@ def merge_maps(
             "maps with an `error` sample by their number of seeds, so they cannot be merged with other seeds."
         )
     merged: dict[str, Any] = {**chosen[0], "first_seed": numbers[0], "seeds": len(numbers), "observe": observe}
-    if isinstance(chosen[0]["solver"], str):
-        if solver is None or solver_text(solver) != chosen[0]["solver"]:
-            raise InputError(f"solver must be that of the maps, which is {chosen[0]['solver']}.")
-        merged["solver"] = solver
+    own = chosen[0]["solver"]  # of a user's class: its text
+    text = own if isinstance(own, str) else solver_text(own)
+    if (solver is not None or own is text) and (solver is None or solver_text(solver) != text):
+        raise InputError(f"solver must be that of the maps, which is {text}.")
+    merged["solver"] = own if solver is None else solver
     with jax.enable_x64(opened[0].attrs["precision"] == "float64"):
         settings = MapSettings(**{name: value for name, value in merged.items() if name != "part"})
         return _joined(names, chosen, opened, settings)

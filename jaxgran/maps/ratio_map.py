@@ -10,11 +10,10 @@ from threading import Thread
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jaxgran.dynamics.advance import register_numba
-from jaxgran.dynamics.engine import Numba, select_engine
+from jaxgran.dynamics.engine import Numba, in_lockstep, select_engine
 from jaxgran.environment import usable_cores
 from jaxgran.io.atomic import require_place
 from jaxgran.maps.batches import points_of_part
@@ -53,8 +52,8 @@ def ratio_map(*arguments: Any, **parameters: Any) -> "xr.DataTree":
 
     Returns:
       The DataTree described in ``map_dataset``. It has all observables on (packing_fraction, restitution), with
-      standard errors. Lists of numbers of grains and of time steps add the dimensions grains and
-      timestep in front. It also has the status of each point, and all parameters as attributes.
+      standard errors. Lists of numbers of grains and of time steps add the dimensions grains and timestep in front. It
+      also has the status of each point, and all parameters as attributes.
 
     Raises:
       InputError: (a ValueError) a parameter is out of its range; the message says what is accepted. Or the output
@@ -162,7 +161,7 @@ def _require_own_attributes(run: RunParameters, settings: MapSettings) -> None:
 
 def _workers(run: RunParameters) -> int:
     """How many batches run at a time; InputError if they cannot."""
-    on_cpu = jax.default_backend() == "cpu"
+    on_cpu = not in_lockstep()
     if run.workers is None:
         return usable_cores() if on_cpu and run.scheduler is None and run.record is None else 1
     if run.workers > 1 and not on_cpu:

@@ -16,7 +16,7 @@ from jaxgran.model.choices import Activation
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
 from jaxgran.model.state import State
-from jaxgran.model.status import GIVEN_UP
+from jaxgran.model.status import GIVEN_UP, Status
 
 _PACKED = {"zlib": True, "shuffle": True, "complevel": 4}
 _OF_GRAINS = {
@@ -84,7 +84,11 @@ _snapshot = jax.jit(snapshot)
 
 def instant_at(
     state: State, restitution: float, packing_fraction: float, timestep: float, activation: Activation
-) -> Instant:
-    """The grains of a state, and the forces of the time step that begins with it, by the default solver."""
+) -> Instant | None:
+    """The grains of a state, and the forces of the time step that begins with it, by the default solver.
+
+    None where contacts may be missing or have no solution.
+    """
     flow = ShearFlow(len(state.grains.radii), restitution, packing_fraction, timestep, activation=activation)
-    return instant_of(_snapshot(flow, state))
+    now = _snapshot(flow, state)
+    return None if now.status >= Status.infeasible else instant_of(now)

@@ -205,7 +205,7 @@ def _instants(data: xr.Dataset, dims: list[str]) -> tuple[list[dict[str, Any] | 
         alpha, nu = (data[name].values[here[name]] for name in ("restitution", "packing_fraction"))
         timestep = timesteps[here.get("timestep", 0)]
         one = instant_at(state, float(alpha), float(nu), timestep, activation)
-        found.append(grain_data(**one._asdict(), scale=scale_of(one.speed, one.force)))
+        found.append(None if one is None else grain_data(**one._asdict(), scale=scale_of(one.speed, one.force)))
     return found, [f"Instants of more than {MOST_GRAINS} grains are not drawn."] if large else []
 
 

@@ -1,4 +1,4 @@
-"""What figures, films and pages draw alike: levels of contours, and the colours and widths of grains and forces."""
+"""What figures, movies and pages draw alike: levels of contours, and the colours and widths of grains and forces."""
 
 import numpy as np
 
