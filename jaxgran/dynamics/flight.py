@@ -23,7 +23,7 @@ class Carry(NamedTuple):
 
     lists: PairLists
     pairs: PairMotion
-    slack: Array  # what is left of the skin of the near list; the look-ahead of a step needs some of it
+    slack: Array  # unused skin of the near list, of which the look-ahead of a step takes a part
     loss: Array  # bound on how fast any gap closes
     velocities: Array
     step: Array  # steps flown
