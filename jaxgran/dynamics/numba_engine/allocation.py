@@ -18,6 +18,7 @@ from numba.np.arrayobj import make_array, populate_array
 from jaxgran.dynamics.numba_engine.compilation import inline_njit
 from jaxgran.dynamics.numba_engine.layout import (
     LANES,
+    LEAST_SHIFT,
     SAVED,
     WORDS,
     WORDS_PER_GRAIN,
@@ -83,10 +84,12 @@ def _reserve(memory, count, size):
 def _pairs_of(memory, count):
     room = min(_PAIR_CAPACITY * count, count * (count - 1) // 2)
     slots, cells = (room + LANES) // LANES * LANES, max(9, 2 * count)
+    bounds = (slots >> LEAST_SHIFT) + LANES  # padded to whole rows
     return Pairs(
         _unsigned_at(_reserve(memory, 2 * slots, 4), (2, slots)),
         doubles_at(_reserve(memory, 2 * slots, 8), (2, slots)),
         _signed_at(_reserve(memory, 3 * slots, 4), (3, slots)),
+        _signed_at(_reserve(memory, 2 * bounds, 4), (2, bounds)),
         _unsigned_at(_reserve(memory, 2 * room, 4), (2 * room,)),
         _unsigned_at(_reserve(memory, count + 1, 4), (count + 1,)),
         _unsigned_at(_reserve(memory, cells + 1, 4), (cells + 1,)),

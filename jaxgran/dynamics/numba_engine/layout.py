@@ -17,8 +17,8 @@ RESULTS = NUMBERS + 4
 BETWEEN_LISTS, WITHIN_LIST = 1, 2  # where a suspended loop goes on
 SAVED = 15  # numbers of a suspended loop, behind its sums
 WORDS, WORDS_PER_GRAIN = (
-    1024 + 2 * NUMBERS + SAVED,
-    187,
+    2048 + 2 * NUMBERS + SAVED,
+    189,
 )  # of eight bytes: bounds of the memory that ``allocation`` divides
 
 X, Y, VX, VY = range(4)  # columns of the motion of the grains
@@ -37,6 +37,7 @@ RESPONSE, STEP, CHANGE, BEST, BOUND = range(5)  # columns of the same for a stif
 NEVER = np.int32(2**31 - 1)  # a step of the calendar that does not come
 MANY = 2.0**30  # steps, the end of the calendar
 LANES = 64  # entries of the calendar that are compared together
+LEAST_SHIFT = 5  # blocks of entries are of 2**5 at least
 EPSILON = float(np.finfo(np.float64).eps)
 OK, ITERATION_LIMIT = int(Status.ok), int(Status.iteration_limit)
 INFEASIBLE, CAPACITY, NONFINITE = int(Status.infeasible), int(Status.capacity), int(Status.nonfinite)
@@ -84,15 +85,17 @@ class Order(NamedTuple):
 class Pairs(NamedTuple):
     """Near pairs, padded to whole ``LANES``, with a spare slot for a pair beyond the room.
 
-    ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; of_grain: (2 room,) pairs of the grains,
-    those of grain g at ``offsets[g] : offsets[g + 1]``. For the search: starts: (cells + 1,); cells, sorted: (grains,)
-    the cell of each grain, and the grains in the order of the cells; places: (3, grains) x, y and radius of these.
-    listed: (slots,) pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), scratch memory of a prediction.
+    ends: (2, slots) grains; images: (2, slots); calendar: (3, slots) steps; bounds: (2, blocks) the least strike and
+    begin of a block of the calendar, or less; of_grain: (2 room,) pairs of the grains, those of grain g at
+    ``offsets[g] : offsets[g + 1]``. For the search: starts: (cells + 1,); cells, sorted: (grains,) the cell of each
+    grain, and the grains in the order of the cells; places: (3, grains) x, y and radius of these. listed: (slots,)
+    pairs to be predicted; flights, entries: (5, LANES) and (3, LANES), scratch memory of a prediction.
     """
 
     ends: Any
     images: Any
     calendar: Any
+    bounds: Any
     of_grain: Any
     offsets: Any
     starts: Any

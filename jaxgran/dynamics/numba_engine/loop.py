@@ -21,6 +21,8 @@ import math
 import numpy as np
 
 from jaxgran.dynamics.numba_engine.calendar import (
+    bound_blocks,
+    choose_blocks,
     clear_calendar,
     contacts_of_step,
     next_contact_step,
@@ -125,7 +127,6 @@ def advance_loop(
         if going_on == WITHIN_LIST:
             fresh = False
             k, found, skin, loss, slack, fastest, kinetic = _list_saved(saved[NUMBERS:])
-            blocks = clear_calendar(found, pairs)
             going_on = 0
         else:
             k, fresh = 0, True  # steps since the search
@@ -143,8 +144,11 @@ def advance_loop(
             horizon = max(min(slack / loss if loss > 0.0 else math.inf, life), dt) + ahead
             for p in range(found):
                 pairs.listed[p] = p
-            predict_contact_steps(found, 0.0, solved, horizon, flow, grains, pairs)
-            blocks = clear_calendar(found, pairs)
+            predict_contact_steps(found, 0.0, solved, horizon, 0, flow, grains, pairs)
+        entries = clear_calendar(found, pairs)
+        shift = choose_blocks(entries, max(min(slack / loss, life - k * dt) / dt, 1.0), pairs)
+        if shift > 0:
+            bound_blocks(entries, shift, pairs)
 
         if room > 0:
             t = k * dt
@@ -153,7 +157,7 @@ def advance_loop(
         while True:
             # The next step to visit is that of a contact, the end of the list's life, or that of the advance.
             spare = min(slack / (loss * dt), life / dt - k, MANY) if loss > 0.0 else MANY
-            strike, before = next_contact_step(blocks, pairs), k
+            strike, before = next_contact_step(entries, shift, pairs), k
             k = min(before + int(max(spare, 1.0 if fresh else 0.0)), strike, steps - done)
             flight, fresh = (k - before) * dt, False  # a new list lasts to the next step, where it is renewed
             kinetic = add_flight(results, k - before, flight, rate * flight, kinetic)
@@ -166,7 +170,7 @@ def advance_loop(
                 break
 
             t = k * dt
-            contacts = contacts_of_step(k, blocks, pairs, network.met)
+            contacts = contacts_of_step(k, entries, shift, pairs, network.met)
             overfull = contacts > network.met.size
             contacts = min(contacts, network.met.size)
             hits, outcome = _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, results)
@@ -187,7 +191,7 @@ def advance_loop(
             slack -= (loss - loss_before) * ahead
             horizon = max(min(slack / loss, life - t), dt) + ahead
             listed = _list_struck(k, hits, found if overfull else contacts, overfull, pairs, network)
-            predict_contact_steps(listed, t, k + 1, horizon, flow, grains, pairs)
+            predict_contact_steps(listed, t, k + 1, horizon, shift, flow, grains, pairs)
             if 0 < room == recorded:
                 suspended = WITHIN_LIST
                 break
