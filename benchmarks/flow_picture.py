@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
+from jaxgran.analysis.force_chains import cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, draw_scene, force_key, scene_of
@@ -66,13 +66,13 @@ def window(restitution: float, choice: Choice) -> Snapshot:
 
 def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
     """What the picture shows, in numbers."""
-    scene, share, sizes = scene_of(snapshots), cluster_share(snapshots), cluster_sizes(snapshots)
+    scene, share = scene_of(snapshots), cluster_share(snapshots)
     return {
         "alpha": restitution,
         "pairs": len(scene.instant.force),
         "pairs_mostly_in_clusters": int(scene.instant.clustered.sum()),
         "force_share_of_clusters": share.force.value.item(),
-        "largest_cluster": float(sizes.at[np.nonzero(sizes.value)[0].max()]),
+        "largest_cluster": float(clusters(snapshots).sizes.max()),
         "mean_speed": float(scene.speed.mean()),
         "largest_force": float(scene.instant.force.max()),
     }
