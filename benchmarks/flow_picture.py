@@ -4,7 +4,7 @@ Both flows are sheared to their steady state and on to the same tilt of the cell
 snapshot, and a line shows the mean force between two grains over that short time: at α = 0.9 pairs collide one after
 the other, at α = 0.1 chains of grains push at once.
 
-A film shows a third flow, by the command that the README gives.
+A movie shows a third flow, by the command that the README gives.
 
     python -m benchmarks flow_picture            # about 2 minutes
     python -m benchmarks flow_picture --quick    # about a minute: 100 grains, a longer time step
@@ -28,7 +28,7 @@ from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, dr
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
 THINNER = 0.6  # lines of the figure, over those of a flow that fills a page
 TILT = 0.15  # of the cell at the first snapshot
-FILM = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
+MOVIE = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
 
 
 class Choice(NamedTuple):
@@ -51,8 +51,8 @@ def run(output: Output, colour: Colour = "speed") -> None:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
     output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow")
-    film = str(output.path("flow", ".gif"))
-    subprocess.run([sys.executable, "-m", "jaxgran", *FILM.split(), film, "--overwrite"], check=True)
+    movie = str(output.path("flow", ".gif"))
+    subprocess.run([sys.executable, "-m", "jaxgran", *MOVIE.split(), movie, "--overwrite"], check=True)
 
 
 def window(restitution: float, choice: Choice) -> Snapshot:

@@ -53,7 +53,6 @@ def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
         clustered=rng.random(pairs) < 0.5,
         side=10.0,
         tilt=0.2,
-        window=0.002,
     )
 
 
