@@ -14,7 +14,7 @@ from jaxgran.model.cell import centred
 
 
 class Instant(NamedTuple):
-    """The grains of a flow at one time, and the forces between them, of a time step or averaged over successive ones."""
+    """The grains of a flow at one time, and the forces between them over one or more time steps."""
 
     positions: Float[np.ndarray, "grains 2"]  # in σ, in the sheared cell whose centre is the origin
     radii: Float[np.ndarray, " grains"]
