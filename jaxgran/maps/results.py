@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from jaxgran.maps.settings import MapSettings
 
 _MARK = b"SHA-256:"  # between the dataset and its checksum
+_SINCE = ("polydispersity",)  # parameters that older maps do not name; they had the default
 _DIGEST = hashlib.sha256().digest_size  # bytes
 
 
@@ -90,7 +91,7 @@ def choices_of(data: xr.DataTree) -> dict[str, Any]:
                 chosen[field.name] = tuple(values) if isinstance(values, list) else values
             elif attribute is not None:
                 chosen[field.name] = np.asarray(data.attrs[attribute]).tolist()
-            elif field.default is not None:
+            elif field.default is not None and field.name not in _SINCE:
                 raise KeyError(field.name)
         chosen["equilibrate"] = None if chosen["equilibrate"] == "until steady" else chosen["equilibrate"]
         chosen["snapshots"] = bool(chosen["snapshots"])
