@@ -4,7 +4,7 @@ Both flows are sheared to their steady state and on to the same tilt of the cell
 snapshot, and a line shows the mean force between two grains over that short time: at α = 0.9 pairs collide one after
 the other, at α = 0.1 chains of grains push at once.
 
-A film shows a third flow, by the command that the README gives.
+A movie shows a third flow, by the command that the README gives.
 
     python -m benchmarks flow_picture            # about 2 minutes
     python -m benchmarks flow_picture --quick    # about a minute: 100 grains, a longer time step
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 import jaxgran as jg
 from benchmarks.output import Output
-from jaxgran.analysis.force_chains import cluster_share, cluster_sizes
+from jaxgran.analysis.force_chains import cluster_share, clusters
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.plotting.drawing import TWO_COLUMNS, styled
 from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, draw_scene, force_key, scene_of
@@ -28,7 +28,7 @@ from jaxgran.plotting.flow import COLOUR_LABELS, Colour, Scene, common_scale, dr
 RESTITUTIONS, PACKING_FRACTION = (0.9, 0.1), 0.8
 THINNER = 0.6  # lines of the figure, over those of a flow that fills a page
 TILT = 0.15  # of the cell at the first snapshot
-FILM = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
+MOVIE = "run --restitution 0.3 --packing-fraction 0.78 --grains 100 --strain 0.5 --frame-strain 0.02 --movie"
 
 
 class Choice(NamedTuple):
@@ -51,8 +51,8 @@ def run(output: Output, colour: Colour = "speed") -> None:
         print(", ".join(f"{name} {value:.4g}" for name, value in row.items()))
     output.write_json("flow", {"nu": PACKING_FRACTION, **choice._asdict(), "flows": rows})
     output.write_picture(draw([scene_of(snapshots) for snapshots in flows], colour), "flow")
-    film = str(output.path("flow", ".gif"))
-    subprocess.run([sys.executable, "-m", "jaxgran", *FILM.split(), film, "--overwrite"], check=True)
+    movie = str(output.path("flow", ".gif"))
+    subprocess.run([sys.executable, "-m", "jaxgran", *MOVIE.split(), movie, "--overwrite"], check=True)
 
 
 def window(restitution: float, choice: Choice) -> Snapshot:
@@ -66,13 +66,13 @@ def window(restitution: float, choice: Choice) -> Snapshot:
 
 def summary(restitution: float, snapshots: Snapshot) -> dict[str, float]:
     """What the picture shows, in numbers."""
-    scene, share, sizes = scene_of(snapshots), cluster_share(snapshots), cluster_sizes(snapshots)
+    scene, share = scene_of(snapshots), cluster_share(snapshots)
     return {
         "alpha": restitution,
         "pairs": len(scene.instant.force),
         "pairs_mostly_in_clusters": int(scene.instant.clustered.sum()),
         "force_share_of_clusters": share.force.value.item(),
-        "largest_cluster": float(sizes.at[np.nonzero(sizes.value)[0].max()]),
+        "largest_cluster": float(clusters(snapshots).sizes.max()),
         "mean_speed": float(scene.speed.mean()),
         "largest_force": float(scene.instant.force.max()),
     }

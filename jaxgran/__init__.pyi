@@ -1,9 +1,9 @@
 """The public names of jaxgran and where they live; they load when they are first used."""
 
-from .analysis.coarse_graining import gaussian, heaviside, lucy
-from .analysis.fields import Fields, fields_at, grid
-from .analysis.fit import TrajectoryFit, fit_trajectory
-from .analysis.jax_md_space import JaxMdSpace, jax_md_space
+from .analysis.coarse_graining import gaussian
+from .analysis.fields import fields_at, grid
+from .analysis.fit import fit_trajectory
+from .analysis.jax_md_space import jax_md_space
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
     BarzilaiBorwein,
@@ -11,14 +11,13 @@ from .contact.projected_methods import (
     Nesterov,
     ProjectedMethod,
 )
-from .contact.residuals import ContactResiduals, contact_residuals
-from .contact.solve_contacts import ContactSolution, solve_contacts
+from .contact.solve_contacts import solve_contacts
 from .dynamics.advance import advance
 from .dynamics.engine import Jax, Numba
 from .dynamics.jax_engine import count_events
 from .dynamics.snapshots import Snapshot, snapshot_series
 from .dynamics.tally import Tally
-from .io.trajectory import Trajectory, read_trajectory, write_trajectory
+from .io.trajectory import read_trajectory, write_trajectory
 from .maps.merge import merge_maps
 from .maps.ratio_map import ratio_map
 from .maps.results import open_map
@@ -27,7 +26,6 @@ from .model.flow import ShearFlow
 from .model.grains import Grains, own_grains, polydisperse
 from .model.state import State
 from .model.status import Status
-from .page.document import Page
 from .page.explore import explore
 from .plotting.enskog_factors import enskog_factors
 from .plotting.flow import flow_figure
@@ -35,8 +33,8 @@ from .plotting.map_figures import save_figures
 from .plotting.ratio import ratio_against_timestep, ratio_contours, ratio_curves
 from .plotting.size import averages_against_grains
 from .plotting.theory import cluster_shares, theory_errors
-from .reference.law import ConstitutiveLaw, Rheology, constitutive_law
-from .reference.validity import Validity, validity
+from .reference.law import constitutive_law
+from .reference.validity import validity
 from .sampling.packing import pack
 from .sampling.sample import Sample, sample
 from .sampling.steady_state import heated, prepare
@@ -44,36 +42,25 @@ from .sampling.steady_state import heated, prepare
 __version__: str
 __all__ = [
     "BarzilaiBorwein",
-    "ConstitutiveLaw",
     "ContactNetwork",
-    "ContactResiduals",
-    "ContactSolution",
     "DelassusProblem",
-    "Fields",
     "Grains",
     "InputError",
     "Jacobi",
     "Jax",
-    "JaxMdSpace",
     "Nesterov",
     "Numba",
-    "Page",
     "ProjectedMethod",
-    "Rheology",
     "Sample",
     "ShearFlow",
     "Snapshot",
     "State",
     "Status",
     "Tally",
-    "Trajectory",
-    "TrajectoryFit",
-    "Validity",
     "advance",
     "averages_against_grains",
     "cluster_shares",
     "constitutive_law",
-    "contact_residuals",
     "count_events",
     "enskog_factors",
     "explore",
@@ -83,9 +70,7 @@ __all__ = [
     "gaussian",
     "grid",
     "heated",
-    "heaviside",
     "jax_md_space",
-    "lucy",
     "merge_maps",
     "open_map",
     "own_grains",

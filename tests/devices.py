@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 from jaxgran.dynamics import engine  # noqa: E402
 
 if host == ["lockstep"]:
-    engine._device = lambda: SimpleNamespace(platform="accelerator")
+    engine.default_device = lambda: SimpleNamespace(platform="accelerator")
 elif host:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(host[0], 2, int(host[1]))

@@ -16,7 +16,7 @@ PAUSE = 0.04  # seconds between two blocks of a sample: a small map takes as lon
 journal.SECONDS = 0.1  # so that its batches have journals
 batches.batch_size = lambda *_: 2
 # Drawing takes as long as such a map.
-figures: Any = SimpleNamespace(save_figures=lambda *_: [], remove_pictures=lambda *_: None)
+figures: Any = SimpleNamespace(save_figures=lambda *_, **__: [], remove_pictures=lambda *_: None)
 modules: dict[str, Any] = sys.modules
 modules["jaxgran.plotting.map_figures"] = figures
 advance_batch = run_replicas.advance_batch

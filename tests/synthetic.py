@@ -27,7 +27,7 @@ def random_tally(rng: np.random.Generator, *shape: int, status: int = 0) -> Tall
     counts = ("steps", "contacts", "loaded_contacts", "collisions", "solves", "iterations", "unconverged")
     values = {}
     for name in TABLE:
-        tail = (2, 2) if name.endswith("moment") else (64,) if name == "residual_counts" else ()
+        tail = (2, 2) if name.endswith("moment") else ()
         values[name] = rng.gamma(20.0, 1.0, (*shape, *tail))
         if name in counts:
             values[name] = np.ceil(values[name])
@@ -53,7 +53,6 @@ def random_instant(seed: int, grains: int = 20, pairs: int = 7) -> Instant:
         clustered=rng.random(pairs) < 0.5,
         side=10.0,
         tilt=0.2,
-        window=0.002,
     )
 
 

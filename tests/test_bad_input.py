@@ -27,6 +27,7 @@ from synthetic import one_sentence, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.analysis import fields
+from jaxgran.contact.residuals import contact_residuals
 from jaxgran.dynamics import snapshots
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps import settings as map_settings
@@ -123,10 +124,8 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "own_grains masses": lambda x: jg.own_grains([1.0, 2.0], x),
     "snapshot_series strain": lambda x: jg.snapshot_series(flow(), SEEN.state, x, 4),
     "snapshot_series count": lambda x: jg.snapshot_series(flow(), SEEN.state, 1.0, x),
-    "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.lucy(1.0)),
+    "fields_at points": lambda x: jg.fields_at(SEEN, x, jg.gaussian(1.0)),
     "gaussian width": lambda x: jg.fields_at(SEEN, POINT, jg.gaussian(x)),
-    "lucy radius": lambda x: jg.fields_at(SEEN, POINT, jg.lucy(x)),
-    "heaviside radius": lambda x: jg.fields_at(SEEN, POINT, jg.heaviside(x)),
 }
 OBJECTS: dict[str, Callable[[Any], Any]] = {
     "polydisperse key": lambda x: jg.polydisperse(4, 0.2, x),
@@ -145,7 +144,7 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "advance state": lambda x: jg.advance(flow(), x, 1),
     "snapshot_series flow": lambda x: jg.snapshot_series(x, SEEN.state, 1.0, 4),
     "snapshot_series state": lambda x: jg.snapshot_series(flow(), x, 1.0, 4),
-    "fields_at seen": lambda x: jg.fields_at(x, POINT, jg.lucy(1.0)),
+    "fields_at seen": lambda x: jg.fields_at(x, POINT, jg.gaussian(1.0)),
     "fields_at graining": lambda x: jg.fields_at(SEEN, POINT, x),
     **{
         name: getattr(jg, name)
@@ -209,9 +208,9 @@ def test_lists_of_numbers_stand_for_arrays() -> None:
     row = jg.DelassusProblem([[2, -1.0], [-1, 2]], [-1, 0])
     assert jg.solve_contacts(row, 1.0).impulses.tolist() == pytest.approx([4 / 3, 2 / 3], rel=1e-3)
     pair = jg.ContactNetwork([[0, 1]], [[1.0, 0.0]], [1, 1], [-1])
-    assert jg.contact_residuals(pair, [0.5]).natural_map == 0
+    assert contact_residuals(pair, [0.5]).natural_map == 0
     with pytest.raises(WouldRun):
-        jg.fields_at(SEEN, [[1.0, 2.0]], jg.lucy(1.0))
+        jg.fields_at(SEEN, [[1.0, 2.0]], jg.gaussian(1.0))
 
 
 @pytest.mark.parametrize(
@@ -248,7 +247,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
         "one ShearFlow, and this is a batch",
     ),
     "sample of other grains": (lambda: jg.sample(make_flow("grains", 64), SEEN.state, 1.0), "one State of 64 grains"),
-    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.lucy(1.0)), "is the last one of a series"),
+    "fields of a series": (lambda: jg.fields_at(SEVERAL, POINT, jg.gaussian(1.0)), "is the last one of a series"),
     "width beyond the cell": (lambda: jg.fields_at(SEEN, POINT, jg.gaussian(1e308)), "positive and at most 3.25"),
     "curves of nothing": (lambda: jg.ratio_curves(xr.Dataset()), "it has no packing_fraction, restitution, force_"),
     "no theory": (lambda: jg.theory_errors(ratio_dataset()), "it has no pressure, theory/pressure"),

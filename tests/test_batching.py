@@ -66,7 +66,7 @@ def test_replicas_of_a_vmap_advance_one_after_another(states) -> None:
 def test_lockstep_has_the_bits_of_each_replica_alone_and_lowers_for_every_accelerator(states, monkeypatch) -> None:
     alone_of = compiled(partial(advanced, jg.Jax()))
     alone = [alone_of(alpha, replica(states, k)) for k, alpha in enumerate(ALPHAS)]
-    monkeypatch.setattr(engine_module, "_device", lambda: SimpleNamespace(platform="accelerator"))
+    monkeypatch.setattr(engine_module, "default_device", lambda: SimpleNamespace(platform="accelerator"))
     run = jax.vmap(lambda alpha, state: advance(replace(flow_of(0.7), restitution=alpha), state, jnp.int32(STEPS)))
     together = compiled(run)(ALPHAS, states)
     for k, one in enumerate(alone):

@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from flows import assert_same_bits
@@ -77,6 +78,13 @@ def test_another_map_is_refused_and_the_difference_named(output: Path, change: d
     cut_off(output)
     with refused(f"has {next(iter(change))} "):
         Checkpoint(output, replace(SETTINGS, **change), resume=True)
+
+
+def test_a_map_begun_on_the_processor_continues_there_beside_an_accelerator(output: Path, monkeypatch) -> None:
+    cut_off(output)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with jax.default_device(jax.devices("cpu")[0]):
+        Checkpoint(output, SETTINGS, resume=True).close(finished=False)
 
 
 def test_files_of_another_format_are_refused_and_kept(output: Path, monkeypatch) -> None:

@@ -67,7 +67,7 @@ SMALL_RUN += ["--strain", "1", "--output", "flow.nc"]
 @pytest.fixture
 def no_figures(monkeypatch) -> None:
     """A map writes its dataset alone: drawing takes longer than all else that these tests do."""
-    monkeypatch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
+    monkeypatch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_, **__: [])
 
 
 # Lists

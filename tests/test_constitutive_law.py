@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran as jg
+from jaxgran.reference.law import ConstitutiveLaw
 from jaxgran.reference.table import LENGTH, MEASURED, read_columns
 
 LAW = jg.constitutive_law()
@@ -85,7 +86,7 @@ def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
     traced = []
 
     @jax.jit
-    def pressures(law: jg.ConstitutiveLaw, nus: Any, rate: Any) -> Any:
+    def pressures(law: ConstitutiveLaw, nus: Any, rate: Any) -> Any:
         traced.append(law)
         return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
 

@@ -40,7 +40,7 @@ class Lab:
     def run_here(self, output: str, *words: str) -> Outcome:
         """Run a map in this process, where nothing happens to it."""
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_: [])
+            patch.setattr("jaxgran.plotting.map_figures.save_figures", lambda *_, **__: [])
             patch.setattr("jaxgran.maps.batches.batch_size", lambda *_: 2)
             return jaxgran(self.folder, *MAP, "--workers", "1", "--output", output, *words)
 

@@ -12,6 +12,7 @@ from flows import GRAINS
 from synthetic import refused
 
 import jaxgran as jg
+from jaxgran.analysis.fit import TrajectoryFit
 
 TRUTH, GUESS, WINDOWS, STEPS = 0.73, 0.5, 3, 500
 POSITION, VELOCITY = 1e-3, 1e-2  # standard deviations of the noise
@@ -31,7 +32,7 @@ def noisy(state: jg.State, seed: int) -> jg.State:
     return replace(state, positions=positions, velocities=state.velocities + velocities)
 
 
-def fit(seed: int, steps: int = STEPS, **options) -> tuple[jg.TrajectoryFit, jg.State]:
+def fit(seed: int, steps: int = STEPS, **options) -> tuple[TrajectoryFit, jg.State]:
     start = starts()[seed * WINDOWS : (seed + 1) * WINDOWS]
     end, _ = jax.jit(jg.advance)(FLOW, start, jnp.int32(steps))
     seen = noisy(start, 10 + seed) if "velocities" in options else start

@@ -179,7 +179,7 @@ def test_maps_in_double_precision_are_merged_in_it_by_a_process_that_computes_in
 def test_maps_of_an_engine_are_merged_where_it_cannot_run(replicas, monkeypatch) -> None:
     parts = [of_seeds(replicas, 0, 1, engine=Numba()), of_seeds(replicas, 1, 2, engine=Numba())]
     whole = of_seeds(replicas, 0, 3, engine=Numba())
-    monkeypatch.setattr("jaxgran.dynamics.engine._device", lambda: SimpleNamespace(platform="gpu"))
+    monkeypatch.setattr("jaxgran.dynamics.engine.default_device", lambda: SimpleNamespace(platform="gpu"))
     assert_one_run(merge_maps(parts), whole)
 
 

@@ -40,10 +40,9 @@ def assert_same(ours, plain, atol: float) -> None:
     for name in (*COUNTS, "unconverged"):
         assert getattr(tally, name) == getattr(sums, name), name
     for name in TABLE:
-        if name not in (*COUNTS, "unconverged", "iterations", "residual_counts", "worst_residual", "momentum_drift"):
+        if name not in (*COUNTS, "unconverged", "iterations", "worst_residual", "momentum_drift"):
             expected_value = np.asarray(getattr(sums, name))
             np.testing.assert_allclose(getattr(tally, name), expected_value, rtol=1e-6, atol=1e-9 + atol, err_msg=name)
-    assert np.sum(tally.residual_counts) == tally.solves
 
 
 @pytest.mark.parametrize(
@@ -161,7 +160,6 @@ def test_a_solve_of_nothing_has_no_residual(native_run) -> None:
         state = State(grains, *(jnp.asarray(x, float) for x in (places, speeds, 40.0, 0.0)))
         _, tally = native_run(flow_of(0.03, shear_rate=0.0), state, 2)
         assert np.isfinite(tally.worst_residual)
-        assert np.sum(tally.residual_counts) == tally.solves
 
 
 def test_derivatives_are_those_of_the_engine_jax_at_the_values_of_the_engine_numba(flowing) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import random_tally
 
-from jaxgran.dynamics.tally import RESIDUAL_EDGES, Tally, empty_tally
+from jaxgran.dynamics.tally import Tally, empty_tally
 from jaxgran.sampling.averages import averages
 from jaxgran.sampling.observables import OBSERVABLES
 
@@ -62,9 +62,7 @@ def tally(microscopic) -> Tally:
         solves=np.float64(4.0),
         iterations=np.float64(24.0),
         unconverged=np.float64(1.0),
-        residual_counts=np.histogram([3e-5, 4e-5, 9e-5, 0.02], RESIDUAL_EDGES)[0].astype(float),
         overlap=np.float64(6e-3),
-        squared_impulse=(impulses**2).sum(),
         largest_overlap=np.float64(3e-3),
         worst_residual=np.float64(0.02),
         momentum_drift=np.float64(1e-15),

@@ -126,6 +126,24 @@ def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
     assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
 
 
+@pytest.mark.parametrize("words", [[], ["--resume"]])
+def test_a_map_that_is_there_replaces_no_file_by_a_figure(words: list[str], finished: bytes, tmp_path: Path) -> None:
+    """As where the map was made in Python, without figures, and the file by someone else."""
+    figure, other = tmp_path / "jaxgran_map_curves.png", tmp_path / "jaxgran_map_clusters.png"
+    figure.write_bytes(b"by hand")
+    other.unlink()
+    assert jaxgran(tmp_path, *MAP, *words).status == 0
+    assert figure.read_bytes() == b"by hand" and other.exists()
+    assert jaxgran(tmp_path, *MAP, *words, "--overwrite").status == 0
+    assert figure.read_bytes() != b"by hand"
+
+
+def test_a_part_that_replaces_a_map_leaves_none_of_its_figures(finished: bytes, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(dict(list(BOTH.items())[:1])))
+    assert jaxgran(tmp_path, *MAP, "--part", "1/2", "--overwrite").status == 0
+    assert not [name for name in files(tmp_path) if name.endswith(".png")]
+
+
 def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_path: Path) -> None:
     names = ("jaxgran_map_timestep.pdf", "other_theory.pdf", "other_theory.svg")
     for name in names:  # none of which is a picture of these maps

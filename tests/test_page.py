@@ -21,7 +21,7 @@ from jaxgran.maps.points import PointGrid
 from jaxgran.maps.schema import flattened, path_of
 from jaxgran.maps.states import state_variables
 from jaxgran.model.checks import InputError
-from jaxgran.page.document import document
+from jaxgran.page.document import Page, document
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
 from jaxgran.reference.table import MEASURED, Table, shipped_table
@@ -33,7 +33,7 @@ def found() -> dict:
     return map_data(page_map())
 
 
-def written(page: jg.Page) -> dict:
+def written(page: Page) -> dict:
     """The data in the text of a page."""
     text = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.text)
     assert text is not None

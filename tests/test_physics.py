@@ -206,7 +206,6 @@ def test_twice_the_shear_rate_and_half_the_step_repeat_the_trajectory_to_the_bit
     powers |= {"cluster_moment": 2, "local_kinetic": 2, "wave_kinetic": 2}
     powers |= {
         "binary_speed_moment": 4,
-        "squared_impulse": 4,
         "dissipation": 4,
         "binary_dissipation": 4,
         "complementarity": 4,

@@ -83,7 +83,7 @@ def test_snapshots_take_a_batch(states: State) -> None:
 @pytest.mark.parametrize("numerics", [{}, {"engine": jg.Jax()}, {"solver": jg.Jacobi()}])
 @pytest.mark.parametrize("platform", ["cpu", "accelerator"])
 def test_replicas_advance_together_on_an_accelerator_only(states: State, numerics: Any, platform: str, monkeypatch):
-    monkeypatch.setattr(engine, "_device", lambda: SimpleNamespace(platform=platform))
+    monkeypatch.setattr(engine, "default_device", lambda: SimpleNamespace(platform=platform))
     found = over_replicas(lambda flow, _: flow.restitution * float(in_batch()), Numerics(**numerics), (FLOWS, states))
     np.testing.assert_array_equal(found, ALPHAS * float(platform == "accelerator"))
 

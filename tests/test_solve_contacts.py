@@ -22,9 +22,9 @@ from jaxgran import (
     Jacobi,
     Nesterov,
     Status,
-    contact_residuals,
     solve_contacts,
 )
+from jaxgran.contact.residuals import contact_residuals
 
 SIZE = 12  # contacts of the matrices
 seeds = st.integers(0, 2**32 - 1)

@@ -42,7 +42,7 @@ def test_forces_of_a_state_act_between_grains_that_touch(with_states) -> None:
         i, j = found.pairs.T
         apart = np.hypot(*minimum_image(found.positions[i] - found.positions[j], found.side, found.tilt).T)
         near = found.radii[i] + found.radii[j] + 5e-4 * (found.speed[i] + found.speed[j] + 2)
-        assert np.all(found.force > 0) and np.all(apart < near) and found.window == 5e-4
+        assert np.all(found.force > 0) and np.all(apart < near)
         pairs += len(found.force)
     assert pairs
 

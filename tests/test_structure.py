@@ -8,7 +8,6 @@ from synthetic import SNAPSHOTS, snapshot_of
 
 from jaxgran.analysis.force_chains import (
     cluster_share,
-    cluster_sizes,
     clusters,
     loaded_contacts,
 )
@@ -37,10 +36,6 @@ def test_a_chain_of_three_and_a_pair() -> None:
     found = clusters(seen)
     np.testing.assert_array_equal(found.sizes, [[3, 3, 3, 2, 2, 1, 1]])
     assert len(set(found.labels[0, :3])) == 1 and found.labels[0, 3] == found.labels[0, 4] != found.labels[0, 0]
-    sizes, share, _ = cluster_sizes(seen)
-    np.testing.assert_array_equal(sizes, [2, 3])
-    np.testing.assert_allclose(share, [0.5, 0.5])
-    np.testing.assert_allclose(cluster_sizes(seen, [2, 4, 8]).value, [0.5, 0])
     carried = cluster_share(seen)
     np.testing.assert_allclose(carried.contacts.value, 2 / 3)
     np.testing.assert_allclose([carried.force.value, carried.pressure.value], 3 / 4)

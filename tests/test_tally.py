@@ -82,7 +82,6 @@ def test_terms_of_a_contact_stand_where_the_table_says():
         "loaded_contacts": 2,
         "collisions": 3,
         "overlap": overlap,
-        "squared_impulse": p * p,
         "deep_contacts": overlap > DEEP_OVERLAP,
         "binary_speed_moment": -approach * binary * moment,
         "binary_dissipation": -approach * binary * (2 - one_plus_alpha) / 2,

@@ -40,13 +40,10 @@ TRANSFORMED: dict[str, Callable[[Any, State], Any]] = {
     "polydisperse": lambda x, _: jg.polydisperse(COUNT, x / 2, KEY),
     "own_grains": lambda x, _: jg.own_grains(x + jnp.arange(4.0)),
     "gaussian": lambda x, _: jg.gaussian(x).second_moment,
-    "lucy": lambda x, _: jg.lucy(x).second_moment,
-    "heaviside": lambda x, _: jg.heaviside(x).second_moment,
     "grid": lambda x, _: jg.grid(x, 3),
     "fields_at": lambda x, _: jg.fields_at(seen(), jnp.asarray([[1.0, 1.2]]), jg.gaussian(x)),
     "jax_md_space": lambda x, state: jg.jax_md_space(replace(state, tilt=x))[2],
     "solve_contacts": lambda x, _: jg.solve_contacts(PAIR, x).velocities,
-    "contact_residuals": lambda x, _: jg.contact_residuals(PAIR, x * jnp.ones(2)).natural_map,
     "validity": lambda x, _: jg.validity(x, 0.7).measured,
     "constitutive_law": lambda x, _: jg.constitutive_law()(x, 0.7, 2 * x),
 }
@@ -65,12 +62,10 @@ REFUSED: dict[str, Callable[[Any, State], Any]] = {
 
 # Classes, and what takes datasets and files.
 WITHOUT_ARRAYS = """
-    ContactNetwork ContactResiduals ContactSolution DelassusProblem Fields
-    TrajectoryFit Grains InputError JaxMdSpace ShearFlow Snapshot State Status Tally Trajectory averages_against_grains
-    cluster_shares explore Page
-    ratio_against_timestep ratio_contours ratio_curves BarzilaiBorwein Jacobi Nesterov
-    ProjectedMethod Jax Numba merge_maps open_map read_trajectory save_figures theory_errors
-    enskog_factors write_trajectory Validity ConstitutiveLaw Rheology
+    ContactNetwork DelassusProblem Grains InputError ShearFlow Snapshot State Status Tally
+    averages_against_grains cluster_shares explore ratio_against_timestep ratio_contours
+    ratio_curves BarzilaiBorwein Jacobi Nesterov ProjectedMethod Jax Numba merge_maps open_map
+    read_trajectory save_figures theory_errors enskog_factors write_trajectory
 """
 
 

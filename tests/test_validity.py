@@ -18,6 +18,7 @@ import jaxgran as jg
 from benchmarks import reference
 from jaxgran.reference.surface import Shape, Surface
 from jaxgran.reference.table import FACTORS, MEASURED, shipped_table
+from jaxgran.reference.validity import Validity
 from jaxgran.theory import gaussian_moments, navier_stokes
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -142,11 +143,11 @@ def test_single_precision_is_refused_where_jax_traces() -> None:
         jax.jit(jg.validity)(0.5, 0.5)
 
 
-def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> jg.Validity:
+def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> Validity:
     all_factors = dict.fromkeys(FACTORS, np.array(1.0)) | {name: np.array(x) for name, x in factors.items()}
     measured = {"force_ratio": np.array(ratio)}, {"force_ratio": np.array(0.001)}
     errors = {"pressure": np.array(error)}, {"pressure": np.array(ci95)}
-    return jg.Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {})
+    return Validity(np.array(0.5), np.array(0.5), *measured, {}, *errors, {}, {}, {}, all_factors, {})
 
 
 @pytest.mark.parametrize(
@@ -162,7 +163,7 @@ def made(error: float, ci95: float, ratio: float = 1.0, **factors: float) -> jg.
         (made(-0.9, 0.02, 4.0, binary=8.0, pairs=5.0), ("in clusters", "explain 25 % of the mean contact force")),
     ],
 )
-def test_a_verdict_says_error_cause_and_share_of_binary_collisions(found: jg.Validity, said: tuple[str, ...]) -> None:
+def test_a_verdict_says_error_cause_and_share_of_binary_collisions(found: Validity, said: tuple[str, ...]) -> None:
     assert all(words in found.verdict() for words in said)
 
 

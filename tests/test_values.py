@@ -10,6 +10,11 @@ import pytest
 from synthetic import one_sentence, random_tally, refused, snapshot_of
 
 import jaxgran as jg
+from jaxgran.analysis.fields import Fields
+from jaxgran.analysis.fit import TrajectoryFit
+from jaxgran.contact.residuals import ContactResiduals
+from jaxgran.contact.solve_contacts import ContactSolution
+from jaxgran.io.trajectory import Trajectory
 from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
@@ -55,10 +60,11 @@ def test_values_that_jax_traces_are_not_compared() -> None:
 
 
 def test_no_public_value_compares_arrays_by_their_truth() -> None:
-    public = (getattr(jg, name) for name in jg.__all__)
-    values = [one for one in public if isinstance(one, type) and is_dataclass(one)]
+    results = ContactResiduals, ContactSolution, Fields, Trajectory, TrajectoryFit
+    public = [getattr(jg, name) for name in jg.__all__]
+    values = [one for one in (*public, *results) if isinstance(one, type) and is_dataclass(one)]
     of_arrays = [one for one in values if any("rray" in str(field.type) for field in fields(one))]
-    assert len(of_arrays) > 12 and {jg.State, jg.Fields} <= {*of_arrays}
+    assert len(of_arrays) > 12 and {jg.State, Fields} <= {*of_arrays}
     solvers = {one for one in of_arrays if issubclass(one, jg.ProjectedMethod)}  # they hold single numbers
     assert {one for one in of_arrays if one.__eq__ is not equal_values} <= solvers
 

@@ -23,6 +23,8 @@ from benchmarks.collection.make import padded
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.timing import timed
 from jaxgran.contact.problem import as_contacts
+from jaxgran.contact.residuals import contact_residuals
+from jaxgran.contact.solve_contacts import ContactSolution
 from jaxgran.model.status import Status
 
 CAP = 20_000  # products with W of our own methods
@@ -83,11 +85,11 @@ def _row(name: str, prepare: Prepare | jg.ProjectedMethod, entry: Entry, toleran
 
 
 def residual_of(entry: Entry, impulses: np.ndarray) -> float:
-    """Residual of the natural map; see ``jaxgran.contact_residuals``."""
+    """Residual of the natural map; see ``jaxgran.contact.residuals``."""
     network = padded(entry.problem)
     filled = np.zeros(len(network.approach))
     filled[: len(entry.problem.approach)] = impulses
-    return float(jg.contact_residuals(network, jnp.asarray(filled)).natural_map)
+    return float(contact_residuals(network, jnp.asarray(filled)).natural_map)
 
 
 def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Solve:
@@ -106,7 +108,7 @@ def projected(method: jg.ProjectedMethod, entry: Entry, tolerance: float) -> Sol
 
 
 @jax.jit
-def solved_network(network: jg.ContactNetwork, solver: jg.ProjectedMethod) -> jg.ContactSolution:
+def solved_network(network: jg.ContactNetwork, solver: jg.ProjectedMethod) -> ContactSolution:
     """The solution of a network."""
     return jg.solve_contacts(network, solver=solver)
 

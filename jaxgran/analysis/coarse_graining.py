@@ -67,18 +67,12 @@ GAUSSIAN = Kernel(
     reach=6.0,
 )
 LUCY = Kernel(_lucy_value, _lucy_line, 5 / 56, 1.0)
-HEAVISIDE = Kernel(
-    value=lambda q2: jnp.where(q2 < 1, 1 / jnp.pi, 0).astype(q2.dtype),
-    line=lambda s, b2: _in_disc(s, b2) / jnp.pi,
-    second_moment=1 / 4,
-    reach=1.0,
-)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CoarseGraining:
-    """A coarse-graining function G of given width, made by ``gaussian``, ``lucy`` or ``heaviside``.
+    """A coarse-graining function G of given width, made by ``gaussian`` or ``lucy``.
 
     ======  ======  ====  ======================================
     field   shape   unit  meaning
@@ -133,11 +127,6 @@ def gaussian(width: float | Array) -> CoarseGraining:
 def lucy(radius: float | Array) -> CoarseGraining:
     """Lucy's function 5/(πc²) (1 + 3r/c)(1 − r/c)³ inside a radius c (σ), with two continuous derivatives."""
     return _of_width(radius, LUCY)
-
-
-def heaviside(radius: float | Array) -> CoarseGraining:
-    """The uniform weight 1/(πc²) in a disc of radius c (σ); fields are discontinuous and not differentiable."""
-    return _of_width(radius, HEAVISIDE)
 
 
 def _of_width(width: float | Array, kernel: Kernel) -> CoarseGraining:

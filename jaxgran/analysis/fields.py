@@ -141,7 +141,7 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: Co
     if not isinstance(snapshot, Snapshot) or jnp.ndim(snapshot.state.positions) != 2:
         raise InputError("snapshot must be a single Snapshot; series[-1] is the last one of a series.")
     if not isinstance(graining, CoarseGraining):
-        raise InputError(f"graining must come from gaussian, lucy or heaviside, not {short_repr(graining)}.")
+        raise InputError(f"graining must come from gaussian or lucy, not {short_repr(graining)}.")
     points, accepted = as_array(points), "an array (points, 2) of finite numbers"
     require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted)
     _check(graining, snapshot.state)

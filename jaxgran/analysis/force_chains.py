@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
-from jaxgran.analysis.series import Curve, Measured, by_time, centres, histograms, ratio, series, with_errors
+from jaxgran.analysis.series import Measured, by_time, ratio, series, with_errors
 from jaxgran.contact.clusters import cluster_labels
 from jaxgran.dynamics.snapshots import Snapshot
 
@@ -85,20 +84,6 @@ def pair_forces(snapshots: Snapshot) -> PairForces:
     in_cluster = sizes[load.time, load.i] > 2
     total, clustered = (np.bincount(pair, load.force * w, minlength=pairs.size) for w in (1, in_cluster))
     return PairForces(pairs // grains, pairs % grains, total / times, ratio(clustered, total))
-
-
-def cluster_sizes(snapshots: Snapshot, edges: ArrayLike | None = None) -> Curve:
-    """Share of each size among the clusters of two or more grains, averaged over the sizes in each bin.
-
-    ``edges`` are integer bin edges; a bin contains its lower edge. By default each size is a bin.
-    """
-    sizes = clusters(snapshots).sizes
-    edges = np.arange(2, max(sizes.max(), 2) + 2) if edges is None else np.asarray(edges)
-    time = np.repeat(np.arange(len(sizes)), sizes.shape[1])
-    weights = np.where(sizes > 1, 1 / sizes, 0)  # the grains of a cluster have a total weight of one
-    sums = {"n": histograms(len(sizes), time, sizes.ravel(), edges, weights.ravel()), "all": weights.sum(axis=1)}
-    estimates = with_errors(lambda s: {"p": ratio(s["n"], s["all"][..., None] * np.diff(edges))}, sums)["p"]
-    return Curve(centres(edges) - 0.5, *estimates)
 
 
 def cluster_share(snapshots: Snapshot) -> ClusterShare:

@@ -14,17 +14,16 @@ from jaxgran.model.cell import centred
 
 
 class Instant(NamedTuple):
-    """The grains of a flow at one time, and the forces between them averaged over a short strain around it."""
+    """The grains of a flow at one time, and the forces between them over one or more time steps."""
 
     positions: Float[np.ndarray, "grains 2"]  # in σ, in the sheared cell whose centre is the origin
     radii: Float[np.ndarray, " grains"]
     speed: Float[np.ndarray, " grains"]  # |c|, the peculiar speed, in σγ̇
     pairs: Int[np.ndarray, "pairs 2"]  # indices i < j of each pair in loaded contact
-    force: Float[np.ndarray, " pairs"]  # mean over the window, in mσγ̇²
+    force: Float[np.ndarray, " pairs"]  # mean over the time steps, in mσγ̇²
     clustered: Bool[np.ndarray, " pairs"]  # whether most of it acts in clusters of three or more
     side: float
     tilt: float
-    window: float  # strain over which forces are averaged
 
 
 def instant_of(frame: Snapshot) -> Instant:
@@ -43,7 +42,6 @@ def instant_of(frame: Snapshot) -> Instant:
         clustered=pairs.cluster_share > 0.5,
         side=side,
         tilt=tilt,
-        window=arrays.timestep.item() * rate,
     )
 
 
@@ -59,5 +57,4 @@ def averaged(instants: Sequence[Instant]) -> Instant:
         pairs=distinct,
         force=total / len(instants),
         clustered=ratio(in_clusters, total) > 0.5,
-        window=sum(one.window for one in instants),
     )

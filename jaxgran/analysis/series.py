@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from jaxgran.dynamics.snapshots import Snapshot
 from jaxgran.statistics import jackknife
@@ -21,14 +20,6 @@ BLOCKS = 32  # of successive times, for the standard errors
 class Measured(NamedTuple):
     """An average over the times of a series and its standard error, of equal shape; NaN where nothing was counted."""
 
-    value: np.ndarray
-    error: np.ndarray
-
-
-class Curve(NamedTuple):
-    """A measured function: points, values and standard errors of the values, arrays of shape (points,)."""
-
-    at: np.ndarray
     value: np.ndarray
     error: np.ndarray
 
@@ -65,19 +56,3 @@ def by_time(times: int, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     sums = np.zeros((times, *values.shape[1:]))
     np.add.at(sums, time, values)
     return sums
-
-
-def histograms(
-    times: int, time: np.ndarray, x: np.ndarray, edges: np.ndarray, weights: np.ndarray | None = None
-) -> Float[np.ndarray, "times bins"]:
-    """A histogram for each time; a bin contains its lower edge."""
-    bins = len(edges) - 1
-    place = np.searchsorted(edges, x, side="right") - 1
-    inside = (place >= 0) & (place < bins)
-    weights = np.ones(inside.sum()) if weights is None else weights[inside]
-    counts = np.bincount(time[inside] * bins + place[inside], weights, minlength=times * bins)
-    return counts.reshape(times, bins)
-
-
-def centres(edges: np.ndarray) -> np.ndarray:
-    return (edges[:-1] + edges[1:]) / 2

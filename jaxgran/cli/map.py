@@ -51,7 +51,7 @@ def run_map_command(format: FileFormat = "png", quiet: bool = False, **given: An
     if whole and not overwrite:
         require_new_figures(output, format)
     data, interrupted, written = run_map(given, quiet, "jaxgran.plotting.map_figures")
-    pictures = draw_beside(data, output, format, replaced=overwrite and existed) if whole and not interrupted else []
+    pictures = [] if interrupted else draw_beside(data if whole else None, output, format, overwrite, existed)
     if whole:
         print_tables(data)
     finish(data, [*([output] if written else []), *pictures], interrupted, output)
@@ -74,12 +74,16 @@ def require_new_figures(output: Path, format: FileFormat) -> None:
             )
 
 
-def draw_beside(data, output: Path, format: FileFormat, replaced: bool) -> list[Path]:
-    """Draw the figures of a map beside its file, then remove those of a map that it replaced; the files drawn."""
+def draw_beside(data, output: Path, format: FileFormat, overwrite: bool, existed: bool) -> list[Path]:
+    """Draw the figures of a map beside its file, none of a part, then remove those of a map that it replaced.
+
+    Files that are there are kept without ``overwrite``. The files drawn.
+    """
     from jaxgran.plotting.map_figures import remove_pictures, save_figures
 
-    pictures = save_figures(data, output.with_suffix(""), format)
-    if replaced:
+    stem = output.with_suffix("")
+    pictures = [] if data is None else save_figures(data, stem, format, overwrite=overwrite)
+    if overwrite and existed:
         remove_pictures(output, but=pictures)
     return pictures
 

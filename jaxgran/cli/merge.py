@@ -40,7 +40,7 @@ def run_merge_command(files: list[Path], output: Path, overwrite: bool = False, 
     data = merge_maps(files)
     data.attrs["command"] = command_line()
     write_dataset(data, output)
-    pictures = draw_beside(data, output, format, replaced=existed)
+    pictures = draw_beside(data, output, format, overwrite, existed)
     print_tables(data)
     finish(data, [output, *pictures], interrupted=False)
 

@@ -24,14 +24,13 @@ _IN_ASCII = str.maketrans(
 class Table:
     """A table of strings: title, column names and rows; a row of a single string is a group heading.
 
-    The first ``keys`` columns name a row and are repeated on every page. The others are right-aligned, or left-aligned
-    if ``numbers`` is False.
+    The first column names a row and is repeated on every page. The others are right-aligned, or left-aligned if
+    ``numbers`` is False.
     """
 
     title: str
     columns: Sequence[str]
     rows: list[list[str]] = field(default_factory=list)
-    keys: int = 1
     numbers: bool = True
 
 
@@ -40,7 +39,7 @@ def print_table(table: Table) -> None:
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
         console = Console(width=_UNLIMITED)
-    left = list(range(table.keys, len(table.columns)))
+    left = list(range(1, len(table.columns)))
     narrow = _width(_page(table, left)) > console.width
     while left:
         shown = len(left)
@@ -56,14 +55,14 @@ def _width(page: RichTable) -> int:
 
 
 def _page(table: Table, columns: Iterable[int], narrow: bool = False) -> RichTable:
-    """The keys and some columns of a table; with ``narrow`` long keys are wrapped."""
+    """The names of the rows and some columns of a table; with ``narrow`` long names are wrapped."""
     page = RichTable(title=plain(table.title), box=box.SIMPLE, title_justify="left")
-    places = [*range(table.keys), *columns]
+    places = [0, *columns]
     for k in places:
         widest = max((len(plain(row[k])) for row in table.rows if len(row) > 1), default=0)
         words = plain(table.columns[k]).split()
         head = "\n".join(wrap(" ".join(words), max(widest, *map(len, words))))
-        page.add_column(head, no_wrap=True, justify="right" if table.numbers and k >= table.keys else "left")
+        page.add_column(head, no_wrap=True, justify="right" if table.numbers and k else "left")
     for row in table.rows:
         if len(row) == 1:
             page.add_section()

@@ -158,7 +158,6 @@ def contact_terms(
         loaded,
         approaching,
         overlap,
-        impulse * impulse,
         where(overlap > DEEP_OVERLAP, used, 0),
         binary_speed * xx,
         binary_speed * xy,

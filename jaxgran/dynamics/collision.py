@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -19,7 +18,7 @@ from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.contact.solver import Solution, solve
 from jaxgran.dynamics.flight import closing_speed, pairs_now
 from jaxgran.dynamics.observer import ObserveNow, with_contacts
-from jaxgran.dynamics.tally import RESIDUAL_EDGES, RunningSums
+from jaxgran.dynamics.tally import RunningSums
 from jaxgran.model.control_flow import switch_replica
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.grains import Grains
@@ -28,7 +27,6 @@ from jaxgran.model.state import State
 from jaxgran.model.status import Status
 
 Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: the state, its contacts, their impulses
-_ABOVE, _UP_TO = np.append(-np.inf, RESIDUAL_EDGES[1:-1]), np.append(RESIDUAL_EDGES[1:-1], np.inf)  # bins of residuals
 MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
 
 
@@ -242,12 +240,9 @@ def _with_collision(sums: RunningSums, collision: Collision, meets: Array) -> Ru
     """The sums with what the contacts of one step add."""
     dtype = sums.contact.dtype
     solve_counts = [meets, collision.iterations, collision.status != Status.ok]
-    above, up_to = jnp.asarray(_ABOVE, dtype), jnp.asarray(_UP_TO, dtype)
-    by_residual = (collision.residual > above) & (collision.residual <= up_to) & meets
-    solves = jnp.concatenate([jnp.stack([x.astype(dtype) for x in solve_counts]), by_residual.astype(dtype)])
     return sums._replace(
         contact=sums.contact + collision.contact_sums,
-        solve=sums.solve + solves,
+        solve=sums.solve + jnp.stack([x.astype(dtype) for x in solve_counts]),
         largest=jnp.maximum(sums.largest, jnp.stack([collision.deepest, collision.residual])),
         status=jnp.maximum(sums.status, collision.status),
         user_sums=collision.user_sums,

@@ -127,7 +127,7 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     requested = numerics.engine
     if isinstance(requested, Jax):
         return requested
-    device = _device()
+    device = default_device()
     option = "" if option in Numba.options else option
     why = _why_unsupported(numerics.solver, state, option, device)
     if why is None:
@@ -146,7 +146,7 @@ def in_lockstep() -> bool:
 
     They do on an accelerator. On a processor they advance one after another, which is faster.
     """
-    return _device().platform != "cpu"
+    return default_device().platform != "cpu"
 
 
 def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
@@ -181,7 +181,7 @@ def _dtype(state: State | None) -> jnp.dtype:
     return jnp.dtype(jnp.result_type(float)) if state is None else state.positions.dtype
 
 
-def _device() -> Any:
+def default_device() -> Any:
     """The device that JAX computes on by default."""
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
     return jax.devices(device)[0] if device is None or isinstance(device, str) else device

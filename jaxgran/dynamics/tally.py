@@ -17,8 +17,6 @@ from jaxgran.model.batches import equal_values
 from jaxgran.model.indexing import taken
 from jaxgran.model.status import DEEP_SHARE, Status
 
-RESIDUAL_EDGES = np.logspace(-16, 0, 65)  # bounds of the bins in which relative residuals are counted
-
 # What adds to a sum. The running sums of an engine stand in this order, and within it in the order of the table.
 FLIGHT = "flight"  # the flight between two events
 CONTACT = "contact"  # each contact of a solved network, by the law of a contact
@@ -64,11 +62,7 @@ class Tally:
     solves: Float[Array, "*b"] = _sum(SOLVE, "–", "networks solved")
     iterations: Float[Array, "*b"] = _sum(SOLVE, "–", "solver iterations")
     unconverged: Float[Array, "*b"] = _sum(SOLVE, "–", "solves that ended above the tolerance")
-    residual_counts: Float[Array, "*b 64"] = _sum(
-        SOLVE, "–", "solves by relative residual, in the bins between ``RESIDUAL_EDGES``", (RESIDUAL_EDGES.size - 1,)
-    )
     overlap: Float[Array, "*b"] = _sum(CONTACT, "σ", "overlaps of the contacts of solved networks")
-    squared_impulse: Float[Array, "*b"] = _sum(CONTACT, "m²σ²γ̇²", "squares p² of the contact impulses")
     deep_contacts: Float[Array, "*b"] = _sum(CONTACT, "–", "contacts that overlap by more than ``DEEP_OVERLAP``")
     binary_speed_moment: Float[Array, "*b 2 2"] = _sum(
         CONTACT, "mσ³γ̇²", "the binary moment, each contact times its speed of approach max(0, −u⁻)", _TENSOR

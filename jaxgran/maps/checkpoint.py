@@ -30,6 +30,7 @@ import jax
 import numpy as np
 
 from jaxgran.contact.projected_methods import solver_text
+from jaxgran.dynamics.engine import default_device
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
 from jaxgran.environment import precision
 from jaxgran.files import same_file
@@ -228,7 +229,7 @@ def _replicas_of(arrays: Mapping[str, np.ndarray], settings: MapSettings) -> dic
 def _identity(settings: MapSettings) -> dict[str, object]:
     """All that the results depend on, bit for bit, in types of JSON."""
     versions = versions_of(made_with())
-    here = {"precision": precision(), "device": jax.default_backend(), "number of running sums": len(TABLE)}
+    here = {"precision": precision(), "device": default_device().platform, "number of running sums": len(TABLE)}
     parameters = {field.name: getattr(settings, field.name) for field in fields(settings)}
     engine = "auto" if settings.engine is None else settings.engine.name
     identity = {

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from jaxgran import environment
 from jaxgran.cache.persistent_jit import sources_digest
+from jaxgran.dynamics.engine import default_device
 
 _PACKAGES = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
 DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
@@ -14,9 +15,10 @@ DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 def made_with() -> dict[str, str]:
     """Precision, device, platform, versions, sources and commit of this process."""
+    device = default_device()
     return {
         "precision": environment.precision(),
-        "device": environment.devices()[0],
+        "device": f"{device.platform}: {device.device_kind}",
         "platform": f"{environment.system()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "commit": environment.commit(),

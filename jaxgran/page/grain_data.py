@@ -49,7 +49,6 @@ def grain_data(
     clustered: Bool[np.ndarray, " pairs"],
     side: float,
     tilt: float,
-    window: float,
     scale: Scale,
 ) -> dict[str, Any]:
     """One instant for a page; the arguments are those of an ``Instant``, and a scale.
@@ -67,7 +66,7 @@ def grain_data(
         *(np.round(255 * np.clip(share, 0, 1)).astype(np.uint8) for share in shares),
         clustered.astype(np.uint8),
     ]
-    numbers = {"side": side, "tilt": tilt, "window": window, "radius": largest, **scale._asdict()}
+    numbers = {"side": side, "tilt": tilt, "radius": largest, **scale._asdict()}
     return {
         "grains": len(radii),
         "pairs": len(force),

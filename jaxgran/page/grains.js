@@ -119,10 +119,9 @@ function drawScaleBar(pen, side, scale, point) {
 
 // What the lines and colours of a picture mean, in words.
 function grainCaption(instant) {
-  const window = numberText(instant.window, 3);
   return [
     "Black: forces within clusters of three or more grains. Red: binary collisions.",
-    `The widest line is a force of ${numberText(instant.force, 2)} mσγ̇² or more; forces are means over a strain of ${window}.`,
+    `The widest line is a force of ${numberText(instant.force, 2)} mσγ̇² or more; all are those of one time step.`,
     `Blue: peculiar speed, deepest from ${numberText(instant.speed, 2)} σγ̇.`,
   ].join(" ");
 }

@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from jaxgran.maps.schema import RATIO, MapData, require_map
-from jaxgran.model.checks import InputError, require_whole, short_repr
+from jaxgran.model.checks import InputError, require_flag, require_whole, short_repr
 from jaxgran.model.choices import FileFormat
 from jaxgran.plotting.drawing import FILE_DPI, is_plane, writable_stem, write
 from jaxgran.plotting.enskog_factors import enskog_factors, has_factors
@@ -39,7 +39,12 @@ FIGURES = {
 
 
 def save_figures(
-    data: MapData, stem: Path | str, format: FileFormat = "png", dpi: int = FILE_DPI, caption: bool = True
+    data: MapData,
+    stem: Path | str,
+    format: FileFormat = "png",
+    dpi: int = FILE_DPI,
+    caption: bool = True,
+    overwrite: bool = True,
 ) -> list[Path]:
     """Write every figure for which a map has the data, and return the paths written.
 
@@ -64,12 +69,14 @@ def save_figures(
       format: "png", "pdf" or "svg", which is also the ending of the names.
       dpi: dots per inch of a PNG, 50 to 1200; the other formats have none.
       caption: whether the parameters of the run and the notes stand under the axes.
+      overwrite: whether files that are there are replaced; otherwise they are kept.
 
     Raises:
       InputError: (a ValueError) the data are not a map, a choice is not one of these, or no files can be written there.
     """
     data = require_map(data, *RATIO)
     require_file(format, dpi)
+    require_flag("overwrite", overwrite)
     stem = writable_stem(stem)
     drawn = {
         stem.with_name(f"{stem.name}_{name}.{format}"): one.draw
@@ -79,9 +86,10 @@ def save_figures(
     for path in drawn:
         if path.is_dir():
             raise InputError(f"the figures must be files, and {str(path)!r} is a folder.")
-    for path, draw in drawn.items():
-        write(draw(data), path, dpi, caption)
-    return list(drawn)
+    written = [path for path in drawn if overwrite or not path.exists()]
+    for path in written:
+        write(drawn[path](data), path, dpi, caption)
+    return written
 
 
 def remove_pictures(path: Path, but: Iterable[Path] = ()) -> None:

@@ -131,7 +131,7 @@ def require_room(flow: ShearFlow, grains: Grains) -> None:
         )
 
 
-def _overlap_forces(neighbours: PairLists, grains: Grains) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
+def _overlap_forces(neighbours: PairLists) -> tuple[Float[Array, "grains 2"], Float[Array, ""]]:
     """Forces of the overlap energy, and the largest overlap in σ, infinite if the list of pairs is incomplete."""
     pairs = neighbours.near
     separations = separations_now(pairs, neighbours.frame)
@@ -153,7 +153,7 @@ def _fire_step(now: _Fire, grains: Grains, side: Array, allowed: Array) -> _Fire
     neighbours = lax.cond(
         any_replica(stale), lambda: refresh(now.neighbours, grains, side, stale), lambda: now.neighbours
     )
-    forces, overlap = _overlap_forces(neighbours, grains)
+    forces, overlap = _overlap_forces(neighbours)
     forward = jnp.sum(forces * now.velocities) > 0
     aligned = jnp.linalg.norm(now.velocities) / jnp.maximum(jnp.linalg.norm(forces), 1e-30) * forces
     mixed = jnp.where(forward, (1 - now.mixing) * now.velocities + now.mixing * aligned, 0)

@@ -167,7 +167,7 @@ def prepare_batch(
     state, packed = _heated(flow, keys, temperature, grains, lockstep=in_lockstep())
     check_precision(flow, state)
     status = np.where(np.asarray(packed), Status.ok, Status.infeasible)
-    coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains=grains))
+    coarse = replace(flow, timestep=bounded_coarse_timestep(flow, theory, grains))
     predictions = {name: getattr(theory, name) for name in ("granular_temperature", "pressure", "shear_stress")}
     each = for_replicas(numerics, len(status))
     batch = Batch(coarse, each, state, status, np.zeros(len(status)), np.zeros(len(status)))

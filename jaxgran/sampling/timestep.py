@@ -100,14 +100,11 @@ def _crossing_rate(theory: SteadyShear, grains: Grains | None) -> np.ndarray:
     return speed if grains is None else speed / np.min(2 * grains.radii * np.sqrt(grains.masses), axis=-1)
 
 
-def bounded_coarse_timestep(
-    flow: ShearFlow, theory: SteadyShear, longest: float = COARSE_TIMESTEP, grains: Grains | None = None
-) -> np.ndarray:
-    """The coarse time step of each flow, in t: short enough for its thermal speed, and not shorter than its own step.
-
-    ``longest`` is in 1/γ̇.
-    """
-    coarse = np.minimum(longest / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains))
+def bounded_coarse_timestep(flow: ShearFlow, theory: SteadyShear, grains: Grains | None = None) -> np.ndarray:
+    """The coarse time step of each flow, in t: short enough for its thermal speed, not shorter than its own step."""
+    coarse = np.minimum(
+        COARSE_TIMESTEP / np.asarray(flow.shear_rate), _COARSE_CROSSING / _crossing_rate(theory, grains)
+    )
     timestep = np.asarray(flow.timestep)
     return np.maximum(coarse.astype(timestep.dtype), timestep)
 

@@ -13,19 +13,17 @@ from jaxgran.dynamics.numba_engine.layout import (
     RADIUS,
     SECOND,
 )
-from jaxgran.dynamics.tally import CONTACT, RESIDUAL_EDGES, place_of, span_of
+from jaxgran.dynamics.tally import CONTACT, place_of, span_of
 
 contact_terms, kinetic_means = LAW["contact_terms"], LAW["kinetic_means"]
 
-_EDGES = RESIDUAL_EDGES[1:-1]
 _FIRST_TERM, _TERMS = span_of(CONTACT).start, span_of(CONTACT).stop - span_of(CONTACT).start
 _PADDED = (_TERMS + 7) // 8 * 8  # the terms are added eight at a time
 # Terms that fill the last eight, and are added to nothing: zeros in their place cost 3 to 6 % of a step.
 _PADS = _PADDED - _TERMS
 _DURATION, _STEPS, _KINETIC = place_of("duration"), place_of("steps"), place_of("kinetic_moment")
 COLLISIONS = place_of("collisions")
-_SOLVES, _ITERATIONS = place_of("solves"), place_of("iterations")
-_UNCONVERGED, _COUNTS = place_of("unconverged"), place_of("residual_counts")
+_SOLVES, _ITERATIONS, _UNCONVERGED = (place_of(name) for name in ("solves", "iterations", "unconverged"))
 _LARGEST_OVERLAP, _WORST_RESIDUAL = place_of("largest_overlap"), place_of("worst_residual")
 
 
@@ -82,12 +80,8 @@ def add_contacts(sums, step_sums, contacts, one_plus_alpha, grains, network):
 @inline_njit
 def add_solve(sums, iterations, residual, outcome, deepest):
     """Add one solve."""
-    place = 0
-    while place < _EDGES.size and residual > _EDGES[place]:
-        place += 1
     sums[_SOLVES] += 1
     sums[_ITERATIONS] += iterations
     sums[_UNCONVERGED] += outcome != OK
-    sums[_COUNTS + place] += 1
     sums[_LARGEST_OVERLAP] = max(sums[_LARGEST_OVERLAP], deepest)
     sums[_WORST_RESIDUAL] = max(sums[_WORST_RESIDUAL], residual)
