@@ -176,7 +176,7 @@ def test_records_of_a_call_are_within_a_number_of_bytes_or_the_fewest(grains: in
     records = observed_advance.records_of_call(grains)
     assert records >= 2 and (records == 2 or 8 * records * record_numbers(grains) <= 2**26)
     call = jax.eval_shape(
-        lambda: call_numba(replace(FLOW, grains=grains), BarzilaiBorwein(), _shapes(grains), 1, records)
+        lambda: call_numba(replace(FLOW, grains=grains), BarzilaiBorwein(), _shapes(grains), jnp.ones(1), records)
     )
     assert call.records.shape == (records, record_numbers(grains))
 

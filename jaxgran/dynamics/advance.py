@@ -5,22 +5,24 @@ engines.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.dynamics.batching import with_forward_derivative, with_own_batching
-from jaxgran.dynamics.engine import Engine, Numba, checked_numerics, select_engine
+from jaxgran.dynamics.engine import Engine, Numba, Numerics, checked_numerics, select_engine
 from jaxgran.dynamics.jax_engine import advance_by_jax, ended, require_advance
 from jaxgran.dynamics.replicas import checked_batch, over_replicas
 from jaxgran.dynamics.tally import NUMBERS, RunningSums, Tally, sums_from_row
 from jaxgran.model.control_flow import in_batch
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.state import State
+from jaxgran.model.state import State, kinetic_energy
 
 
 def advance(
@@ -89,6 +91,24 @@ def advance(
     return _jax_engine(moving_contacts)(*arrays)
 
 
+def advance_blocks(
+    flow: ShearFlow, numerics: Numerics, state: State, steps: Int[Array, " blocks"]
+) -> tuple[State, Tally]:
+    """Advance a flow by one block of steps after another, with a tally (blocks,) for each.
+
+    The engine ``Jax`` advances by each block as ``advance`` does. The numba engine keeps its list of near pairs from
+    one block to the next, so its trajectory differs by rounding from that of one call a block, and a batch of replicas
+    meets at the end of all blocks only.
+    """
+    if isinstance(select_engine(flow, numerics, state), Numba):
+        return _numba_blocks(flow, numerics.solver, state, steps)
+
+    def block(state: State, steps: Array) -> tuple[State, Tally]:
+        return advance(flow, state, steps, solver=numerics.solver, engine=numerics.engine)
+
+    return lax.scan(block, state, steps)
+
+
 @cache
 def _jax_engine(moving_contacts: bool) -> Callable[..., tuple[State, Tally]]:
     """The engine ``Jax`` with batches and forward derivatives; reverse mode needs ``events``, and the plain engine."""
@@ -110,10 +130,34 @@ def register_numba() -> None:
     ffi.register()
 
 
-def advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+def _advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the numba engine."""
+    return _end_of(state, call_numba(flow, solver, state, steps[None]))
+
+
+def _blocks_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+    """Advance one replica with the numba engine, by blocks of steps."""
     call = call_numba(flow, solver, state, steps)
-    return ended(state, call.end.positions, call.end.tilt, call.end.velocities, call.sums)
+    end, last = _end_of(state, call)
+    if steps.size == 1:
+        return end, jax.tree.map(lambda x: x[None], last)
+    energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic[:-1]])
+    before = jax.vmap(lambda sums, **ends: sums.tally(**ends))(
+        jax.tree.map(lambda x: x[:-1], call.sums), energy_change=jnp.diff(energies), momentum_drift=call.drift[:-1]
+    )
+    last = replace(last, energy_change=last.energy_change - (energies[-1] - energies[0]))
+    return end, jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), before, last)
+
+
+def _blocks_by_jax(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
+    """The same with the engine ``Jax``."""
+    return lax.scan(lambda state, steps: advance_by_jax(flow, solver, state, steps), state, steps)
+
+
+def _end_of(state: State, call: "NumbaCall") -> tuple[State, Tally]:
+    """The state at the end of a call from a state, and the tally of its last block, with the whole energy change."""
+    sums = jax.tree.map(lambda x: x[-1], call.sums)
+    return ended(state, call.end.positions, call.end.tilt, call.end.velocities, sums)
 
 
 class NumbaCall(NamedTuple):
@@ -123,7 +167,9 @@ class NumbaCall(NamedTuple):
     field      shape            meaning
     =========  ===============  ==========================================================================
     end        State            the state at the end, unless the call is suspended
-    sums       RunningSums      the running sums, with those of the calls that it goes on from
+    sums       RunningSums      (blocks,) the running sums, with those of the calls that it goes on from
+    kinetic    (blocks,)        kinetic energy at the end of each block but the last one
+    drift      (blocks,)        relative momentum then
     suspended  ()               where the call is suspended; 0 if it is finished
     recorded   ()               number of records
     records    (room, numbers)  see ``numba_engine.records``
@@ -133,6 +179,8 @@ class NumbaCall(NamedTuple):
 
     end: State
     sums: RunningSums
+    kinetic: Array
+    drift: Array
     suspended: Array
     recorded: Array
     records: Array
@@ -146,7 +194,8 @@ def numba_memory(flow: ShearFlow) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((1 + layout.WORDS + layout.WORDS_PER_GRAIN * flow.grains,), jnp.float64)
 
 
-_numba_engine = with_forward_derivative(advance_by_numba, advance_by_jax)
+_numba_engine = with_forward_derivative(_advance_by_numba, advance_by_jax)
+_numba_blocks = with_forward_derivative(_blocks_by_numba, _blocks_by_jax)
 
 
 def call_numba(
@@ -161,8 +210,10 @@ def call_numba(
     """Run the numba engine once.
 
     Args:
-      flow, solver, state, steps: as in ``advance``.
-      room: number of records, static. The call is suspended where there is no room for more; 0 records nothing.
+      flow, solver, state: as in ``advance``.
+      steps: (blocks,) numbers of time steps.
+      room: number of records, static, for one block. The call is suspended where there is no room for more; 0 records
+        nothing.
       suspended, memory: those of an earlier call with the same arguments, where it is to go on; 0 to begin.
     """
     from jaxgran.dynamics.numba_engine import layout
@@ -171,16 +222,19 @@ def call_numba(
     register_numba()
     dtype, grains, count = state.positions.dtype, state.grains, flow.grains
     numbers = (state.side, state.tilt, flow.restitution, flow.timestep, flow.shear_rate, solver.tolerance)
-    numbers = (*numbers, flow.activation_fraction, solver.max_steps, steps, suspended)
+    numbers = (*numbers, flow.activation_fraction, solver.max_steps, suspended)
     record = layout.record_numbers(count)
     kept = numba_memory(flow).shape if room > 0 else (0,)  # without records nothing goes on in it
-    shapes = [state.positions.shape, state.positions.shape, (layout.RESULTS,), kept, (room, record)]
+    shapes = [state.positions.shape, state.positions.shape, (*steps.shape, layout.RESULTS), kept, (room, record)]
     results = [jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
-    aliases = None if memory is None else {5: 3}
+    aliases = None if memory is None else {6: 3}
     call = jax.ffi.ffi_call(TARGET, results, vmap_method="broadcast_all", input_output_aliases=aliases)
     packed = jnp.stack([jnp.asarray(x).astype(dtype) for x in numbers])
-    given = state.positions, state.velocities, grains.radii, grains.masses, packed
+    given = state.positions, state.velocities, grains.radii, grains.masses, packed, steps.astype(dtype)
     positions, velocities, found, memory, records = call(*given, *(() if memory is None else (memory,)))
-    end = State(grains, positions, velocities, state.side, found[layout.TILT])
-    sums = sums_from_row(found[:NUMBERS], found[layout.STATUS].astype(jnp.int32))
-    return NumbaCall(end, sums, found[layout.SUSPENDED], found[layout.RECORDED].astype(jnp.int32), records, memory)
+    last = found[-1]
+    end = State(grains, positions, velocities, state.side, last[layout.TILT])
+    sums = jax.vmap(sums_from_row)(found[:, :NUMBERS], found[:, layout.STATUS].astype(jnp.int32))
+    recorded = last[layout.RECORDED].astype(jnp.int32)
+    kinetic, drift = found[:, layout.KINETIC], found[:, layout.DRIFT]
+    return NumbaCall(end, sums, kinetic, drift, last[layout.SUSPENDED], recorded, records, memory)

@@ -84,9 +84,9 @@ def _recorded(
     room = records_of_call(flow.grains)
 
     def called(now: _Progress) -> _Progress:
-        call = call_numba(flow, solver, state, steps, room, now.suspended, now.memory)
+        call = call_numba(flow, solver, state, steps[None], room, now.suspended, now.memory)
         user_sums = _with_records(flow, state, observe, now.sums.user_sums, call)
-        sums = call.sums._replace(user_sums=user_sums)
+        sums = jax.tree.map(lambda x: x[0], call.sums)._replace(user_sums=user_sums)
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 
     dtype = state.positions.dtype
@@ -107,7 +107,7 @@ def _with_records(flow: ShearFlow, state: State, observe: Observe, user_sums: An
     """The user sums with what is found in the records of a call."""
     from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS
 
-    records, count, flown = call.records, call.recorded, call.sums.steps
+    records, count, flown = call.records, call.recorded, call.sums.steps[0]
     dtype = records.dtype
     most = 3 * flow.grains  # contacts of discs form a planar graph
     sizes = max(4, flow.grains // _FEW), most

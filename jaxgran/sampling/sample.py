@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
+from jaxgran.dynamics.advance import advance_blocks
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.interruption import waited
 from jaxgran.dynamics.replicas import checked_batch, compiled_for_few_sizes, compiled_over_replicas
@@ -366,7 +367,10 @@ def _sample_blocks(
     def block(state: State, steps: Array) -> tuple[State, Tally]:
         return advance_and_observe(flow, numerics, state, steps, observe)
 
-    state, tally = lax.scan(block, state, steps)
+    if observe is None:
+        state, tally = advance_blocks(flow, numerics, state, steps)
+    else:
+        state, tally = lax.scan(block, state, steps)
     shear_rate = jnp.asarray(flow.shear_rate, state.side.dtype)
     return state, Sample(tally, state.side**2, shear_rate, flow.grains)
 

@@ -173,7 +173,8 @@ def _handler(frame, replica, stop):
         return _replicas(args, 4)
     grains = _length(args, 2, 1)
     room, record = _length(rets, 4, 2), _length(rets, 4, 1)
-    results = doubles_at(_data(rets, 2, replica, RESULTS), (RESULTS,))
+    blocks = _length(args, 5, 1)
+    results = doubles_at(_data(rets, 2, replica, blocks * RESULTS), (blocks, RESULTS))
     words = 1 + WORDS + WORDS_PER_GRAIN * grains
     kept = _length(rets, 3, 1) > 0  # the memory outlasts the call
     block = _data(rets, 3, replica, words) if kept else _allocate(8 * words)
@@ -192,6 +193,7 @@ def _handler(frame, replica, stop):
         doubles_at(_data(args, 2, replica, grains), (grains,)),
         doubles_at(_data(args, 3, replica, grains), (grains,)),
         doubles_at(_data(args, 4, replica, INPUTS), (INPUTS,)),
+        doubles_at(_data(args, 5, replica, blocks), (blocks,)),
         doubles_at(_data(rets, 0, replica, 2 * grains), (grains, 2)),
         doubles_at(_data(rets, 1, replica, 2 * grains), (grains, 2)),
         results,
@@ -207,9 +209,10 @@ def _handler(frame, replica, stop):
 @inline_njit
 def _refuse(results):
     """Results of a call for which there is no memory."""
-    for n in range(RESULTS):
-        results[n] = 0.0
-    results[STATUS] = CAPACITY
+    for b in range(results.shape[0]):
+        for n in range(RESULTS):
+            results[b, n] = 0.0
+        results[b, STATUS] = CAPACITY
     return 0
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxgran.dynamics.tally import NUMBERS
 from jaxgran.model.status import Status
 
-INPUTS = 10  # numbers of a flow and of its advance
-STATUS, TILT, SUSPENDED, RECORDED = range(NUMBERS, NUMBERS + 4)  # behind the sums
-RESULTS = NUMBERS + 4
+INPUTS = 9  # numbers of a flow and of its advance
+STATUS, TILT, SUSPENDED, RECORDED, KINETIC, DRIFT = range(NUMBERS, NUMBERS + 6)  # behind the sums
+RESULTS = NUMBERS + 6
 BETWEEN_LISTS, WITHIN_LIST = 1, 2  # where a suspended loop goes on
 SAVED = 15  # numbers of a suspended loop, behind its sums
 WORDS, WORDS_PER_GRAIN = (

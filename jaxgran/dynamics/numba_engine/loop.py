@@ -33,10 +33,12 @@ from jaxgran.dynamics.numba_engine.compilation import LAW, inline_njit, njit
 from jaxgran.dynamics.numba_engine.layout import (
     BETWEEN_LISTS,
     CAPACITY,
+    DRIFT,
     EPSILON,
     FAILED,
     FIRST,
     INVERSE_MASS,
+    KINETIC,
     MANY,
     NONFINITE,
     OK,
@@ -78,33 +80,38 @@ _NARROWEST_SKIN = 0.05  # σ, the usual skin of a dense flow
 
 @njit
 def advance_loop(
-    positions, velocities, radii, masses, numbers, new_positions, new_velocities, results, records, arrays, stop
+    positions, velocities, radii, masses, numbers, steps, new_positions, new_velocities, results, records, arrays, stop
 ):
-    """Advance one replica.
+    """Advance one replica by one block of steps after another.
 
     Args:
       positions, velocities: (grains, 2) as in a State; ``new_positions`` and ``new_velocities`` receive those after.
       radii, masses: (grains,).
       numbers: side, tilt, restitution, timestep, shear rate, tolerance, activation fraction, most iterations of a
-        solve, steps, and where an earlier call was suspended, or 0 to begin.
-      results: (RESULTS,) receives the running sums, the status, the tilt, where the loop is suspended (0 if it is
-        finished), and the number of records.
-      records: (room, numbers) receives ``records`` of steps; when they are full, the loop is suspended before it
-        delivers anything. Without room it records nothing.
+        solve, and where an earlier call was suspended, or 0 to begin.
+      steps: (blocks,) numbers of time steps.
+      results: (blocks, RESULTS) receives, for each block, the running sums and the status; at the end of all but the
+        last one also a reading of the velocity scales, the kinetic energy and the relative momentum; in the last one
+        the tilt, where the loop is suspended (0 if it is finished), and the number of records.
+      records: (room, numbers) receives ``records`` of the steps of one block; when they are full, the loop is
+        suspended before it delivers anything. Without room it records nothing.
       arrays: memory of the loop, see ``allocation``; of the earlier call where one was suspended.
       stop: (1,), a word that another thread may set; unless it is zero, the loop ends with the status ``failed``.
     """
     side, tilt, alpha, dt, rate = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     flow = Flow(side, rate, dt, numbers[6], 1.0 + alpha, numbers[5], int(numbers[7]))
-    steps, ahead, count = int(numbers[8]), flow.theta * dt, radii.size
-    for n in range(RESULTS):
-        results[n] = 0.0
+    ahead, count, blocks, total = flow.theta * dt, radii.size, steps.size, 0
+    for b in range(blocks):
+        total += int(steps[b])
+        for n in range(RESULTS):
+            results[b, n] = 0.0
+    block, block_end, sums = 0, int(steps[0]), results[0]
 
     grains, pairs, network, clusters, order, step_sums, saved = arrays
-    going_on = int(numbers[9])
+    going_on = int(numbers[8])
     if going_on > 0:
         for n in range(NUMBERS):
-            results[n] = saved[n]
+            sums[n] = saved[n]
         tilt, largest, done, solved, status, counted = _advance_saved(saved[NUMBERS:])
     else:
         put_in_order(positions, side, tilt, order)
@@ -120,7 +127,7 @@ def advance_loop(
 
     life = LIFE / rate if rate > 0.0 else math.inf
     room, recorded, suspended = records.shape[0], 0, 0
-    while done < steps and status < NONFINITE:
+    while done < total and status < NONFINITE:
         if 0 < room < recorded + 2:  # for a list and for contacts
             suspended = BETWEEN_LISTS
             break
@@ -158,22 +165,30 @@ def advance_loop(
             # The next step to visit is that of a contact, the end of the list's life, or that of the advance.
             spare = min(slack / (loss * dt), life / dt - k, MANY) if loss > 0.0 else MANY
             strike, before = next_contact_step(entries, shift, pairs), k
-            k = min(before + int(max(spare, 1.0 if fresh else 0.0)), strike, steps - done)
+            k = min(before + int(max(spare, 1.0 if fresh else 0.0)), strike, block_end - done)
             flight, fresh = (k - before) * dt, False  # a new list lasts to the next step, where it is renewed
-            kinetic = add_flight(results, k - before, flight, rate * flight, kinetic)
+            kinetic = add_flight(sums, k - before, flight, rate * flight, kinetic)
             slack -= loss * flight
             solved = solved if k == before else 0
             if stop[0] != 0:
                 status = FAILED
                 break
-            if done + k >= steps or strike > k or (k > before and slack < -16 * EPSILON * skin):
+            t, block_ends = k * dt, done + k >= block_end
+            while block + 1 < blocks and done + k >= block_end:
+                _end_block(t, tilt + rate * t, side, rate, kinetic, status, grains, clusters, step_sums, sums)
+                block, sums, status, counted = block + 1, results[block + 1], OK, 0.0
+                block_end += int(steps[block])
+            if done + k >= block_end or (k > before and slack < -16 * EPSILON * skin):
+                break
+            if strike > k:
+                if block_ends:
+                    continue
                 break
 
-            t = k * dt
             contacts = contacts_of_step(k, entries, shift, pairs, network.met)
             overfull = contacts > network.met.size
             contacts = min(contacts, network.met.size)
-            hits, outcome = _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, results)
+            hits, outcome = _collide(contacts, t, flow, grains, pairs, network, clusters, step_sums, sums)
             status = max(status, CAPACITY if overfull else OK, outcome)
             solved = 1
             if room > 0:
@@ -184,9 +199,9 @@ def advance_loop(
             if not finite:
                 status = NONFINITE
                 break
-            if results[COLLISIONS] - counted >= READ_AFTER * count / 2:
-                read_velocity_scales(t, tilt + rate * t, side, rate, grains, clusters.matrices, step_sums, results)
-                counted = results[COLLISIONS]
+            if sums[COLLISIONS] - counted >= READ_AFTER * count / 2:
+                read_velocity_scales(t, tilt + rate * t, side, rate, grains, clusters.matrices, step_sums, sums)
+                counted = sums[COLLISIONS]
             loss_before, loss = loss, skin_loss(fastest, rate, largest + skin)
             slack -= (loss - loss_before) * ahead
             horizon = max(min(slack / loss, life - t), dt) + ahead
@@ -206,7 +221,7 @@ def advance_loop(
 
     if suspended > 0:
         for n in range(NUMBERS):
-            saved[n] = results[n]
+            saved[n] = sums[n]
         _save_advance(tilt, largest, done, solved, status, counted, saved[NUMBERS:])
     elif done > 0:
         _deliver(order.given, side, tilt, rate, grains, new_positions, new_velocities)
@@ -214,7 +229,27 @@ def advance_loop(
         for g in range(count):
             new_positions[g, 0], new_positions[g, 1] = _wrapped(positions[g, 0], positions[g, 1], side, tilt)
             new_velocities[g, 0], new_velocities[g, 1] = velocities[g, 0], velocities[g, 1]
-    results[STATUS], results[TILT], results[SUSPENDED], results[RECORDED] = status, tilt, suspended, recorded
+    for b in range(block, blocks):  # several where a block has no steps, or where something went wrong
+        results[b, STATUS] = status
+    sums = results[blocks - 1]
+    sums[TILT], sums[SUSPENDED], sums[RECORDED] = tilt, suspended, recorded
+
+
+@njit
+def _end_block(t, tilt, side, rate, kinetic, status, grains, clusters, step_sums, sums):
+    """Complete the sums of a block that ends at the time t since the search, and is not the last one."""
+    motion, constants = grains.motion, grains.constants
+    read_velocity_scales(t, tilt, side, rate, grains, clusters.matrices, step_sums, sums)
+    px = py = total = 0.0
+    for g in range(motion.shape[0]):
+        cx, cy = motion[g, VX] - rate * (motion[g, Y] + motion[g, VY] * t), motion[g, VY]
+        mass = 1 / constants[g, INVERSE_MASS]
+        px += mass * cx
+        py += mass * cy
+        total += mass * math.sqrt(cx * cx + cy * cy)
+    xx, _, yy = kinetic
+    sums[STATUS], sums[KINETIC] = status, (xx + yy) / 2
+    sums[DRIFT] = math.sqrt(px * px + py * py) / total if total > 0.0 else 0.0
 
 
 @inline_njit
