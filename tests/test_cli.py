@@ -43,7 +43,6 @@ from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.presets import combined
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
-from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
 from jaxgran.plotting import movie
@@ -77,25 +76,12 @@ def restitutions(text: str) -> tuple[float, ...]:
     return arguments.value("restitution", map_module.MAP_OPTIONS["restitution"], text)
 
 
-@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=8))
-def test_list_of_numbers_is_those_numbers(numbers: list[float]) -> None:
-    assert restitutions(",".join(map(repr, numbers))) == tuple(numbers)
-
-
 @given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
 def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, count: int) -> None:
     numbers = restitutions(f"{start / 100}:{stop / 100}:{count}")
     assert len(numbers) == count
     assert (numbers[0], numbers[-1]) == (start / 100, stop / 100)
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
-
-
-@pytest.mark.parametrize("text", ["", "0.1,", "0.1;0.5", "0.1:0.9:1", "0:1:2:3"])
-def test_what_is_no_list_is_refused(text: str) -> None:
-    with pytest.raises(
-        InputError, match=r"restitution must be a number or a list like 0\.1,0\.5,0\.9 or start:stop:count"
-    ):
-        restitutions(text)
 
 
 # Mistakes
@@ -166,13 +152,6 @@ def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder
             assert option in outcome.err or parameter.name in of_files, outcome.err
 
 
-def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> None:
-    outcome = in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09")
-    assert_one_sentence(outcome)
-    assert "timestep must be at most" in outcome.err
-    assert not files(tmp_path)
-
-
 # What the commands do
 
 
@@ -232,17 +211,6 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
 
 
-def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch) -> None:
-    """The first is compared; of the others, which take longer, that there is a file."""
-    folder, _ = small_map
-    for name in set(FIGURES) - {"curves"}:
-        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
-    outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
-    assert (outcome.status, outcome.out) == (0, "")
-    assert files(tmp_path) == PICTURES
-    assert (tmp_path / "small_curves.png").read_bytes() == (folder / "small_curves.png").read_bytes()
-
-
 def test_plot_makes_its_folder_and_writes_other_formats_without_caption(small_map, tmp_path: Path, monkeypatch) -> None:
     folder, _ = small_map
     for name in FIGURES:
@@ -271,27 +239,6 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
     assert f"wrote flow.gsd: {frames} frames\n" in outcome.err and f"wrote flow.gif: {frames} frames\n" in outcome.err
     with Image.open(folder / "flow.gif") as film:
         assert film.n_frames == frames
-
-
-def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
-    folder, outcome = small_run
-    data = open_map(folder / "flow.nc")
-    assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
-    assert "recording frames split the run" in outcome.err
-    assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
-    data = flattened(data).isel(restitution=0, packing_fraction=0)
-    averages, budget = outcome.out.split("Relative error, 95 %")
-    for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "dissipation_rate"):
-        (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
-        assert with_error(*(float(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))) in row
-    (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
-    sources = ("sampling", "timestep", "size", "tolerance", "total")
-    shown = [f"{100 * float(data.pressure_ci95.sel(error_source=one) / data.pressure):.2g}" for one in sources]
-    assert [word for word in row.split()[1:] if word != "%"] == shown
-    (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
-    correlated = data["diagnostics/correlation_strain"].sel(observable="pressure")
-    samples = data["seeds/strain"].sum().item() / correlated.item()
-    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data['theory/pressure']):.3g}"]
 
 
 def parsed(text: str) -> dict[str, Any]:
@@ -385,11 +332,6 @@ def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatc
 # Trajectories and maps that are fitted
 
 
-def rows_of(table: str) -> dict[str, str]:
-    """The columns of a table of two."""
-    return dict(re.split(r"\s{2,}", line.strip()) for line in table.splitlines() if "  " in line.strip())
-
-
 # Help, completion, colours
 
 
@@ -410,21 +352,6 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
         if "--help" not in words:
             context = group.commands[name].make_context(name, list(words))
             assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    {
-        "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "info"},
-        "jaxgran run --m": {"--movie"},
-        "jaxgran map --preset ": {"quick", "paper", "dense"},
-    }.items(),
-)
-def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch) -> None:
-    word = str(len(line.split(" ")) - 1)
-    for name, value in (("_JAXGRAN_COMPLETE", "complete_bash"), ("COMP_WORDS", line), ("COMP_CWORD", word)):
-        monkeypatch.setenv(name, value)
-    assert set(jaxgran(tmp_path).out.split()) == expected
 
 
 def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
@@ -491,27 +418,6 @@ def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, mo
     assert [row.count("*") for row in rows] == [len(points) - 1] * 2  # force ratio and shear-stress ratio
 
 
-def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_points_name_theirs(
-    tmp_path: Path, monkeypatch
-) -> None:
-    write_without_drawing(monkeypatch)
-    write_few_variables(monkeypatch)
-    statuses = {(point, 0): Status.ok for point in range(7)} | {(7, 0): Status.deep_overlap}
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(statuses))
-    words = [*POINTS, "--seeds", "1", "--grains", "64,128", "--timestep", "1e-3,1e-4"]
-    outcome = jaxgran(tmp_path, "map", *words)
-    assert outcome.status == 3 and "8/8 points" in outcome.err
-    assert "deep overlap at (restitution 0.9, packing fraction 0.6, 128 grains, time step 0.0001)." in outcome.err
-    pictures = ("_curves.png", "_timestep.png", "_size.png", "_clusters.png")
-    assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", *pictures)}
-    _, *tables = re.split("(Force|Shear-stress) ratio at ", " ".join(outcome.out.split()))
-    assert tables[::2] == ["Force", "Shear-stress"] * 4
-    parts = [(n, dt) for n in (64, 128) for dt in (1e-3, 1e-4) for _ in range(2)]
-    for table, (n, dt) in zip(tables[1::2], parts, strict=True):
-        assert table.startswith(f"{n} grains, dt = {dt:g} / shear rate, midpoint activation")
-        assert table.count("*") == ((n, dt) == (128, 1e-4))
-
-
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch) -> None:
     write_few_variables(monkeypatch)
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(1, 0): Status.ok}, KeyboardInterrupt))
@@ -539,28 +445,6 @@ def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(words, tmp
     found = parsed(as_json.out)
     assert found["status"]["value"] == "not_run" and found["force_ratio"]["value"] is None
     assert not files(tmp_path)
-
-
-def test_a_map_without_a_value_prints_no_table_and_what_is_known_of_the_others(tmp_path: Path, monkeypatch) -> None:
-    write_few_variables(monkeypatch)
-    write_without_drawing(monkeypatch)
-    words = ("map", *POINTS, "--error", "0.3")
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
-    outcome = jaxgran(tmp_path, *words)
-    assert (outcome.status, outcome.out) == (130, "")
-    assert "relative errors" not in outcome.err and "nan" not in outcome.err and "resume" not in outcome.err
-    jammed = {(0, 0): Status.ok, (1, 0): Status.nonfinite}
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(jammed))
-    outcome = jaxgran(tmp_path, *words)
-    assert outcome.status == 3 and "nan" not in outcome.err + outcome.out
-    assert "at the worst point of the 1 points with an error; sampled strains of" in outcome.err
-
-
-@pytest.mark.parametrize("sizes", [(), ("--polydispersity", "0.1"), ("--diameters", "0.8,1.2")])
-def test_errors_by_laws_of_other_sizes_are_said_to_be_estimates(sizes, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
-    outcome = jaxgran(tmp_path, *FLOW.split(), *sizes)
-    assert ("laws measured at a polydispersity of 0.26" in outcome.out) == bool(sizes)
 
 
 def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch) -> None:

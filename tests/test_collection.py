@@ -11,8 +11,6 @@ import pytest
 from benchmarks import networks
 from benchmarks.collection import PATH, Entry, load
 from benchmarks.collection.certificates import Problem, certificate, delassus, obstacle, obstructed, solved
-from benchmarks.collection.compare import Answer, compare
-from benchmarks.collection.files import write
 from benchmarks.collection.problems import compact
 from benchmarks.exact_contacts import certified_impulses
 from benchmarks.exact_contacts import incidence as dense_incidence
@@ -112,20 +110,6 @@ def test_weights_prove_in_exact_fractions_that_there_is_no_solution(network):
     assert max(abs(float(x)) for x in total.ravel()) < 1e-30
 
 
-def test_file_returns_what_was_written_and_is_the_same_twice(entries, tmp_path):
-    for name in ("one.h5", "two.h5"):
-        write(tmp_path / name, entries)
-    assert (tmp_path / "one.h5").read_bytes() == (tmp_path / "two.h5").read_bytes()
-    again = sorted(load(tmp_path / "one.h5"), key=lambda one: [x.name for x in entries].index(one.name))
-    for one, other in zip(entries, again, strict=True):
-        assert (one.name, one.family, one.origin) == (other.name, other.family, other.origin)
-        assert one.solution.feasible == other.solution.feasible
-        assert one.solution.certificate == other.solution.certificate
-        for a, b in zip((*one.problem, *one.solution[1:4]), (*other.problem, *other.solution[1:4]), strict=True):
-            np.testing.assert_array_equal(a, b)
-    assert len(load(tmp_path / "one.h5", most_contacts=15)) == sum(len(x.problem.approach) <= 15 for x in entries)
-
-
 def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold():
     told = json.loads((ROOT / "benchmarks" / "results" / "collection.json").read_text())
     assert hashlib.sha256(PATH.read_bytes()).hexdigest() == told["sha256"]
@@ -147,21 +131,3 @@ def test_committed_collection_is_the_one_of_its_summary_and_its_solutions_hold()
             assert certificate(one.problem, high, low) == pytest.approx(one.solution.certificate, rel=1e-6, abs=1e-40)
         else:
             assert obstacle(one.problem, high, low) < 1e-28
-
-
-def test_solvers_are_judged_by_their_residual_and_not_by_their_word(entries):
-    solvers = {
-        "right": lambda entry, tolerance: lambda: entry.solution.impulses if entry.solution.feasible else None,
-        "counting": lambda entry, tolerance: lambda: Answer(entry.solution.impulses, 7),
-        "wrong": lambda entry, tolerance: lambda: np.zeros(len(entry.problem.approach)),
-        "gives up": lambda entry, tolerance: lambda: None,
-    }
-    rows = compare(solvers, entries, timings=1)
-    assert [row.solver for row in rows[:4]] == list(solvers)
-    for row in rows:
-        assert (
-            row.solved
-            == {"right": True, "counting": row.feasible, "wrong": False, "gives up": not row.feasible}[row.solver]
-        )
-        assert row.seconds > 0
-        assert row.residual < 1e-12 or row.solver in ("wrong", "gives up") or not row.feasible

@@ -59,17 +59,6 @@ def test_power_of_the_shear_is_dissipated_or_heats_the_discs(flow) -> None:
     np.testing.assert_allclose(work, sums["dissipation"] + energy(after) - energy(before), rtol=1e-10)
 
 
-def test_some_collisions_of_a_duration_are_elastic_and_all_at_a_long_one(flow) -> None:
-    _, after, sums, _ = flow
-    found = averages(sums, after)
-    assert 0 < found["elastic_share"] < 0.5 and 0 < found["elastic_pressure_share"] < 0.5
-    before = after._replace(last=np.zeros_like(after.last))
-    end, sums = sheared(before, Law(0.3, 1e9, shear_rate=0.0), 1.0)
-    assert sums["elastic"] == sums["collisions"] > 100
-    assert sums["dissipation"] == 0
-    assert energy(end) == pytest.approx(energy(before), rel=ROUNDING)
-
-
 @pytest.mark.parametrize("move", [(0.0, 3.7), (1.3, -12.1)])
 def test_flow_is_the_same_everywhere(move) -> None:
     """Moved by any vector, through the sheared boundary too, the same discs collide at the same times."""

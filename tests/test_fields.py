@@ -22,7 +22,6 @@ from jaxgran.analysis.fields import Fields, fields_at, grid
 from jaxgran.contact.network import Contacts
 from jaxgran.dynamics.snapshots import Snapshot, collided, flown, snapshot
 from jaxgran.model.cell import wrap
-from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
 
@@ -204,20 +203,6 @@ def test_line_integral_is_that_of_the_function(name, middle, angle, length, widt
     assert segment(graining, middle, angle, length) == pytest.approx(expected, rel=1e-9, abs=1e-10)
 
 
-@every_kernel
-def test_line_integral_at_its_edges(name: str) -> None:
-    """Points on the branch, at its end and outside the support, and a branch of hardly any length."""
-    graining = KERNELS[name](0.7)
-    for middle, angle in (((0.0, 0.0), 0.3), ((0.5, 0.0), 0.0), ((0.2, 0.0), 0.0), ((0.0, 0.7), 0.0)):
-        expected = by_quadrature(name, 0.7, middle, angle, 1.0)
-        assert segment(graining, middle, angle, 1.0) == pytest.approx(expected, rel=1e-10, abs=1e-12)
-    if name != "gaussian":
-        for middle in ((0.0, 0.71), (1.3, 0.0)):
-            assert segment(graining, middle, 0.0, 1.0) == pytest.approx(0, abs=1e-15)
-    expected = graining.value(jnp.asarray([[0.2, 0.3]]))[0]
-    assert segment(graining, (0.2, 0.3), 1.0, 1e-6) == pytest.approx(float(expected), rel=1e-8)
-
-
 @jax.jit
 def spread(graining, d):
     """G at a separation and over a branch along x of length one."""
@@ -390,16 +375,6 @@ def test_momentum_through_planes_of_all_heights_is_the_virial_stress(seen) -> No
     np.testing.assert_allclose(mean, virial_stress(seen), rtol=0, atol=1e-10 * np.max(np.abs(mean)))
 
 
-@pytest.mark.parametrize("width", [-1.0, float("nan"), 3.0])
-def test_a_width_that_does_not_fit_the_cell_is_refused(seen, points, width: float) -> None:
-    for fields in (
-        partial(fields_at, seen),
-        lambda r, graining: jax.eval_shape(lambda r: fields_at(seen, r, graining), r),
-    ):
-        with pytest.raises(InputError, match="width of the coarse-graining must be positive and at most"):
-            fields(points, lucy(width))
-
-
 def test_branches_in_several_blocks_are_all_counted(seen, points, monkeypatch) -> None:
     """In a series of snapshots, too."""
     graining, series = SMOOTH["lucy"], jax.tree.map(lambda x: x[None], seen)
@@ -408,13 +383,3 @@ def test_branches_in_several_blocks_are_all_counted(seen, points, monkeypatch) -
     fewer = points[:-1]  # another shape, so that it is compiled anew
     cut = lax.map(lambda one: fields_at(one, fewer, graining), series)
     assert_same(jax.tree.map(lambda x: x[0], cut), jax.tree.map(lambda x: x[:-1], whole), 1e-11)
-
-
-def test_flows_in_single_precision_have_fields_in_single_precision(seen, points) -> None:
-    def single(tree):
-        return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, tree)
-
-    fields = fields_at(single(seen), single(points), SMOOTH["lucy"])
-    assert {x.dtype for x in jax.tree.leaves(fields)} == {jnp.dtype("float32")}
-    assert grid(single(seen.state.side), 3).dtype == jnp.float32
-    assert_same(fields, fields_at(seen, points, SMOOTH["lucy"]), 1e-4)

@@ -64,11 +64,6 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
 
 
-def test_the_same_map_may_be_repeated(finished: bytes, tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3").status == 0  # as by default
-    assert (tmp_path / "jaxgran_map.nc").read_bytes() != finished  # it has another command
-
-
 def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "jaxgran_map.nc").write_bytes(b"years of work")
     outcome = jaxgran(tmp_path, *MAP)
@@ -148,16 +143,6 @@ def test_a_new_map_replaces_no_file_by_a_figure(finished: bytes, command: str, t
     assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
     assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0
     assert (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"  # a line of points has no such figure
-
-
-def test_an_interrupted_map_leaves_the_figures_that_are_there(finished: bytes, tmp_path: Path, monkeypatch) -> None:
-    half = dict(list(BOTH.items())[:1])
-    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
-    (tmp_path / "jaxgran_map.nc").write_bytes(b"not a map")  # so that the half is written in its place
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
-    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 130
-    assert open_map(tmp_path / "jaxgran_map.nc").status.size == 2
-    assert pictures and files(tmp_path) >= pictures
 
 
 def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_path: Path) -> None:

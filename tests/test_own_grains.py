@@ -195,20 +195,3 @@ def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_
     assert relative(below) > 0.8 * limit
     side = cell_side(below.radii, flow.packing_fraction)
     assert float(widest_skin(below, side)) >= 0.2
-
-
-@pytest.mark.parametrize(
-    ("grains", "words"),
-    [
-        (own_grains(np.ones(GRAINS + 1)), "radii and masses of 32 discs"),
-        (Grains(jnp.full(GRAINS, 0.35), jnp.ones(GRAINS)), "mean diameter must be 1, the unit of length, not 0.7"),
-        (Grains(jnp.full(GRAINS, 0.5), jnp.zeros(GRAINS)), "masses must be a list of positive numbers"),
-        (Grains(jnp.full(GRAINS, jnp.nan), jnp.ones(GRAINS)), "radii must be a list of positive numbers"),
-        (Grains(jnp.full(GRAINS, 0.5), jnp.ones(3)), "of shapes"),
-        (0.5, "grains must be Grains"),
-    ],
-)
-def test_grains_that_are_not_the_flows_are_refused_in_one_sentence(grains, words):
-    for function in (pack, prepare, heated):
-        with refused(words):
-            function(flow_of(), jax.random.key(0), grains=grains)

@@ -5,7 +5,7 @@ import pytest
 from flows import flow_of
 
 import jaxgran as jg
-from benchmarks.paper_claims import hexatic, spread
+from benchmarks.paper_claims import spread
 
 
 def test_windows_of_a_sample_have_its_force_ratio_if_weighted_by_their_force(flowing) -> None:
@@ -16,11 +16,3 @@ def test_windows_of_a_sample_have_its_force_ratio_if_weighted_by_their_force(flo
     assert np.average(ratio, weights=sample.tally.binary_impulse) == pytest.approx(found["force_ratio"][0])
     low, high = found["middle_95_percent_of_windows"]
     assert ratio.min() <= low < found["mean_of_windows"] < high <= ratio.max()
-
-
-def test_positions_alone_have_their_hexatic_order() -> None:
-    """A hexagonal lattice of 14 rows of 12, strained by less than 1 % to close in a square cell."""
-    rows, columns, side = 14, 12, 12.0
-    k, m = np.meshgrid(np.arange(columns), np.arange(rows))
-    positions = np.stack([((k + m / 2) * side / columns).ravel(), (m * side / rows).ravel()], axis=1)
-    np.testing.assert_allclose(hexatic(positions, side, 0.0), 1, atol=1e-2)

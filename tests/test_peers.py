@@ -1,12 +1,11 @@
 """The peers of the comparison obey the laws that they are compared by, and its table reads right what was measured."""
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from benchmarks.peers import front, jaxgran_itself, numba_rival
+from benchmarks.peers import jaxgran_itself, numba_rival
 from benchmarks.peers.problem import Discs, Flow, overlaps
 from jaxgran.model.state import State
 
@@ -37,17 +36,6 @@ def test_discs_of_the_numba_loop_rebound_with_the_restitution(restitution: float
     assert velocities[1] - velocities[0] == pytest.approx(restitution, abs=1e-12)
 
 
-def test_a_run_begins_with_the_discs_it_was_given(sheared: Discs) -> None:
-    run = numba_rival.begin(sheared, Flow(0.7, 0.6), CURVE, TIMESTEP, 0.1)
-    now = run.discs()
-    run.close()
-    moved = (now.positions - sheared.positions) / sheared.side
-    moved[:, 0] -= moved[:, 1] * sheared.tilt
-    np.testing.assert_allclose(moved, np.round(moved), atol=1e-12)  # by whole periods
-    for found, given in zip(now[1:], sheared[1:], strict=True):
-        np.testing.assert_allclose(found, given, atol=1e-12)
-
-
 def test_momentum_is_conserved_while_the_cell_tilts_over(sheared: Discs) -> None:
     run = numba_rival.begin(sheared, Flow(0.7, 0.6), CURVE, TIMESTEP, 2.25)
     stress = run.advance()
@@ -57,27 +45,3 @@ def test_momentum_is_conserved_while_the_cell_tilts_over(sheared: Discs) -> None
     assert (now.tilt - sheared.tilt - 2.25 + 0.5) % 1 == pytest.approx(0.5, abs=1e-9)
     assert 0 < stress.shear_stress < stress.pressure
     assert overlaps(now)[1] < 0.1
-
-
-def test_overlaps_are_seen_across_the_sheared_boundary() -> None:
-    radii = np.array([0.5, 0.5, 0.5])
-    positions = np.array([[1.0, 0.1], [1.0 + 0.3 * 8, 7.2], [5.0, 4.0]])
-    discs = Discs(positions, np.zeros((3, 2)), radii, radii, 8.0, 0.3)
-    assert overlaps(discs) == pytest.approx((0.1, 0.1))
-    assert overlaps(discs._replace(tilt=0.0)) == (0.0, 0.0)
-
-
-def row(seconds: float, error: float, noise: float = 0.0) -> dict:
-    return {front.COST: seconds, "errors": dict.fromkeys(front.OBSERVABLES, (error, noise))}
-
-
-def test_time_to_the_target_is_interpolated_along_the_front() -> None:
-    rows = [row(2.0, 0.2), row(1.0, -0.1), row(100.0, 0.001), {"failure": "left out"}]
-    seconds, sign = front.time_to_target(rows, front.OBSERVABLES)
-    share = math.log(0.1 / front.TARGET) / math.log(0.1 / 0.001)
-    assert (seconds, sign) == (pytest.approx(100**share), "=")
-    assert front.time_to_target([row(1.0, 0.01, 0.5)], front.OBSERVABLES) == (1.0, "<")
-    assert front.time_to_target([row(1.0, 0.06), row(3.0, 0.05)], ("pressure",)) == (3.0, ">")
-    by_chance = [row(0.5, 0.002), *rows]  # a finer setting is worse
-    assert front.time_to_target(by_chance, front.OBSERVABLES) == (seconds, sign)
-    assert math.isnan(front.time_to_target([{"failure": "left out"}], ("pressure",))[0])

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import jaxgran
 from synthetic import random_replica, refused
 
 import jaxgran as jg
@@ -81,28 +80,6 @@ def test_other_sizes_are_another_map(bidisperse: xr.DataTree) -> None:
         ratio_map(**MAP, diameters=[1.0, 2.0], snapshots=True, output=output)
     with pytest.raises(InputError, match=r"has a map with diameters .1\.0, 1\.4. and not None"):
         ratio_map(**MAP, snapshots=True, output=output)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "words"),
-    [
-        ({"diameters": [1.0, 1.4, 2.0]}, "diameters must be a list whose length divides the number of grains, 32"),
-        ({"diameters": [1.0, -1.0]}, "diameters must be a list of positive numbers"),
-        ({"diameters": 1.4}, "diameters must be a list"),
-        ({"diameters": [1.0] * 31 + [9.0]}, "the largest diameter"),
-        ({"polydispersity": 0.6}, "polydispersity must be between 0 and 0.5"),
-    ],
-)
-def test_sizes_that_cannot_be_are_refused_before_the_map_runs(sizes: dict[str, Any], words: str) -> None:
-    with refused(words):
-        ratio_map(**MAP, **sizes)
-
-
-def test_sizes_are_options_of_the_command_line(bidisperse: xr.DataTree, tmp_path) -> None:
-    words = "map --restitution 0.9 --packing-fraction 0.6 --grains 32 --seeds 1 --equilibrate 0.5 --strain 1.6"
-    outcome = jaxgran(tmp_path, *words.split(), "--diameters", "1,1.4", "--part", "1/1", "-o", "map.nc", "-q")
-    assert outcome.status in (0, 3), outcome.err
-    assert jg.open_map(tmp_path / "map.nc").force_ratio.equals(bidisperse.force_ratio)
 
 
 def test_a_polydispersity_beside_diameters_is_refused_and_that_of_a_file_replaced() -> None:

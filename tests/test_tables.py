@@ -1,7 +1,5 @@
 """A table fits the terminal in pages that name their rows, and the letters that the terminal has."""
 
-import os
-import subprocess
 import sys
 from contextlib import redirect_stdout
 from io import BytesIO, StringIO, TextIOWrapper
@@ -69,12 +67,3 @@ def test_a_map_without_a_number_prints_no_table_and_no_error(capsys) -> None:
         out, err = capsys.readouterr()
         assert "nan" not in out + err
         assert (bool(out), "0.1 requested" in err) == ((True, True) if len(bad) == 1 else (False, False))
-
-
-def test_names_of_files_that_are_no_text_keep_their_bytes() -> None:
-    program = "from jaxgran.cli.tables import use_plain_letters; use_plain_letters(); print('wrote \\udcff.nc')"
-    for encoding in ("utf-8", "ascii"):
-        done = subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, env=os.environ | {"PYTHONIOENCODING": encoding}
-        )
-        assert (done.returncode, done.stdout) == (0, b"wrote \xff.nc\n")

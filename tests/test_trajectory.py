@@ -21,7 +21,6 @@ from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
 from jaxgran.io.trajectory import (
     Trajectory,
-    check_trajectory,
     read_trajectory,
     write_frame,
     write_trajectory,
@@ -112,15 +111,6 @@ def test_a_state_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
     assert read.packing_fraction == pytest.approx(0.78, rel=1e-14)
 
 
-def test_a_state_in_single_precision_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
-    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, seen[0.3])
-    write_frame(tmp_path / "flow.gsd", single, 0)
-    read = read_trajectory(tmp_path / "flow.gsd")
-    for a, b in zip(jax.tree.leaves(frame_of(read, 0)), jax.tree.leaves(single.state), strict=True):
-        assert a.dtype == np.float32
-        np.testing.assert_array_equal(a, b)
-
-
 def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: Path) -> None:
     path, strains = tmp_path / "flow.gsd", [0.5, 0.512, 0.53]
     states = jax.tree.map(lambda *x: jnp.stack(x), *(one.state for one in seen.values()))
@@ -179,14 +169,6 @@ def test_a_replica_that_is_not_finite_has_no_frames(flow, flowing, drive, tmp_pa
     lost = replace(state, velocities=state.velocities.at[..., 0].set(jnp.nan))
     driven_in_blocks(recorder.recording(drive), flow, lost, (10, 0))
     assert recorder.frames == 0 and not path.exists()
-
-
-def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
-    path = tmp_path / "flow.gsd"
-    recorder = Recorder(0.01, partial(write_frame, path))
-    for steps in (30, 20):
-        driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (steps,))
-        assert len(read_trajectory(path).step) == recorder.frames == 1 + steps // 10
 
 
 def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive) -> None:
@@ -300,18 +282,6 @@ def test_force_and_cluster_of_a_grain_are_those_of_its_bonds(seen, tmp_path: Pat
 # Files of other programs
 
 
-def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
-    lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
-    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
-    write_frame(tmp_path / "flow.gsd", lost, 1)
-    write_frame(tmp_path / "flow.gsd", seen[0.0], 2)
-    with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
-        counts = [frame.bonds.N for frame in file]
-        assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
-        assert not file[1].log["particles/contact_force"].any() and (file[1].log["particles/cluster_size"] == 1).all()
-    assert counts[1] == 0 < min(counts[0], counts[2])
-
-
 def foreign(path: Path, frames: int = 2, **changes) -> Path:
     """A file as another program writes it: single precision, and a cell tilted by more than a half."""
     rng = np.random.default_rng(0)
@@ -351,19 +321,6 @@ def test_a_file_of_another_program_is_read(tmp_path: Path) -> None:
     assert read.packing_fraction == pytest.approx(20 * np.pi * 0.75**2 / 64)
 
 
-def test_diameters_and_masses_that_are_not_told_are_one(tmp_path: Path) -> None:
-    state = read_trajectory(foreign(tmp_path / "x.gsd", particles_diameter=None, particles_mass=None)).state
-    np.testing.assert_array_equal(state.grains.radii, 0.5)
-    np.testing.assert_array_equal(state.grains.masses, 1)
-
-
-def test_a_flow_may_start_at_rest(tmp_path: Path) -> None:
-    """Velocities of zero are those that a file does not tell, unless it never tells any."""
-    path = foreign(tmp_path / "x.gsd", particles_velocity=lambda k: np.full((20, 3), k))
-    read = read_trajectory(path)
-    np.testing.assert_array_equal(read.state.velocities, np.stack([np.zeros((20, 2)), np.ones((20, 2))]))
-
-
 LACKING = {
     "there are no velocities": {"particles_velocity": None},
     "there are no positions": {"particles_position": None},
@@ -391,24 +348,6 @@ def assert_refused(path, words: str) -> None:
 @pytest.mark.parametrize(("words", "changes"), LACKING.items(), ids=LACKING)
 def test_a_file_that_lacks_something_is_refused_in_one_sentence(words: str, changes: dict, tmp_path: Path) -> None:
     assert_refused(foreign(tmp_path / "lacks.gsd", **changes), words)
-
-
-def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
-    content = recorded[0].read_bytes()
-    assert_refused(tmp_path / "none.gsd", "there is no file")
-    assert_refused(tmp_path, "there is no file")
-    assert_refused(3, "path must be a file name")
-    for name, torn in {
-        "empty": b"",
-        "text": b"no trajectory " * 99,
-        "torn": content[:-300],
-        "head": content[:256],
-    }.items():
-        (tmp_path / f"{name}.gsd").write_bytes(torn)
-        assert_refused(tmp_path / f"{name}.gsd", "is not a readable GSD file")
-    with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
-        pass
-    assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
 
 
 # Interruptions
@@ -496,13 +435,6 @@ def test_a_file_is_whole_after_every_frame(flow, flowing, drive, tmp_path: Path)
 
 
 # Where trajectories are written
-
-
-@pytest.mark.parametrize("name", ["flow.nc", "none/flow.gsd", "folder.gsd"])
-def test_a_place_that_does_not_do_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
-    (tmp_path / "folder.gsd").mkdir()
-    with pytest.raises(InputError, match=r"^trajectory must be .*\.$"):
-        check_trajectory(tmp_path / name)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no limit of the size of a file")

@@ -199,14 +199,3 @@ def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> Non
             as_few = sum(comb(40, k) * 0.95**k * 0.05 ** (40 - k) for k in range(within + 1))
             assert len(fresh) == 40
             assert as_few > 0.025
-
-
-def test_what_pages_say_of_the_plane_follows_from_the_table(result: dict) -> None:
-    assert reference.plane(shipped_table()) == result["plane"]
-    page = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
-    plane = result["plane"]
-    worst, share = plane["worst_binary"], plane["0.1"]
-    assert f"{100 * share['share_of_binary']:.0f} % of the part" in page
-    assert f"{100 * share['share']:.0f} %" in page
-    assert f"{100 * plane['0.05']['share']:.0f} %" in page
-    assert f"{-100 * worst['error']:.0f} % too low" in page
