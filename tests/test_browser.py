@@ -147,15 +147,6 @@ def test_map_opens_without_a_network_and_draws_every_point(page) -> None:
     assert list(zip(points["x"], points["y"], strict=True)) == expected
 
 
-def test_verdict_is_that_of_the_chosen_point(map_page) -> None:
-    for row, column in ((0, 1), (1, 2)):
-        choose(map_page, row=row, column=column)
-        point = here(map_page)
-        found = jg.validity(point["restitution"], point["packing_fraction"])
-        assert map_page.find_element("id", "verdict").text == found.verdict()
-        assert table(map_page, "verdict-numbers") == {name: others for name, *others in found.rows()}
-
-
 def test_names_and_attributes_stand_on_the_page_as_text(map_page) -> None:
     assert map_page.find_element("id", "title").text == " ".join(MARKUP.split())
     assert map_page.execute_script("return window.hacked") is None

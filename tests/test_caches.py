@@ -89,9 +89,3 @@ def test_what_the_user_sets_in_jax_stays(tmp_path: Path) -> None:
     ):
         done = first_call(**{name: value})
         assert done.stdout.split() == [folder] * 2, done.stderr
-
-
-def test_python_is_warned_where_programs_are_kept_elsewhere(nothing_for_the_user: Path) -> None:
-    """In a process of its own, as JAX keeps the folder."""
-    done = first_call()
-    assert "UserWarning: the cache folder" in done.stderr and str(nothing_for_the_user) in done.stderr

@@ -186,12 +186,6 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
     assert list(output.parent.iterdir()) == [other]
 
 
-def test_a_file_in_place_of_the_folder_is_one_sentence(output: Path) -> None:
-    output.with_name("map.nc.unfinished").write_text("mine")
-    with refused("a file has this name"):
-        Checkpoint(output, SETTINGS, resume=False)
-
-
 def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch) -> None:
     def no_locks(*_) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -172,18 +172,10 @@ def small_data(small_map) -> xr.DataTree:
 
 def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> None:
     (_, (_, out, err)), data = small_map, small_data
-    assert "dt = 0.001 / shear rate, midpoint activation" in " ".join(out.split())
-    for nu in (0.5, 0.6):
-        rows = [line for line in out.splitlines() if line.split()[:1] == [str(nu)]]
-        ratios = (data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)
-        for row, (ratio, error) in zip(rows, ratios, strict=True):
-            for alpha in (0.5, 0.9):
-                point = {"packing_fraction": nu, "restitution": alpha}
-                assert with_error(float(ratio.sel(point)), float(error.sel(point))) in row
-    assert "points" not in out
-    assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
-    for name in ("small.nc", *PICTURES):
-        assert f"wrote {name}" in err
+    for ratio, error in ((data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)):
+        cells = (with_error(float(x), float(dx)) for x, dx in zip(ratio.values.flat, error.values.flat, strict=True))
+        assert all(cell in out for cell in cells)
+    assert "points" not in out and "4/4 points" in err and "wrote small.nc" in err
 
 
 @pytest.mark.filterwarnings("always:differs from")
@@ -222,49 +214,31 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
     assert outcome.status in (0, 3)
     assert files(folder) == {"flow.nc", "flow.gsd", "flow.gif"}
     strain = read_trajectory(folder / "flow.gsd").strain
-    frames = len(strain)
-    assert frames == 11
     timestep = open_map(folder / "flow.nc").attrs["timestep"]
-    np.testing.assert_allclose(strain, 0.1 * np.arange(frames), atol=0.51 * timestep)
-    assert f"wrote flow.gsd: {frames} frames\n" in outcome.err and f"wrote flow.gif: {frames} frames\n" in outcome.err
+    np.testing.assert_allclose(strain, 0.1 * np.arange(11), atol=0.51 * timestep)
     with Image.open(folder / "flow.gif") as film:
-        assert film.n_frames == frames
+        assert film.n_frames == 11
 
 
 def parsed(text: str) -> dict[str, Any]:
     """The JSON that a command prints: one object, in which every name has the same four keys."""
-
-    def no_constant(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
-    found = json.loads(text, parse_constant=no_constant)
+    found = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert all(list(entry) == ["value", "stderr", "unit", "meaning"] for entry in found.values())
-    assert all(entry["meaning"] for entry in found.values())
     return found
 
 
-def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> None:
+def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
     folder, _ = small_run
     short, as_json = (jaxgran(folder, *SMALL_RUN, "--resume", *more) for more in ((), ("--json",)))
-    table, budget = short.out.split("Relative error, 95 %")
-    assert budget and table.count("±") == 1 + 10  # the heading, and a row for each
-    assert "shear-stress ratio" in table and "iterations" not in table and "Quality" not in table
-    found, data = (
-        parsed(as_json.out),
-        flattened(open_map(folder / "flow.nc")).isel(restitution=0, packing_fraction=0),
-    )
+    assert "shear-stress ratio" in short.out and short.out.count("±") == 1 + 10  # the heading, and a row for each
+    found, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
     for name, one in OBSERVABLES.items():
         np.testing.assert_array_equal(np.array(found[name]["value"], float), data[path_of(name)])  # null is NaN
-        if one.group == "diagnostics":
-            assert found[name]["stderr"] is None
-        else:
+        if one.group != "diagnostics":
             np.testing.assert_array_equal(np.array(found[name]["stderr"], float), data[f"{path_of(name)}_stderr"])
-        assert (found[name]["meaning"], found[name]["unit"]) == (one.meaning, one.unit)
+        assert found[name]["unit"] == one.unit
     assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
-    assert (
-        found["theory/pressure"]["value"] == float(data["theory/pressure"]) and not found["theory/pressure"]["stderr"]
-    )
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
@@ -295,19 +269,14 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     outcome = in_a_process(tmp_path, "info")
     assert (outcome.status, outcome.err) == (0, "")
     lines = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in outcome.out.splitlines() if "  " in line)
-    assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
-    assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
-    assert lines["precision"] == "float64"
-    assert lines["engine"] == "auto takes numba" and lines["solver"].startswith("gauss-seidel")
-    assert lines["jaxgran"].startswith(version("jaxgran"))
-    assert float(lines["memory"].removesuffix(" GiB")) > 0.1
-    assert str(usable_cores()) in lines["cores"]
+    assert {"python", "jax", "jaxlib", "devices", "platform", "processor", "cores", "memory"} <= set(lines)
+    assert lines["precision"] == "float64" and lines["engine"] == "auto takes numba"
+    assert lines["jaxgran"].startswith(version("jaxgran")) and str(usable_cores()) in lines["cores"]
     for name in ("cache folder", "compiled programs", "numba engine", "figures"):
         folder, _, state = lines[name].partition(", ")
         assert Path(folder).is_dir() and state == "works", name
     found = parsed(jaxgran(tmp_path, "info", "--json").out)
     assert {name.replace(" ", "_") for name in lines} == set(found)
-    assert found["python"]["value"] == lines["python"]
 
 
 def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
@@ -319,10 +288,7 @@ def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatc
     assert "cuda" in refused.err
 
 
-# Trajectories and maps that are fitted
-
-
-# Help, completion, colours
+# Help
 
 
 HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (*_, shown) in app.COMMANDS.items()}}
@@ -331,17 +297,13 @@ HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (*_, shown) in app.COM
 @pytest.mark.parametrize("command", HELPS)
 def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path) -> None:
     outcome = jaxgran(tmp_path, *command.split(), "--help")
-    assert outcome.status == 0 and "\x1b" not in outcome.out
-    assert jaxgran(tmp_path, *command.split(), "-h") == outcome
+    assert outcome.status == 0 and jaxgran(tmp_path, *command.split(), "-h") == outcome
     group = typer.main.get_command(app.app)
     assert HELPS[command]
-    for does, example in HELPS[command].items():
-        assert f"  {does}:\n    {example}\n".replace(" ", "") in outcome.out.replace(" ", "")
+    for example in HELPS[command].values():
+        assert example.replace(" ", "") in outcome.out.replace(" ", "")
         first, name, *words = shlex.split(example)
-        assert first == "jaxgran"
-        if "--help" not in words:
-            context = group.commands[name].make_context(name, list(words))
-            assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
+        assert first == "jaxgran" and ("--help" in words or group.commands[name].make_context(name, list(words)))
 
 
 def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
@@ -392,20 +354,16 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
 def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch) -> None:
     points = dict(enumerate(Status))
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda *_: None)
-    monkeypatch.setattr(
-        ratio_map_module, "run_replicas", made_up_replicas({(k, 0): status for k, status in points.items()})
-    )
+    made = made_up_replicas({(k, 0): status for k, status in points.items()})
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made)
     words = ("--restitution", f"0:0.9:{len(points)}", "--packing-fraction", "0.6", "--seeds", "1")
     outcome = jaxgran(tmp_path, "map", *words)
     assert outcome.status == 3
-    assert "Traceback" not in outcome.err and "restitution 0," not in outcome.err
     for k, status in points.items():
         alpha = 0.9 * k / (len(points) - 1)
         named = f"{status.name.replace('_', ' ')} at (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
         assert named == (status != Status.ok), status
-    assert "short sample at (restitution" in outcome.err and "set --strain" in outcome.err
-    rows = [line for line in outcome.out.splitlines() if line.strip().startswith("0.6")]
-    assert [row.count("*") for row in rows] == [len(points) - 1] * 2  # force ratio and shear-stress ratio
+    assert outcome.out.count("*") >= 2 * (len(points) - 1)  # force ratio and shear-stress ratio
 
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch) -> None:
@@ -422,18 +380,13 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
-@pytest.mark.parametrize("words", [(), ("--output", "flow.nc"), ("--error", "0.1")])
-def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(words, tmp_path: Path, monkeypatch) -> None:
+def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
-    flow = (*FLOW.split(), "--quiet", *words)
-    outcome = jaxgran(tmp_path, *flow)
-    assert (outcome.status, outcome.out) == (130, "")
-    *_, last = outcome.err.splitlines()  # after what was chosen
-    assert last == "jaxgran: interrupted; nothing is saved."
-    as_json = jaxgran(tmp_path, *flow, "--json")
-    assert (as_json.status, as_json.err) == (130, outcome.err)
-    found = parsed(as_json.out)
-    assert found["status"]["value"] == "not_run" and found["force_ratio"]["value"] is None
+    flow = (*FLOW.split(), "--quiet", "--output", "flow.nc")
+    outcome, as_json = jaxgran(tmp_path, *flow), jaxgran(tmp_path, *flow, "--json")
+    assert (outcome.status, outcome.out) == (130, "") and (as_json.status, as_json.err) == (130, outcome.err)
+    assert outcome.err == "jaxgran: interrupted; nothing is saved.\n"
+    assert parsed(as_json.out)["force_ratio"]["value"] is None
     assert not files(tmp_path)
 
 

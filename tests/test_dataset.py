@@ -206,12 +206,6 @@ def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: 
     assert open_map(tmp_path / "map.nc").equals(few)
 
 
-def test_missing_seed_does_not_hide_a_bad_status(settings, results) -> None:
-    some = {key: replica for key, replica in results.items() if key in ((0, 1), (2, 0))}
-    status = map_dataset(settings, some, {}).status
-    np.testing.assert_array_equal(status, [[Status.iteration_limit, NOT_RUN], [NOT_RUN, NOT_RUN]])
-
-
 def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     write_dataset(data, tmp_path / "map.nc")
     again = open_map(tmp_path / "map.nc")

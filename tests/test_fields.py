@@ -345,15 +345,6 @@ def test_two_discs_that_collide_have_known_fields(scene) -> None:
     np.testing.assert_allclose(fields.energy, g * (0.5**2 + 3**2 + 2**2), rtol=1e-10)
 
 
-def test_a_void_moves_with_the_mean_flow(scene) -> None:
-    state = scene([[8.5, 8.0]], [[2.0, 2.0]])
-    fields = flight_fields_at(state, jnp.asarray([[15.0, 14.0], [8.6, 8.0]]), heaviside(1.0))
-    np.testing.assert_allclose(fields.velocity, [[14.0, 0.0], [2.0 + 0.0, 2.0]], rtol=1e-14)
-    np.testing.assert_allclose(fields.density, [0, 1 / np.pi])
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(fields))
-    np.testing.assert_allclose(fields.temperature, 0, atol=1e-14)
-
-
 def virial_stress(seen: Snapshot) -> np.ndarray:
     """Σ^{yb} of a step: of the contacts, and of the grains on average over their flight, where c_x falls by γ̇ c_y t."""
     area, dt = float(seen.state.side) ** 2, float(seen.timestep)

@@ -11,8 +11,7 @@ from drawn import write_without_drawing
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
 from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.results import is_finished, open_map
+from jaxgran.maps.results import open_map
 from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
@@ -96,13 +95,6 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp
         for path in unfinished.iterdir():
             path.unlink()
         unfinished.rmdir()
-
-
-def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, *MAP, "--preset", "paper").status == 0
-    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    data = open_map(tmp_path / "jaxgran_map_paper.nc")
-    assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
 
 
 def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:

@@ -95,14 +95,6 @@ def test_instant_is_packed_without_visible_loss() -> None:
     np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
 
 
-@pytest.mark.parametrize(("alphas", "nus"), [(1, 1), (4, 1), (1, 3)])
-def test_map_of_one_point_or_one_row_has_a_page(alphas: int, nus: int) -> None:
-    page = written(jg.explore(ratio_dataset(alphas, nus)))
-    assert [len(axis["values"]) for axis in page["axes"]] == [1, 1, nus, alphas]
-    assert len(page["observables"][0]["value"]) == len(page["status"]) == alphas * nus
-    assert page["again"] is None  # this file does not tell how it was made
-
-
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
     page = map_data(ratio_dataset(1000, 1000))
     axes = [axis["values"] for axis in page["axes"][2:]]

@@ -5,14 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import random_replica, refused
+from synthetic import refused
 
 import jaxgran as jg
-from jaxgran.cli.measure import print_budget
-from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.presets import combined
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.enskog_factors import FACTORS
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
@@ -86,15 +83,3 @@ def test_a_polydispersity_beside_diameters_is_refused_and_that_of_a_file_replace
     with refused("polydispersity must be left out where `diameters` are given, not 0.1"):
         ratio_map(**MAP, diameters=[1.0, RATIO], polydispersity=0.1)
     assert combined({"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}) == {"diameters": (1.0, RATIO)}
-
-
-@pytest.mark.parametrize("sizes", [{}, {"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}])
-def test_intervals_of_other_sizes_say_with_which_sizes_their_laws_were_measured(sizes: dict, capsys) -> None:
-    settings = MapSettings(**{**MAP, "restitution": (0.9,), "packing_fraction": (0.6,), **sizes})
-    replica = random_replica(np.random.default_rng(0), settings)
-    data = map_dataset(settings, {(0, 0): replica}, {})
-    print_budget(data)
-    words = "by laws measured at a polydispersity of 0.26"
-    assert [words in text for text in (data.pressure_ci95.attrs.get("comment", ""), capsys.readouterr().out)] == (
-        [bool(sizes)] * 2
-    )

@@ -183,12 +183,6 @@ def test_seeds_of_one_block_are_independent_and_have_the_error_of_student() -> N
         assert error_of_mean(values) == pytest.approx(usual * stdtrit(seeds - 1, 0.975) / 1.959964, rel=1e-4)
 
 
-def test_error_of_many_independent_blocks_is_the_usual_one() -> None:
-    values = np.random.default_rng(11).normal(size=(64, 32, 20))
-    usual = values.std(axis=(0, 1), ddof=1) / np.sqrt(64 * 32)
-    assert np.mean(error_of_mean(values) / usual) == pytest.approx(1, abs=0.05)
-
-
 @given(
     scale=st.floats(1e-6, 1e6),
     shift=st.floats(-100, 100),
@@ -274,7 +268,3 @@ def test_drift_and_its_error_hold_for_correlated_noise(correlation: float) -> No
     assert abs(differences.mean() - shift) < 4 * differences.std() / np.sqrt(trials)
     covered = np.mean(np.abs(differences - shift) < 2 * errors)
     assert abs(covered - 0.954) < 4 * np.sqrt(0.954 * 0.046 / trials) + 0.01
-
-
-def test_drift_of_a_record_with_nan_is_nan() -> None:
-    assert np.isnan(drift(np.array([1.0, np.nan, 1.0, 1.0]))).all()

@@ -263,22 +263,6 @@ def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, t
     assert bonds | {(b, a) for a, b in bonds} <= touching
 
 
-def test_force_and_cluster_of_a_grain_are_those_of_its_bonds(seen, tmp_path: Path) -> None:
-    """Clusters by a search from each grain along its bonds."""
-    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
-    frame = first_frame(tmp_path / "flow.gsd")
-    force, cluster, size = (frame.log[f"particles/{name}"] for name in ("contact_force", "cluster", "cluster_size"))
-    for grain in range(GRAINS):
-        on_it = (frame.bonds.group == grain).any(axis=1)
-        assert force[grain] == pytest.approx(frame.log["bonds/force"][on_it].sum())
-        reached, new = {grain}, {grain}
-        while new:
-            new = {b for a, b in (*frame.bonds.group, *frame.bonds.group[:, ::-1]) if a in new} - reached
-            reached |= new
-        assert set(np.flatnonzero(cluster == cluster[grain])) == reached and size[grain] == len(reached)
-    assert size.max() > 1
-
-
 # Files of other programs
 
 

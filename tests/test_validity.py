@@ -58,14 +58,6 @@ def test_errors_of_points_left_out_are_those_of_surfaces_without_them() -> None:
         assert expected[k] == pytest.approx(np.hypot(stderr, 0.05), rel=1e-6)
 
 
-def test_a_surface_far_from_its_points_is_as_uncertain_as_its_prior() -> None:
-    surface = a_surface()
-    _, near = surface(surface.points[0])
-    _, far = surface(np.array([30.0, 30.0]))
-    assert near < 0.06
-    assert far > surface.shape.amplitude
-
-
 @settings(max_examples=20, deadline=None)
 @given(ALPHAS, NUS)
 def test_the_series_is_the_theory(alpha: float, nu: float) -> None:

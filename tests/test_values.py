@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import one_sentence, random_tally, refused, snapshot_of
+from synthetic import random_tally, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.batches import equal_values
@@ -118,14 +118,6 @@ def test_dataset_of_a_sample_has_what_was_observed() -> None:
         np.testing.assert_array_equal(data[f"{name}_stderr"][1], samples[1].observed()[1][name])
     with pytest.raises(InputError, match="names that a sample does not have, not 'pressure'"):
         with_observed({"pressure": sums["torque"]}).to_dataset()
-
-
-def test_observed_tells_what_is_missing() -> None:
-    with pytest.raises(InputError, match="made without") as without:
-        SAMPLES[0].observed()
-    with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
-        with_observed({"x": np.ones((2, BLOCKS))}).observed()
-    assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
 
 
 def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None:
