@@ -377,10 +377,7 @@ RUN = ("run", "--restitution", "0.5", "--packing-fraction", "0.6")
 
 
 NO_MAPS: dict[str, xr.Dataset] = {
-    "nothing": xr.Dataset(),
     "no values": ratio_dataset().drop_vars("force_ratio"),
-    "no errors": ratio_dataset().drop_vars("force_ratio_stderr"),
-    "no dimension restitution": ratio_dataset().isel(restitution=0),
     "another dimension": ratio_dataset().expand_dims("seed"),
     "empty": ratio_dataset().isel(restitution=slice(0)),
     "text": ratio_dataset().assign(force_ratio=ratio_dataset().force_ratio.astype(str)),
@@ -421,7 +418,6 @@ GARBAGE: dict[str, Callable[[Path], Any]] = {
     "empty": lambda path: path.write_bytes(b""),
     "signature and noise": lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 16),
     "HDF5 of other things": other_hdf5,
-    "folder": lambda path: path.mkdir(),
     "link to nothing": lambda path: path.symlink_to("none"),
 }
 

@@ -80,21 +80,6 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=rtol, atol=1e-8)
 
 
-def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
-    assert jax.tree.leaves(LAW) == []
-    traced = []
-
-    @jax.jit
-    def pressures(law: jg.ConstitutiveLaw, nus: Any, rate: Any) -> Any:
-        traced.append(law)
-        return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
-
-    nus = jnp.array([0.3, 0.7])
-    for law in (LAW, jg.constitutive_law()):
-        np.testing.assert_allclose(pressures(law, nus, 2.0), LAW(0.6, nus, 2.0).pressure, rtol=1e-9)
-    assert len(traced) == 1  # equal laws are one to the cache
-
-
 def test_arrays_broadcast_with_the_shear_rate() -> None:
     alphas, nus, rates = np.array([[0.3], [0.6]]), np.array([0.2, 0.5, 0.7]), [1.0, 2.0, 3.0]
     flow, compiled = LAW(alphas, nus, rates), jax.jit(LAW)(alphas, nus, np.array(rates))

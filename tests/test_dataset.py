@@ -182,30 +182,6 @@ def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
     assert (nothing.status == NOT_RUN).all()
 
 
-def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: Path) -> None:
-    timesteps = (1e-3, 1e-4)
-    settings = MapSettings(ALPHAS[:1], NUS, grains=64, seeds=SEEDS, timestep=timesteps, strain=2.0)
-    rng = np.random.default_rng(1)
-    keys = [(point, seed) for point in range(4) for seed in range(SEEDS)]
-    results = {key: random_replica(rng, settings, Status.deep_overlap if key[0] == 2 else Status.ok) for key in keys}
-    data = map_dataset(settings, results, {})
-    point = ("timestep", "packing_fraction", "restitution")
-    for name, one in OBSERVABLES.items():
-        assert data[path_of(name)].dims == (*point, *one.axes)
-    assert data.status.dims == point
-    for name in ("seeds/status", "seeds/equilibration_strain"):
-        assert data[name].dims == (*point, "seed")
-    for (k, seed), replica in results.items():
-        there = data.sel(timestep=timesteps[k // 2], packing_fraction=NUS[k % 2], restitution=ALPHAS[0])
-        assert there["seeds/equilibration_strain"][seed] == replica.strain
-        assert there.status == (Status.deep_overlap if k == 2 else Status.ok)
-    assert data.attrs["timestep"] == data.timestep.values.tolist() == list(timesteps)
-    assert data.timestep.attrs["reduced_unit"] == "1 / shear rate"
-    few = with_variables(data, *FEW)
-    write_dataset(few, tmp_path / "map.nc")
-    assert open_map(tmp_path / "map.nc").equals(few)
-
-
 def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     write_dataset(data, tmp_path / "map.nc")
     again = open_map(tmp_path / "map.nc")

@@ -86,23 +86,15 @@ def jg_metric(displacement):
     return space.metric(displacement)
 
 
-def test_derivatives_with_respect_to_the_box_are_right_and_those_of_jax_md_are_not() -> None:
-    """jax-md passes tangents of fractions on as lengths, which suits forces but no deformation."""
-    from jax_md import space
-
+def test_derivatives_with_respect_to_the_box_are_those_of_differences() -> None:
     to, origin, side, dt = jnp.asarray([1.0, 9.0]), jnp.asarray([2.0, 1.0]), 10.0, 1e-6
     ours = jg.jax_md_space(State(None, None, None, jnp.asarray(side), jnp.asarray(0.0))).displacement
-    theirs = space.periodic_general(side * jnp.eye(2), fractional_coordinates=False)[0]
 
-    def box(tilt):
-        return jnp.asarray([[side, 0.0], [0.0, side]]) + tilt * jnp.asarray([[0.0, side], [0.0, 0.0]])
+    def apart(tilt):
+        return ours(to, origin, box=jnp.asarray([[side, 0.0], [0.0, side]]) + tilt * jnp.asarray([[0, side], [0, 0]]))
 
-    found, wrong = (jax.jacfwd(lambda tilt, f=f: f(to, origin, box=box(tilt)))(0.1) for f in (ours, theirs))
-    for function in (ours, theirs):
-        change = (function(to, origin, box=box(0.1 + dt)) - function(to, origin, box=box(0.1 - dt))) / (2 * dt)
-        np.testing.assert_allclose(change, [-side, 0], atol=1e-6)
-    np.testing.assert_allclose(found, [-side, 0], atol=64 * EPS * side)
-    assert abs(wrong[0] + side) > 1
+    np.testing.assert_allclose((apart(0.1 + dt) - apart(0.1 - dt)) / (2 * dt), [-side, 0], atol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(apart)(0.1), [-side, 0], atol=64 * EPS * side)
 
 
 def test_grains_that_are_shifted_stay_in_the_cell(state: State) -> None:

@@ -135,14 +135,11 @@ def test_float32_is_refused_where_it_cannot_resolve_the_time_step(state) -> None
     check_precision(replace(FLOWS[0], timestep=1e-5), state)  # float64 resolves it
 
 
-@pytest.mark.parametrize(("name", "value"), [("packing_fraction", 0.601), ("polydispersity", 0.2)])
-def test_a_flow_that_is_not_that_of_the_state_is_refused(state, name: str, value: float) -> None:
-    right = getattr(FLOWS[0], name)
-    with refused(f"^{name} must be {right}, which the state has, not {value}: "):
-        sample(replace(FLOWS[0], **{name: value}), state, STRAIN)
-    require_match(FLOWS[0], state)
+def test_a_flow_that_is_not_that_of_the_state_is_refused(state) -> None:
+    for name, value in (("packing_fraction", 0.601), ("polydispersity", 0.2)):
+        with refused(f"^{name} must be {getattr(FLOWS[0], name)}, which the state has, not {value}: "):
+            sample(replace(FLOWS[0], **{name: value}), state, STRAIN)
     require_match(FLOWS[0], in_float32(state))
-    jax.eval_shape(lambda nu: require_match(replace(FLOWS[0], packing_fraction=nu), state), 0.8)  # it is traced
 
 
 def test_a_sample_below_four_correlation_strains_says_so_however_it_is_taken(state) -> None:

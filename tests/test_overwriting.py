@@ -97,22 +97,6 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp
         unfinished.rmdir()
 
 
-def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(
-        ratio_map_module, "run_replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)})
-    )
-    names = {"jaxgran_map_curves.png", "jaxgran_map_timestep.png", "jaxgran_map_clusters.png"}
-    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3,1e-4").status == 0
-    assert files(tmp_path) >= names
-    (tmp_path / "jaxgran_map_notes.png").touch()
-    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc").status == 0
-    assert files(tmp_path) >= names
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
-    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
-    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
-    assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
-
-
 def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_path: Path) -> None:
     names = ("jaxgran_map_timestep.pdf", "other_theory.pdf", "other_theory.svg")
     for name in names:  # none of which is a picture of these maps

@@ -10,7 +10,6 @@ from flows import in_batches
 from synthetic import random_replica, random_state
 
 from jaxgran.maps import run_replicas as run_replicas_module
-from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, open_map, write_dataset
@@ -61,19 +60,6 @@ def kept(settings: MapSettings) -> dict[Key, Replica]:
     rng = np.random.default_rng(0)
     found = {(point, 0): random_state(point, 20 + point) for point in (0, 1, 3)}
     return {(p, s): random_replica(rng, settings)._replace(state=found.get((p, s))) for p in range(4) for s in (0, 1)}
-
-
-def test_checkpoint_gives_back_the_states(tmp_path: Path) -> None:
-    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
-    written = kept(settings)
-    run = Checkpoint(tmp_path / "map.nc", settings, resume=False)
-    run.add(written)
-    run.close(finished=False)
-    resumed = Checkpoint(tmp_path / "map.nc", settings, resume=True)
-    resumed.close(finished=True)
-    assert set(resumed.done) == set(written)
-    for key, replica in written.items():
-        jax.tree.map(np.testing.assert_array_equal, resumed.done[key], replica)
 
 
 def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:

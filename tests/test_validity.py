@@ -22,7 +22,6 @@ from jaxgran.theory import gaussian_moments, navier_stokes
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 ALPHAS, NUS = st.floats(0.1, 0.98), st.floats(0.1, 0.82)
-FLOWS = [(0.7, 0.6), (0.98, 0.5), (0.1, 0.82), (0.5, 0.75), (0.3, 0.2)]
 
 
 @pytest.fixture(scope="module")
@@ -172,11 +171,10 @@ def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: 
         assert printed[f"{name}_ci95"]["value"] == pytest.approx(ci95, rel=VARIANCE_ROUNDING)
 
 
-@pytest.mark.parametrize(("alpha", "nu"), FLOWS)
-def test_the_command_says_the_verdict_and_every_average(alpha: float, nu: float, tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path, "where", "--restitution", str(alpha), "--packing-fraction", str(nu))
+def test_the_command_says_the_verdict_and_every_average(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "where", "--restitution", "0.5", "--packing-fraction", "0.75")
     assert outcome.status == 0
-    assert jg.validity(alpha, nu).verdict() in outcome.out
+    assert jg.validity(0.5, 0.75).verdict() in outcome.out
     assert all(name.replace("_", " ") in outcome.out for name in (*MEASURED, "force_ratio"))
 
 
