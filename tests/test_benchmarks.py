@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import __main__ as door
 from benchmarks import output
 from benchmarks.registry import BENCHMARKS
 
@@ -37,28 +36,3 @@ def test_run_takes_the_options_of_the_registry(benchmark) -> None:
     assert [one.name for one in others] == options
     assert all(one.default is not one.empty for one in others)
     assert f"python -m benchmarks {benchmark.name}" in module.__doc__
-
-
-def test_a_full_run_is_refused_from_a_changed_tree(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    """A quick run is not refused, nor one that is asked for; what is left behind is nothing."""
-    runs = []
-    monkeypatch.setattr(door, "set_up", lambda one_core: None)
-    monkeypatch.setattr(door, "import_module", lambda name: type("made", (), {"run": staticmethod(runs.append)}))
-    monkeypatch.setattr(output, "uncommitted", lambda: ["jaxgran/model/flow.py", "notes.txt"])
-    words = ["validation", "--output", str(tmp_path / "results")]
-    with pytest.raises(SystemExit) as end:
-        door.main(words)
-    assert end.value.code == 2
-    said = capsys.readouterr().err
-    assert "jaxgran/model/flow.py and 1 more" in said and "--allow-uncommitted" in said
-    assert said.count("\n") == 1 and said.endswith(".\n")
-    assert not runs and not (tmp_path / "results").exists()
-    door.main([*words, "--quick"])
-    door.main([*words, "--allow-uncommitted"])
-    assert [one.quick for one in runs] == [True, False]
-    assert runs[1].hardware["commit"].endswith("-dirty")
-    monkeypatch.setattr(output, "uncommitted", list)
-    door.main(words)
-    assert not runs[2].hardware["commit"].endswith("-dirty")

@@ -158,7 +158,6 @@ def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> N
 
 
 def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) -> None:
-    """And all that was known."""
     run = Checkpoint(output, SETTINGS, resume=False)
     first, second, _ = batches()
     run.add(first)

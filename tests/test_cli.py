@@ -45,7 +45,6 @@ from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
-from jaxgran.plotting import movie
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
@@ -123,23 +122,6 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(command: str, accep
     assert_one_sentence(outcome)
     assert accepted in outcome.err
     assert files(folder) == before
-
-
-@pytest.mark.parametrize("name", app.COMMANDS)
-def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder: Path) -> None:
-    """Whatever an option is for, what it cannot be is refused in its name."""
-    command = typer.main.get_command(app.app).commands[name]
-    for parameter in command.params:
-        option = parameter.opts[0]
-        if option.startswith("--") and parameter.name not in ("help", "scheduler"):
-            wrong = f"{option}=" if getattr(parameter, "is_flag", False) else f"{option}=no\nsuch"
-            needed = {"run": FLOW.split()[1:], "map": [], "info": [], "merge": ["text.nc", "-o", "a.nc"]}
-            needed |= {"where": ["--restitution", "0.5", "--packing-fraction", "0.5"]}
-            needed = needed.get(name, ["text.nc"])
-            outcome = jaxgran(folder, name, *needed, wrong)
-            assert outcome.status == 2 and "Traceback" not in outcome.err, outcome
-            of_files = ("output", "trajectory", "movie", "page", "from_map")  # read after what is required
-            assert option in outcome.err or parameter.name in of_files, outcome.err
 
 
 # What the commands do
@@ -304,15 +286,6 @@ def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path
         assert example.replace(" ", "") in outcome.out.replace(" ", "")
         first, name, *words = shlex.split(example)
         assert first == "jaxgran" and ("--help" in words or group.commands[name].make_context(name, list(words)))
-
-
-def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
-    words = "run --restitution 0.5 --packing-fraction 0.6 --movie flow.mp4"
-    outcome = jaxgran(tmp_path, *words.split())
-    assert_one_sentence(outcome)
-    assert "use .gif, or install ffmpeg" in outcome.err
-    assert not files(tmp_path)
 
 
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:

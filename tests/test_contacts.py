@@ -92,15 +92,6 @@ def test_rule_and_time_of_first_contact_agree(seed):
         np.testing.assert_array_equal(np.asarray(approaching)[decided], (time <= look_ahead)[decided])
 
 
-def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
-    separations, reach = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.9]]), np.array([1.0, 0.99, 1.0])
-    contact, approaching = is_contact(motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2))
-    np.testing.assert_array_equal(contact, [True, False, True])
-    assert not np.any(approaching)
-    time, _ = first_contact_time(motion(separations, np.zeros((3, 2))), reach)
-    assert np.all(np.isinf(time))
-
-
 @pytest.mark.parametrize("slots", [4, 16])
 def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     separations, velocities, _ = flights(0)

@@ -367,7 +367,6 @@ def test_momentum_through_planes_of_all_heights_is_the_virial_stress(seen) -> No
 
 
 def test_branches_in_several_blocks_are_all_counted(seen, points, monkeypatch) -> None:
-    """In a series of snapshots, too."""
     graining, series = SMOOTH["lucy"], jax.tree.map(lambda x: x[None], seen)
     whole = fields_at(seen, points, graining)
     monkeypatch.setattr("jaxgran.analysis.fields._BRANCHES_AT_ONCE", 7)

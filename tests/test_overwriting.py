@@ -3,16 +3,13 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from drawn import write_without_drawing
 
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.results import open_map
-from jaxgran.maps.settings import MapSettings
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
 from jaxgran.sampling.budget import BUDGET
@@ -148,15 +145,3 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     assert_one_sentence(outcome)
     assert f"--{option} {file.name!r} already exists; pass --overwrite" in outcome.err
     assert files(tmp_path) == {file.name}
-
-
-def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
-    first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
-    outcome = jaxgran(tmp_path, *RUN)
-    assert_one_sentence(outcome)
-    assert "another process is writing 'flow.nc'" in outcome.err
-    first.close(finished=True)
-    assert jaxgran(tmp_path, *RUN).status == 0
-    assert files(tmp_path) == {"flow.nc"}
-    np.testing.assert_array_equal(open_map(tmp_path / "flow.nc").status, [[Status.ok]])

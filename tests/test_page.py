@@ -17,7 +17,6 @@ from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
 from jaxgran.maps.schema import flattened, path_of
-from jaxgran.model.checks import InputError
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
 from jaxgran.reference.table import MEASURED, Table, shipped_table
@@ -103,12 +102,6 @@ def test_million_points_are_thinned_with_a_word_about_it() -> None:
     (note,) = page["notes"]
     assert one_sentence(note.replace("points. This", "points: this")) and "1000000 points" in note
     assert len(map_data(ratio_dataset(1, 100_000))["status"]) == MOST_POINTS
-
-
-def test_a_page_without_plotly_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
-    with pytest.raises(InputError, match="pip install 'jaxgran\\[explore\\]'"):
-        jg.explore(ratio_dataset())
 
 
 def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:

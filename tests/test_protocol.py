@@ -157,6 +157,25 @@ def test_preparation_of_a_replica_does_not_depend_on_the_time_steps_of_the_other
         assert (together.strain[k], together.status[k]) == (alone.strain[0], alone.status[0])
 
 
+def test_flow_is_steady_by_the_last_two_thirds_of_its_record(monkeypatch) -> None:
+    """A jump before the sixth chunk is out of them after fifteen chunks; twelve are the fewest."""
+    series = iter([5.0] * 5 + [0.001, -0.001] * 30)
+    monkeypatch.setattr(steady_state, "_chunk", lambda batch, *_: (batch, None))
+    monkeypatch.setattr(
+        steady_state,
+        "_averages",
+        lambda *_: dict.fromkeys(("granular_temperature", "pressure"), np.exp([next(series)])),
+    )
+    flow = stack([ShearFlow(32, 0.5, 0.6, 1e-3)])
+    state: Any = SimpleNamespace(side=np.array([6.0]))
+    monkeypatch.setattr(steady_state, "_correlation_strain", lambda batch, _: batch.correlation_strain)
+    end = steady_state._until_steady(
+        Batch(flow, Numerics(), state, np.zeros(1, int), np.zeros(1), np.array([4.0])), None
+    )
+    assert end.status[0] == Status.ok
+    assert end.strain[0] == pytest.approx(15 * 1.0)
+
+
 def test_coarse_time_step_is_never_shorter_than_the_one_asked_for() -> None:
     flow = with_timesteps(1e-4, 2e-2)
     coarse = np.asarray(timestep.bounded_coarse_timestep(flow, predicted(flow)))

@@ -266,8 +266,6 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
     assert set(choices_of(data)["grains"]) == {32, 64} and choices_of(data.sel(grains=64))["grains"] == 64
 
 
-
-
 def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:
     assert list(inspect.signature(ratio_map).parameters) == [row.name for row in fields(RunParameters)]
     for row in fields(RunParameters):

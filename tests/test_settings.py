@@ -101,24 +101,12 @@ def test_a_given_tolerance_is_that_of_the_solver() -> None:
 
 def test_the_command_and_the_function_start_alike() -> None:
     """What is left to Python has no text form, and what is left to the command is about figures and the terminal."""
-    python = {one.name for one in fields(RunParameters)}
-    python_only = {
-        "observe",
-        "grains_by_point",
-        "progress",
-        "record",
-        "attributes",
-    }
-    assert set(MAP_OPTIONS) - {"format", "quiet"} == python - python_only
+    python_only = {"observe", "grains_by_point", "progress", "record", "attributes"}
+    assert set(MAP_OPTIONS) - {"format", "quiet"} == {one.name for one in fields(RunParameters)} - python_only
     assert with_start({}) == PRESETS["quick"]
     assert with_start({"error": 0.1}).items() >= {"grains": "auto", "timestep": "auto", "seeds": 1}.items()
     assert with_start({"preset": "paper", "seeds": 3})["seeds"] == 3
-    for wrong in (
-        {"preset": "slow"},
-        {"preset": "quick", "from_map": "map.nc"},
-        {"from_map": 3},
-        {"from_map": "no.nc"},
-    ):
+    for wrong in ({"preset": "slow"}, {"preset": "quick", "from_map": "map.nc"}, {"from_map": "no.nc"}):
         with refused():
             with_start(wrong)
 

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from synthetic import refused
 
 import jaxgran as jg
 from jaxgran.maps.presets import combined
@@ -79,7 +78,5 @@ def test_other_sizes_are_another_map(bidisperse: xr.DataTree) -> None:
         ratio_map(**MAP, snapshots=True, output=output)
 
 
-def test_a_polydispersity_beside_diameters_is_refused_and_that_of_a_file_replaced() -> None:
-    with refused("polydispersity must be left out where `diameters` are given, not 0.1"):
-        ratio_map(**MAP, diameters=[1.0, RATIO], polydispersity=0.1)
+def test_a_polydispersity_of_a_file_is_replaced_by_diameters() -> None:
     assert combined({"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}) == {"diameters": (1.0, RATIO)}

@@ -1,6 +1,6 @@
 """States, flows, samples and snapshots are values: compared, indexed and counted, and their averages are attributes."""
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,7 +10,6 @@ import pytest
 from synthetic import random_tally, refused, snapshot_of
 
 import jaxgran as jg
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES
@@ -52,15 +51,6 @@ def test_equal_flows_have_equal_hashes_however_they_name_the_rule() -> None:
 def test_values_that_jax_traces_are_not_compared() -> None:
     with refused("cannot be compared while JAX traces them"):
         jax.jit(lambda state: state == SERIES.state)(SERIES.state)
-
-
-def test_no_public_value_compares_arrays_by_their_truth() -> None:
-    public = (getattr(jg, name) for name in jg.__all__)
-    values = [one for one in public if isinstance(one, type) and is_dataclass(one)]
-    of_arrays = [one for one in values if any("rray" in str(field.type) for field in fields(one))]
-    assert len(of_arrays) > 12 and {jg.State, jg.Fields} <= {*of_arrays}
-    solvers = {one for one in of_arrays if issubclass(one, jg.ProjectedMethod)}  # they hold single numbers
-    assert {one for one in of_arrays if one.__eq__ is not equal_values} <= solvers
 
 
 @pytest.mark.parametrize("name", INDEXED)
