@@ -292,7 +292,9 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "jax.vmap": lambda: solving(EVEN, approach=np.ones((1, 2))),
     "approach must be finite": lambda: solving(EVEN, approach=np.array([np.nan, 1.0])),
     "symmetric": lambda: solving(EVEN, matrix=np.eye(2) + np.eye(2, k=1)),
-    "no negative eigenvalue": lambda: solving(EVEN, matrix=np.full((2, 2), 2.0) - np.eye(2)),
+    "no negative eigenvalue": lambda: jg.solve_contacts(
+        jg.DelassusProblem(np.eye(3) - 0.6 * (1 - np.eye(3)), -np.ones(3))
+    ),
     "must have entries": lambda: solving(EVEN, matrix=scipy.sparse.csr_array((2, 2))),
     "masses must be positive": lambda: solving(PAIR, masses=np.zeros(2)),
     "two walls": lambda: solving(PAIR, masses=np.full(2, np.inf)),
@@ -314,6 +316,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "at least 0 and at most 1e+06": lambda: make_map("equilibrate", 1e30),
     "a ProjectedMethod, such as": lambda: make_map("solver", "gauss"),
     "tolerance must be between": lambda: make_map("tolerance", 1.0),
+    "`strain` and `error` exclude each other": lambda: map_of(strain=5.0, error=0.02),
     "snapshots must be True or False": lambda: make_map("snapshots", 1),
     "jg.Jax(), jg.Numba() or None": lambda: make_map("engine", "jax"),
     "with the solver jacobi, not numba": lambda: map_of(engine=jg.Numba(), solver=jg.Jacobi()),
@@ -350,6 +353,10 @@ REFUSED: dict[str, Callable[[], Any]] = {
     ),
     "movie must be": lambda: check_movie(Path("flow.avi")),
     "trajectory must be": lambda: check_trajectory(Path("flow.nc")),
+    "seen must be a flow of finite positions": lambda: jg.flow_figure(
+        replace(SEEN, state=replace(SEEN.state, positions=np.nan * SEEN.state.positions))
+    ),
+    "path must be a file name": lambda: jg.read_trajectory(3),
     "there is no file": lambda: jg.read_trajectory("none.gsd"),
     "have shapes that broadcast, not (2,) and (3,)": lambda: jg.validity([0.5, 0.6], [0.5, 0.6, 0.7]),
 }

@@ -6,8 +6,10 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from matplotlib.text import Text
 
 from benchmarks import output
+from benchmarks.draw import PICTURES
 from benchmarks.registry import BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
@@ -36,3 +38,12 @@ def test_run_takes_the_options_of_the_registry(benchmark) -> None:
     assert [one.name for one in others] == options
     assert all(one.default is not one.empty for one in others)
     assert f"python -m benchmarks {benchmark.name}" in module.__doc__
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_picture_of_a_result_has_the_width_of_a_column_or_two_and_text_that_can_be_read(name: str) -> None:
+    figure = PICTURES[name]()
+    figure.draw_without_rendering()
+    assert figure.get_figwidth() * 2.54 in (pytest.approx(8.5), pytest.approx(17))
+    texts = [text for text in figure.findobj(Text) if text.get_text().strip() and text.get_visible()]
+    assert min(text.get_fontsize() for text in texts) >= 6.99

@@ -116,6 +116,10 @@ def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -
     assert {"map", "grains", "timestep", "ci95", "units", *(f"unit of {x}" for x in (*MEASURED, LENGTH))} <= {*head}
     LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
     assert read_columns(tmp_path / "law.csv")[1]["restitution"].tolist() == [0.5, 0.6]
+    text = (tmp_path / "law.csv").read_text(encoding="utf-8")
+    (tmp_path / "law.csv").write_text(text.replace("format_version: 1", "format_version: 7"), encoding="utf-8")
+    with pytest.raises(jg.InputError, match="reads format_version 1"):
+        read_columns(tmp_path / "law.csv")
 
 
 def test_the_layer_of_the_page_is_in_mechanical_balance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,3 +125,8 @@ def test_global_plotting_state_is_untouched(tmp_path: Path) -> None:
     save_figures(ratio_dataset(), tmp_path / "map")
     assert dict(rcParams) == before
     assert not _pylab_helpers.Gcf.get_all_fig_managers()
+
+
+def test_a_notebook_shows_a_figure_though_no_plotting_state_exists() -> None:
+    figure = ratio_contours(ratio_dataset())
+    assert figure._repr_png_().startswith(b"\x89PNG")

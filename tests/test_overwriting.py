@@ -51,6 +51,8 @@ def finished(original: Path, tmp_path: Path) -> bytes:
 
 
 def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finished: bytes, tmp_path: Path) -> None:
+    for name in ("timestep", "notes"):  # a picture of an earlier map, and one of the user's
+        (tmp_path / f"jaxgran_map_{name}.png").touch()
     before = files(tmp_path)
     outcome = jaxgran(tmp_path, *MAP, "--strain", "9", "--grains", "64")
     assert_one_sentence(outcome)
@@ -58,6 +60,7 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
+    assert "jaxgran_map_timestep.png" not in files(tmp_path) and "jaxgran_map_notes.png" in files(tmp_path)
 
 
 def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import jaxgran
-from made_up_maps import ratio_dataset
+from made_up_maps import ratio_dataset, with_grains
 from pages import MARKUP, page_map
 from synthetic import one_sentence, random_instant
 
@@ -65,6 +65,8 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
         if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
             assert_same_numbers(one["samples"], (strain / correlated).values)
+    ratio = data.force_ratio.transpose(*dims).values
+    assert_same_numbers(by_name["excess"]["value"], ratio - 1)
     assert [axis["values"] for axis in found["axes"]] == [[64], [5e-4, 1e-3], [0.5, 0.6], [0.5, 0.7, 0.9]]
     assert not [name for name in by_name if re.search("_stderr|_seed|ci95|snapshot|status", name)]
 
@@ -92,6 +94,13 @@ def test_instant_is_packed_without_visible_loss() -> None:
     np.testing.assert_allclose(radius / 255 * packed["radius"], one.radii, atol=one.radii.max() / 500)
     np.testing.assert_allclose(speed / 255, np.minimum(one.speed / scale.speed, 1), atol=1 / 500)
     np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
+
+
+def test_numbers_of_grains_are_an_axis_or_stand_at_their_points() -> None:
+    data = ratio_dataset(2, 2)
+    assert map_data(with_grains(data, 64, 256))["axes"][0]["values"] == [64, 256]
+    page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
+    assert page["grains"] == [64, 90, 128, 256]
 
 
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
@@ -172,3 +181,9 @@ def test_explore_without_a_file_writes_the_reference_map(tmp_path: Path) -> None
 
 def flows_of(table: Table) -> list[tuple[float, float]]:
     return list(zip(table.columns["restitution"], table.columns["packing_fraction"], strict=True))
+
+
+def test_a_page_without_plotly_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    with pytest.raises(jg.InputError, match="pip install 'jaxgran\\[explore\\]'"):
+        jg.explore(ratio_dataset())

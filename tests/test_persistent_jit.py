@@ -125,3 +125,12 @@ def test_folder_that_cannot_be_written_costs_a_warning(tmp_path: Path, monkeypat
     with pytest.warns(UserWarning, match="compiled programs are not cached"):
         found = counted([])(*ARGUMENTS)
     np.testing.assert_array_equal(found["sum"], [1.0, 2.0, 3.0])
+
+
+def test_content_that_is_no_program_is_compiled_again(folder: Path) -> None:
+    traces: list = []
+    counted(traces)(*ARGUMENTS)
+    (path,) = folder.iterdir()
+    files.write_cached(path, b"whole, but no program", 8)
+    counted(traces)(*ARGUMENTS)
+    assert len(traces) == 2

@@ -10,6 +10,7 @@ from flows import in_batches
 from synthetic import random_replica, random_state
 
 from jaxgran.maps import run_replicas as run_replicas_module
+from jaxgran.maps.checkpoint import Checkpoint
 from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.replica import Key, Replica
 from jaxgran.maps.results import choices_of, open_map, write_dataset
@@ -83,3 +84,16 @@ def test_state_of_a_batch_that_continues_from_its_journal_is_the_same(with_state
         assert (tmp_path / "journal.nc").exists() == journal_there
         done = dict(run_replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
         jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_states[1, 0])
+
+
+def test_checkpoint_gives_back_the_states(tmp_path: Path) -> None:
+    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
+    written = kept(settings)
+    run = Checkpoint(tmp_path / "map.nc", settings, resume=False)
+    run.add(written)
+    run.close(finished=False)
+    resumed = Checkpoint(tmp_path / "map.nc", settings, resume=True)
+    resumed.close(finished=True)
+    assert set(resumed.done) == set(written)
+    for key, replica in written.items():
+        jax.tree.map(np.testing.assert_array_equal, resumed.done[key], replica)

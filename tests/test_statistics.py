@@ -268,3 +268,10 @@ def test_drift_and_its_error_hold_for_correlated_noise(correlation: float) -> No
     assert abs(differences.mean() - shift) < 4 * differences.std() / np.sqrt(trials)
     covered = np.mean(np.abs(differences - shift) < 2 * errors)
     assert abs(covered - 0.954) < 4 * np.sqrt(0.954 * 0.046 / trials) + 0.01
+
+
+def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
+    ones = np.ones((2, 8))
+    assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
+    few = np.random.default_rng(8).normal(size=(2, 3))
+    assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])

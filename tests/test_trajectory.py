@@ -323,11 +323,14 @@ def test_a_file_that_lacks_something_is_refused_in_one_sentence(words: str, chan
     assert_refused(foreign(tmp_path / "lacks.gsd", **changes), words)
 
 
-def test_a_torn_file_is_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
+def test_a_torn_file_and_one_of_another_schema_are_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
     content = recorded[0].read_bytes()
     for torn in (b"", b"no trajectory " * 99, content[:-300], content[:256]):
         (tmp_path / "torn.gsd").write_bytes(torn)
         assert_refused(tmp_path / "torn.gsd", "is not a readable GSD file")
+    with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
+        pass
+    assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
 
 
 # Interruptions

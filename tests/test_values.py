@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import random_tally, refused, snapshot_of
+from synthetic import one_sentence, random_tally, refused, snapshot_of
 
 import jaxgran as jg
 from jaxgran.model.checks import InputError
@@ -115,3 +115,11 @@ def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None
     assert np.shape(states.grains.radii) == (5,)
     assert states[1] == SERIES.state[1]
     assert states[1:3] == SERIES.state[1:3]
+
+
+def test_observed_tells_what_is_missing() -> None:
+    with pytest.raises(InputError, match="made without") as without:
+        SAMPLES[0].observed()
+    with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
+        with_observed({"x": np.ones((2, BLOCKS))}).observed()
+    assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
