@@ -57,14 +57,6 @@ def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float)
     assert area_within(grains, cell) == pytest.approx(GRAINS * np.pi / 4 / SIDE**2, rel=2e-3)
 
 
-@pytest.mark.parametrize("tilt", [-0.4, 0.25])
-def test_cell_is_the_sheared_one_around_the_origin(tilt: float) -> None:
-    corners = drawn(scene_of(seen(tilt)))[-1].get_xy()[:4]
-    np.testing.assert_allclose(corners.mean(axis=0), 0, atol=1e-12)
-    np.testing.assert_allclose(corners[1] - corners[0], [SIDE, 0])
-    np.testing.assert_allclose(corners[3] - corners[0], [tilt * SIDE, SIDE])
-
-
 def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -> None:
     scene = scene_of(seen(0.2))
     _, clusters, binaries, _ = drawn(scene, Scale(1.0, 2.0))

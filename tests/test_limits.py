@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.dense_limit import fit
 from benchmarks.size_limits import (
     AVERAGES,
     Flow,
@@ -45,16 +44,3 @@ def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logar
     assert found["chi_squared"]["ln N"] > found["best"][1] + 50
     for flow, one in zip(flows, limits_of(flows, found["interval"]), strict=True):
         assert one["interval"][0] - 4e-3 < 2 < one["interval"][1] + 4e-3, flow
-
-
-def test_dense_fit_with_a_correction_finds_the_limit_within_its_error() -> None:
-    rng, number = np.random.default_rng(1), np.geomspace(0.02, 0.17, 16)
-    found = []
-    for _ in range(200):
-        measured = number * (1 + 0.02 * rng.normal(size=16))
-        fraction = 0.8435 - 0.06 * number**0.4 - 0.17 * number
-        found.append(fit(measured, 0.02 * measured, fraction, np.zeros(16), 0.4, 1.0))
-    offsets, errors = np.array([one[:2] for one in found]).T
-    assert offsets.mean() == pytest.approx(0.8435, abs=0.3 * errors.mean())
-    assert 0.7 < offsets.std() / errors.mean() < 1.3
-    assert np.mean([one.reduced_chi_squared for one in found]) == pytest.approx(1, abs=0.15)

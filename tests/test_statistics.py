@@ -275,3 +275,13 @@ def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
     assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
     few = np.random.default_rng(8).normal(size=(2, 3))
     assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])
+
+
+def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
+    sums = correlated_blocks(np.random.default_rng(4), 1, 16)
+    all_merges = error_of_ratio(sums)
+    single = []
+    for merge in (1, 2, 4):
+        monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
+        single.append(error_of_ratio(sums))
+    assert all_merges == max(single)
