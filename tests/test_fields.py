@@ -373,3 +373,12 @@ def test_branches_in_several_blocks_are_all_counted(seen, points, monkeypatch) -
     fewer = points[:-1]  # another shape, so that it is compiled anew
     cut = lax.map(lambda one: fields_at(one, fewer, graining), series)
     assert_same(jax.tree.map(lambda x: x[0], cut), jax.tree.map(lambda x: x[:-1], whole), 1e-11)
+
+
+def test_a_void_moves_with_the_mean_flow(scene) -> None:
+    state = scene([[8.5, 8.0]], [[2.0, 2.0]])
+    fields = flight_fields_at(state, jnp.asarray([[15.0, 14.0], [8.6, 8.0]]), heaviside(1.0))
+    np.testing.assert_allclose(fields.velocity, [[14.0, 0.0], [2.0 + 0.0, 2.0]], rtol=1e-14)
+    np.testing.assert_allclose(fields.density, [0, 1 / np.pi])
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(fields))
+    np.testing.assert_allclose(fields.temperature, 0, atol=1e-14)

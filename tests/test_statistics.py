@@ -285,3 +285,8 @@ def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
         monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
         single.append(error_of_ratio(sums))
     assert all_merges == max(single)
+
+
+def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:
+    """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means have half of it."""
+    assert drift(np.array([0.0, 2.0, 5.0, 7.0])) == (5.0, pytest.approx(np.sqrt(4 / 2)))
