@@ -141,3 +141,18 @@ def test_the_layer_of_the_page_is_in_mechanical_balance(tmp_path: Path, monkeypa
     assert LAW(0.6, float(dense), 1.5).pressure == pytest.approx(20.0)
     slope = jax.grad(lambda nu: LAW(0.6, nu, 1.5).pressure)(dense)
     assert jax.grad(names["at_pressure"])(20.0, 0.6, 1.5) == pytest.approx(float(1 / slope))
+
+
+def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
+    assert jax.tree.leaves(LAW) == []
+    traced = []
+
+    @jax.jit
+    def pressures(law: jg.ConstitutiveLaw, nus: Any, rate: Any) -> Any:
+        traced.append(law)
+        return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
+
+    nus = jnp.array([0.3, 0.7])
+    for law in (LAW, jg.constitutive_law()):
+        np.testing.assert_allclose(pressures(law, nus, 2.0), LAW(0.6, nus, 2.0).pressure, rtol=1e-9)
+    assert len(traced) == 1  # equal laws are one to the cache
