@@ -88,6 +88,7 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
 FLOW = "run --restitution 0.5 --packing-fraction 0.6"
 MISTAKES = {  # one for each kind of option, check and file
     "map --restitution ''": "--restitution must be a number or a list",
+    "map --restitution 0.1:0.9:1": "--restitution must be a number or a list",
     "map --grains auto": "--grains auto requires --error",
     f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
