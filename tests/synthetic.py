@@ -103,9 +103,3 @@ def snapshot_of(positions, contacts=None, velocities=None, radii=0.5, side=40.0,
     velocities = np.zeros_like(positions) if velocities is None else velocities
     state = State(Grains(radii, masses), positions, velocities, side * every, tilt * every)
     return Snapshot(state, network, impulses, every, shear_rate * every, 0.5 * every, 0 * time[:, 0])
-
-
-def assert_within_errors(measured, expected, least: float = 0.0, errors: float = 4.0) -> None:
-    """Every value is the expected one within four standard errors, or within ``least``."""
-    value, error = measured[-2:]
-    np.testing.assert_array_less(np.abs(value - expected), np.maximum(errors * error, least) + 1e-12)

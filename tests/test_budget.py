@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxgran.sampling.budget import BUDGET, SHARES, SIZE_LAWS, error_budget, fewest_grains, size_error
+from jaxgran.sampling.budget import BUDGET, SHARES, SIZE_LAWS, SizeLaw, error_budget, fewest_grains, size_error
 from jaxgran.sampling.timestep import stress_error
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
@@ -66,3 +66,8 @@ def test_law_of_the_size_is_the_fitted_one_and_its_bound_holds(average: str) -> 
 
 def test_shares_of_an_error_add_up_to_it():
     assert sum(share**2 for share in SHARES.values()) == pytest.approx(1, rel=1e-12)
+
+
+def test_missing_part_is_that_of_its_formula():
+    law = SizeLaw(exponent=0.5, elastic=0.01, dissipative=0.1, density=1.0, end=0.82)
+    assert law.missing(0.4, 0.77, 400) == pytest.approx((0.01 + 0.06) * np.exp(0.27) * 0.5 * 2)

@@ -48,27 +48,6 @@ def test_a_temporary_folder_of_others_is_not_used(nothing_for_the_user: Path) ->
     assert cache.cache_folder() is None
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_a_command_says_once_where_programs_are_kept(nothing_for_the_user: Path, shared: bool) -> None:
-    folder = nothing_for_the_user / f"jaxgran-{os.getuid()}"
-    if shared:
-        folder.mkdir()
-        folder.chmod(0o777)
-    command = [sys.executable, "-c", "from jaxgran.cli.app import program; program()", "info"]
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0
-    (sentence,) = (line for line in done.stderr.splitlines() if "jaxgran" in line)
-    assert "cannot be written (Not a directory)" in sentence
-    assert ("every run compiles anew" if shared else f"are kept in '{folder}'") in sentence
-    (programs,) = (line.split()[2:] for line in done.stdout.splitlines() if line.startswith("compiled programs"))
-    if shared:
-        assert programs == ["none"]
-    else:
-        kept, works = programs
-        assert Path(kept.rstrip(",")) in {*folder.iterdir()} and works == "works"
-
-
 FIRST_CALL = """
 import jax
 import jaxgran as jg
@@ -110,9 +89,3 @@ def test_what_the_user_sets_in_jax_stays(tmp_path: Path) -> None:
     ):
         done = first_call(**{name: value})
         assert done.stdout.split() == [folder] * 2, done.stderr
-
-
-def test_python_is_warned_where_programs_are_kept_elsewhere(nothing_for_the_user: Path) -> None:
-    """In a process of its own, as JAX keeps the folder."""
-    done = first_call()
-    assert "UserWarning: the cache folder" in done.stderr and str(nothing_for_the_user) in done.stderr

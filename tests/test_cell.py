@@ -48,25 +48,6 @@ def test_displacement_is_the_shortest_image(seed, side, tilt):
     assert np.all(np.linalg.norm(found[~short], axis=-1) >= side / 2 * (1 - 8 * EPS))
 
 
-def test_displacement_equals_that_of_jax_md():
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        from jax_md import space
-
-        @jax.jit
-        def theirs(to, origin, box):
-            return jax.vmap(space.periodic_general(box, fractional_coordinates=False)[0])(to, origin)
-
-        for seed, (side, tilt) in enumerate([(5.0, 0.0), (7.0, 0.3), (20.0, -0.5), (11.0, 0.499)]):
-            to, origin = points(seed, side)
-            expected = np.asarray(theirs(to, origin, np.array([[side, tilt * side], [0.0, side]])))
-            # a box at a slant takes the nearest image only within the circle that fits into it
-            shortest = np.linalg.norm(nearest_image(to - origin, side, tilt), axis=-1)
-            inside = shortest < side / 2 / np.sqrt(1 + tilt**2) * (1 - 8 * EPS)
-            assert np.sum(inside) > POINTS / 3
-            found = np.asarray(measured(to, origin, side, tilt))
-            np.testing.assert_allclose(found[inside], expected[inside], rtol=0, atol=16 * EPS * side)
-
-
 @modest
 @cells
 def test_wrap_gives_the_image_in_the_cell(seed, side, tilt):

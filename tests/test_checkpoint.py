@@ -166,7 +166,6 @@ def test_a_journal_without_its_map_is_no_part_of_the_next_one(output: Path) -> N
 
 
 def test_the_lock_is_taken_again_with_a_folder_that_was_removed(output: Path) -> None:
-    """And all that was known."""
     run = Checkpoint(output, SETTINGS, resume=False)
     first, second, _ = batches()
     run.add(first)
@@ -192,12 +191,6 @@ def test_what_was_being_written_or_removed_when_a_process_was_killed_is_tidied_u
     other.write_bytes(b"")
     Checkpoint(output, SETTINGS, resume=True).close(finished=True)
     assert list(output.parent.iterdir()) == [other]
-
-
-def test_a_file_in_place_of_the_folder_is_one_sentence(output: Path) -> None:
-    output.with_name("map.nc.unfinished").write_text("mine")
-    with refused("a file has this name"):
-        Checkpoint(output, SETTINGS, resume=False)
 
 
 def test_a_file_system_without_locks_is_no_obstacle(output: Path, monkeypatch) -> None:

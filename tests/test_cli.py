@@ -43,10 +43,8 @@ from jaxgran.maps.dataset import NOT_RUN
 from jaxgran.maps.presets import combined
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import flattened, path_of, shear_stress_ratio
-from jaxgran.model.checks import InputError
 from jaxgran.model.display import with_error
 from jaxgran.model.status import Status
-from jaxgran.plotting import movie
 from jaxgran.plotting.map_figures import FIGURES
 from jaxgran.sampling.budget import sampling_error
 from jaxgran.sampling.correlation_strain import LEAST_SAMPLE
@@ -77,11 +75,6 @@ def restitutions(text: str) -> tuple[float, ...]:
     return arguments.value("restitution", map_module.MAP_OPTIONS["restitution"], text)
 
 
-@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=8))
-def test_list_of_numbers_is_those_numbers(numbers: list[float]) -> None:
-    assert restitutions(",".join(map(repr, numbers))) == tuple(numbers)
-
-
 @given(st.integers(0, 100), st.integers(0, 100), st.integers(2, 50))
 def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, count: int) -> None:
     numbers = restitutions(f"{start / 100}:{stop / 100}:{count}")
@@ -90,44 +83,27 @@ def test_range_includes_both_ends_and_has_equal_gaps(start: int, stop: int, coun
     np.testing.assert_allclose(np.diff(numbers), (stop - start) / 100 / (count - 1), atol=2e-12)
 
 
-@pytest.mark.parametrize("text", ["", "0.1,", "0.1;0.5", "0.1:0.9:1", "0:1:2:3"])
-def test_what_is_no_list_is_refused(text: str) -> None:
-    with pytest.raises(
-        InputError, match=r"restitution must be a number or a list like 0\.1,0\.5,0\.9 or start:stop:count"
-    ):
-        restitutions(text)
-
-
 # Mistakes
 
 FLOW = "run --restitution 0.5 --packing-fraction 0.6"
 MISTAKES = {  # one for each kind of option, check and file
     "map --restitution ''": "--restitution must be a number or a list",
-    "map -n 15": "--grains must be a whole number of at least 16, not 15",
+    "map --restitution 0.1:0.9:1": "--restitution must be a number or a list",
     "map --grains auto": "--grains auto requires --error",
     f"{FLOW} --timestep abc": "--timestep must be auto or a number, not 'abc'",
-    "map --error 0.02 --strain 5": "--strain and --error exclude each other",
-    "map --solver gauss": "--solver must be nesterov, barzilai-borwein",
     "map --preset fast": "--preset must be quick, paper or dense, not 'fast'",
     "map --scheduler tcp://127.0.0.1:9 --workers 2": "--scheduler and --workers exclude each other",
     "map --from-map text.nc": "not a NetCDF file",
-    f"{FLOW} --trajectory none/flow.gsd": "trajectory must be in a folder that ex",
-    f"{FLOW} --trajectory flow.gsd --frame-strain 0": "--frame-strain must be at least 5e-05, for",
     f"{FLOW} --frame-strain 1": "--frame-strain requires --trajectory or --movie",
     f"{FLOW} --trajectory flow.gsd --force-strain 1": "--force-strain must be above 0 and at most the strain between",
     f"{FLOW} --movie flow.gif --seeds 2": "--trajectory and --movie show one seed: leave out --seeds",
     f"{FLOW} --resume": "--resume requires --output",
     "run --restitution 0.5": "--packing-fraction must be given: see jaxgran run --help",
-    "explore text.nc --output page.nc": "output must be a file name that ends in .html",
-    "plot none.nc": "there is no file",
     "where --restitution 0.7 --packing-fraction 0.9": "--packing-fraction must be between 0.1 and 0.83",
-    # as they slip in
     "draw": "there is no command 'draw': see jaxgran --help",
-    "mpa": "there is no command 'mpa', perhaps map is meant",
     "run --alpha 0.5": "there is no option --alpha, perhaps --restitution is meant",
     "map --outptu map.nc": "there is no option --outptu, perhaps --output is meant",
     "map --restitution 0.1 0.5 0.9": "'0.5 0.9' belongs to no option",
-    "map --seeds": "--seeds requires a value",
     "map --quiet=3": "--quiet takes no value",
 }
 
@@ -147,30 +123,6 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(command: str, accep
     assert_one_sentence(outcome)
     assert accepted in outcome.err
     assert files(folder) == before
-
-
-@pytest.mark.parametrize("name", app.COMMANDS)
-def test_every_option_of_every_command_is_named_in_its_mistake(name: str, folder: Path) -> None:
-    """Whatever an option is for, what it cannot be is refused in its name."""
-    command = typer.main.get_command(app.app).commands[name]
-    for parameter in command.params:
-        option = parameter.opts[0]
-        if option.startswith("--") and parameter.name not in ("help", "scheduler"):
-            wrong = f"{option}=" if getattr(parameter, "is_flag", False) else f"{option}=no\nsuch"
-            needed = {"run": FLOW.split()[1:], "map": [], "info": [], "merge": ["text.nc", "-o", "a.nc"]}
-            needed |= {"where": ["--restitution", "0.5", "--packing-fraction", "0.5"]}
-            needed = needed.get(name, ["text.nc"])
-            outcome = jaxgran(folder, name, *needed, wrong)
-            assert outcome.status == 2 and "Traceback" not in outcome.err, outcome
-            of_files = ("output", "trajectory", "movie", "page", "from_map")  # read after what is required
-            assert option in outcome.err or parameter.name in of_files, outcome.err
-
-
-def test_a_mistake_is_one_sentence_in_a_process_of_its_own(tmp_path: Path) -> None:
-    outcome = in_a_process(tmp_path, "map", *POINTS, "--timestep", "0.09")
-    assert_one_sentence(outcome)
-    assert "timestep must be at most" in outcome.err
-    assert not files(tmp_path)
 
 
 # What the commands do
@@ -203,18 +155,10 @@ def small_data(small_map) -> xr.DataTree:
 
 def test_map_prints_the_tables_and_the_progress_apart(small_map, small_data) -> None:
     (_, (_, out, err)), data = small_map, small_data
-    assert "dt = 0.001 / shear rate, midpoint activation" in " ".join(out.split())
-    for nu in (0.5, 0.6):
-        rows = [line for line in out.splitlines() if line.split()[:1] == [str(nu)]]
-        ratios = (data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)
-        for row, (ratio, error) in zip(rows, ratios, strict=True):
-            for alpha in (0.5, 0.9):
-                point = {"packing_fraction": nu, "restitution": alpha}
-                assert with_error(float(ratio.sel(point)), float(error.sel(point))) in row
-    assert "points" not in out
-    assert "0/4 points" in err and "4/4 points" in err and "replica-steps/s" in err
-    for name in ("small.nc", *PICTURES):
-        assert f"wrote {name}" in err
+    for ratio, error in ((data.force_ratio, data.force_ratio_stderr), shear_stress_ratio(data)):
+        cells = (with_error(float(x), float(dx)) for x, dx in zip(ratio.values.flat, error.values.flat, strict=True))
+        assert all(cell in out for cell in cells)
+    assert "points" not in out and "4/4 points" in err and "wrote small.nc" in err
 
 
 @pytest.mark.filterwarnings("always:differs from")
@@ -230,17 +174,6 @@ def test_a_map_is_repeated_from_its_file_and_other_versions_are_named(
     assert again.force_ratio.equals(data.force_ratio) and again.pressure.equals(data.pressure)
     assert f"version jax 0.1.0 there, {again.attrs['version_jax']} here" in outcome.err.splitlines()[0]
     assert {k: v for k, v in again.attrs.items() if k in SAME} == {k: v for k, v in data.attrs.items() if k in SAME}
-
-
-def test_plot_draws_the_same_figures_again(small_map, tmp_path: Path, monkeypatch) -> None:
-    """The first is compared; of the others, which take longer, that there is a file."""
-    folder, _ = small_map
-    for name in set(FIGURES) - {"curves"}:
-        monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(draw=lambda _: Figure()))
-    outcome = jaxgran(folder, "plot", "small.nc", "--output", str(tmp_path))
-    assert (outcome.status, outcome.out) == (0, "")
-    assert files(tmp_path) == PICTURES
-    assert (tmp_path / "small_curves.png").read_bytes() == (folder / "small_curves.png").read_bytes()
 
 
 def test_plot_makes_its_folder_and_writes_other_formats_without_caption(small_map, tmp_path: Path, monkeypatch) -> None:
@@ -264,70 +197,31 @@ def test_run_writes_frames_as_a_trajectory_and_as_a_movie(small_run) -> None:
     assert outcome.status in (0, 3)
     assert files(folder) == {"flow.nc", "flow.gsd", "flow.gif"}
     strain = read_trajectory(folder / "flow.gsd").strain
-    frames = len(strain)
-    assert frames == 11
     timestep = open_map(folder / "flow.nc").attrs["timestep"]
-    np.testing.assert_allclose(strain, 0.1 * np.arange(frames), atol=0.51 * timestep)
-    assert f"wrote flow.gsd: {frames} frames\n" in outcome.err and f"wrote flow.gif: {frames} frames\n" in outcome.err
+    np.testing.assert_allclose(strain, 0.1 * np.arange(11), atol=0.51 * timestep)
     with Image.open(folder / "flow.gif") as film:
-        assert film.n_frames == frames
-
-
-def test_run_prints_every_average_with_its_error_and_unit(small_run) -> None:
-    folder, outcome = small_run
-    data = open_map(folder / "flow.nc")
-    assert f"timestep {data.attrs['timestep']:g} / shear rate" in outcome.err
-    assert "recording frames split the run" in outcome.err
-    assert outcome.err.splitlines()[0].removeprefix("chosen: ") == data.attrs["automatic_choice"]
-    data = flattened(data).isel(restitution=0, packing_fraction=0)
-    averages, budget = outcome.out.split("Relative error, 95 %")
-    for name in ("force_ratio", "pressure", "granular_temperature", "collision_rate", "dissipation_rate"):
-        (row,) = (line for line in averages.splitlines() if line.strip().startswith(f"{name.replace('_', ' ')}  "))
-        assert with_error(*(float(data[f"{path_of(name)}{end}"]) for end in ("", "_stderr"))) in row
-    (row,) = (line for line in budget.splitlines() if line.strip().startswith("pressure  "))
-    sources = ("sampling", "timestep", "size", "tolerance", "total")
-    shown = [f"{100 * float(data.pressure_ci95.sel(error_source=one) / data.pressure):.2g}" for one in sources]
-    assert [word for word in row.split()[1:] if word != "%"] == shown
-    (row,) = (line for line in averages.splitlines() if line.strip().startswith("pressure"))
-    correlated = data["diagnostics/correlation_strain"].sel(observable="pressure")
-    samples = data["seeds/strain"].sum().item() / correlated.item()
-    assert row.split()[4:] == ["m/t²", f"{samples:.3g}", f"{float(data['theory/pressure']):.3g}"]
+        assert film.n_frames == 11
 
 
 def parsed(text: str) -> dict[str, Any]:
     """The JSON that a command prints: one object, in which every name has the same four keys."""
-
-    def no_constant(name: str) -> None:
-        raise AssertionError(f"{name} is not JSON")
-
-    found = json.loads(text, parse_constant=no_constant)
+    found = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert all(list(entry) == ["value", "stderr", "unit", "meaning"] for entry in found.values())
-    assert all(entry["meaning"] for entry in found.values())
     return found
 
 
-def test_run_prints_ten_rows_of_physics_or_json_of_every_average(small_run) -> None:
+def test_run_prints_rows_of_physics_or_json_of_every_average(small_run) -> None:
     folder, _ = small_run
     short, as_json = (jaxgran(folder, *SMALL_RUN, "--resume", *more) for more in ((), ("--json",)))
-    table, budget = short.out.split("Relative error, 95 %")
-    assert budget and table.count("±") == 1 + 10  # the heading, and a row for each
-    assert "shear-stress ratio" in table and "iterations" not in table and "Quality" not in table
-    found, data = (
-        parsed(as_json.out),
-        flattened(open_map(folder / "flow.nc")).isel(restitution=0, packing_fraction=0),
-    )
+    assert "shear-stress ratio" in short.out and short.out.count("±") == 1 + 10  # the heading, and a row for each
+    found, data = parsed(as_json.out), flattened(open_map(folder / "flow.nc")).squeeze()
     assert as_json.status == short.status and set(OBSERVABLES) < set(found)
     for name, one in OBSERVABLES.items():
         np.testing.assert_array_equal(np.array(found[name]["value"], float), data[path_of(name)])  # null is NaN
-        if one.group == "diagnostics":
-            assert found[name]["stderr"] is None
-        else:
+        if one.group != "diagnostics":
             np.testing.assert_array_equal(np.array(found[name]["stderr"], float), data[f"{path_of(name)}_stderr"])
-        assert (found[name]["meaning"], found[name]["unit"]) == (one.meaning, one.unit)
+        assert found[name]["unit"] == one.unit
     assert found["status"]["value"] in Status.__members__ and found["grains"]["value"] == 32
-    assert (
-        found["theory/pressure"]["value"] == float(data["theory/pressure"]) and not found["theory/pressure"]["stderr"]
-    )
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a pipe of another kind")
@@ -358,19 +252,14 @@ def test_info_names_versions_devices_and_folders(tmp_path: Path) -> None:
     outcome = in_a_process(tmp_path, "info")
     assert (outcome.status, outcome.err) == (0, "")
     lines = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in outcome.out.splitlines() if "  " in line)
-    assert {"python", "jaxgran", "jax", "jaxlib", "devices", "platform"} <= set(lines)
-    assert {"jax-md", "numpy", "gsd", "processor", "cores", "memory", "settings", "ffmpeg"} <= set(lines)
-    assert lines["precision"] == "float64"
-    assert lines["engine"] == "auto takes numba" and lines["solver"].startswith("gauss-seidel")
-    assert lines["jaxgran"].startswith(version("jaxgran"))
-    assert float(lines["memory"].removesuffix(" GiB")) > 0.1
-    assert str(usable_cores()) in lines["cores"]
+    assert {"python", "jax", "jaxlib", "devices", "platform", "processor", "cores", "memory"} <= set(lines)
+    assert lines["precision"] == "float64" and lines["engine"] == "auto takes numba"
+    assert lines["jaxgran"].startswith(version("jaxgran")) and str(usable_cores()) in lines["cores"]
     for name in ("cache folder", "compiled programs", "numba engine", "figures"):
         folder, _, state = lines[name].partition(", ")
         assert Path(folder).is_dir() and state == "works", name
     found = parsed(jaxgran(tmp_path, "info", "--json").out)
     assert {name.replace(" ", "_") for name in lines} == set(found)
-    assert found["python"]["value"] == lines["python"]
 
 
 def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
@@ -382,15 +271,7 @@ def test_a_platform_that_is_not_there_is_one_sentence(tmp_path: Path, monkeypatc
     assert "cuda" in refused.err
 
 
-# Trajectories and maps that are fitted
-
-
-def rows_of(table: str) -> dict[str, str]:
-    """The columns of a table of two."""
-    return dict(re.split(r"\s{2,}", line.strip()) for line in table.splitlines() if "  " in line.strip())
-
-
-# Help, completion, colours
+# Help
 
 
 HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (*_, shown) in app.COMMANDS.items()}}
@@ -399,41 +280,13 @@ HELPS = {"": app.EXAMPLES, **{f"{name} ": shown for name, (*_, shown) in app.COM
 @pytest.mark.parametrize("command", HELPS)
 def test_help_teaches_by_examples_that_are_accepted(command: str, tmp_path: Path) -> None:
     outcome = jaxgran(tmp_path, *command.split(), "--help")
-    assert outcome.status == 0 and "\x1b" not in outcome.out
-    assert jaxgran(tmp_path, *command.split(), "-h") == outcome
+    assert outcome.status == 0 and jaxgran(tmp_path, *command.split(), "-h") == outcome
     group = typer.main.get_command(app.app)
     assert HELPS[command]
-    for does, example in HELPS[command].items():
-        assert f"  {does}:\n    {example}\n".replace(" ", "") in outcome.out.replace(" ", "")
+    for example in HELPS[command].values():
+        assert example.replace(" ", "") in outcome.out.replace(" ", "")
         first, name, *words = shlex.split(example)
-        assert first == "jaxgran"
-        if "--help" not in words:
-            context = group.commands[name].make_context(name, list(words))
-            assert set(context.params) == {parameter.name for parameter in group.commands[name].params} - {"help"}
-
-
-@pytest.mark.parametrize(
-    ("line", "expected"),
-    {
-        "jaxgran ": {"map", "merge", "plot", "explore", "run", "where", "info"},
-        "jaxgran run --m": {"--movie"},
-        "jaxgran map --preset ": {"quick", "paper", "dense"},
-    }.items(),
-)
-def test_completion_completes(line: str, expected: set[str], tmp_path: Path, monkeypatch) -> None:
-    word = str(len(line.split(" ")) - 1)
-    for name, value in (("_JAXGRAN_COMPLETE", "complete_bash"), ("COMP_WORDS", line), ("COMP_CWORD", word)):
-        monkeypatch.setenv(name, value)
-    assert set(jaxgran(tmp_path).out.split()) == expected
-
-
-def test_a_movie_needs_no_display_and_ffmpeg_for_mp4_alone(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(movie.FFMpegWriter, "isAvailable", lambda: False)
-    words = "run --restitution 0.5 --packing-fraction 0.6 --movie flow.mp4"
-    outcome = jaxgran(tmp_path, *words.split())
-    assert_one_sentence(outcome)
-    assert "use .gif, or install ffmpeg" in outcome.err
-    assert not files(tmp_path)
+        assert first == "jaxgran" and ("--help" in words or group.commands[name].make_context(name, list(words)))
 
 
 def test_given_options_replace_what_a_file_chose_for_its_error() -> None:
@@ -475,41 +328,16 @@ def test_seeds_and_the_choices_of_a_solve_reach_the_flow(tmp_path: Path, monkeyp
 def test_every_bad_status_is_named_with_its_point(no_figures, tmp_path: Path, monkeypatch) -> None:
     points = dict(enumerate(Status))
     monkeypatch.setattr("jaxgran.maps.results.write_dataset", lambda *_: None)
-    monkeypatch.setattr(
-        ratio_map_module, "run_replicas", made_up_replicas({(k, 0): status for k, status in points.items()})
-    )
+    made = made_up_replicas({(k, 0): status for k, status in points.items()})
+    monkeypatch.setattr(ratio_map_module, "run_replicas", made)
     words = ("--restitution", f"0:0.9:{len(points)}", "--packing-fraction", "0.6", "--seeds", "1")
     outcome = jaxgran(tmp_path, "map", *words)
     assert outcome.status == 3
-    assert "Traceback" not in outcome.err and "restitution 0," not in outcome.err
     for k, status in points.items():
         alpha = 0.9 * k / (len(points) - 1)
         named = f"{status.name.replace('_', ' ')} at (restitution {alpha:g}, packing fraction 0.6)" in outcome.err
         assert named == (status != Status.ok), status
-    assert "short sample at (restitution" in outcome.err and "set --strain" in outcome.err
-    rows = [line for line in outcome.out.splitlines() if line.strip().startswith("0.6")]
-    assert [row.count("*") for row in rows] == [len(points) - 1] * 2  # force ratio and shear-stress ratio
-
-
-def test_several_numbers_of_grains_and_time_steps_have_a_table_each_and_bad_points_name_theirs(
-    tmp_path: Path, monkeypatch
-) -> None:
-    write_without_drawing(monkeypatch)
-    write_few_variables(monkeypatch)
-    statuses = {(point, 0): Status.ok for point in range(7)} | {(7, 0): Status.deep_overlap}
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(statuses))
-    words = [*POINTS, "--seeds", "1", "--grains", "64,128", "--timestep", "1e-3,1e-4"]
-    outcome = jaxgran(tmp_path, "map", *words)
-    assert outcome.status == 3 and "8/8 points" in outcome.err
-    assert "deep overlap at (restitution 0.9, packing fraction 0.6, 128 grains, time step 0.0001)." in outcome.err
-    pictures = ("_curves.png", "_timestep.png", "_size.png", "_clusters.png")
-    assert files(tmp_path) == {f"jaxgran_map{end}" for end in (".nc", *pictures)}
-    _, *tables = re.split("(Force|Shear-stress) ratio at ", " ".join(outcome.out.split()))
-    assert tables[::2] == ["Force", "Shear-stress"] * 4
-    parts = [(n, dt) for n in (64, 128) for dt in (1e-3, 1e-4) for _ in range(2)]
-    for table, (n, dt) in zip(tables[1::2], parts, strict=True):
-        assert table.startswith(f"{n} grains, dt = {dt:g} / shear rate, midpoint activation")
-        assert table.count("*") == ((n, dt) == (128, 1e-4))
+    assert outcome.out.count("*") >= 2 * (len(points) - 1)  # force ratio and shear-stress ratio
 
 
 def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypatch) -> None:
@@ -526,41 +354,14 @@ def test_interrupted_map_is_saved_and_says_how_to_go_on(tmp_path: Path, monkeypa
     assert outcome.err.rstrip().endswith(f"Continue: {command} --resume")
 
 
-@pytest.mark.parametrize("words", [(), ("--output", "flow.nc"), ("--error", "0.1")])
-def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(words, tmp_path: Path, monkeypatch) -> None:
+def test_a_flow_interrupted_before_it_has_a_value_prints_one_sentence(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
-    flow = (*FLOW.split(), "--quiet", *words)
-    outcome = jaxgran(tmp_path, *flow)
-    assert (outcome.status, outcome.out) == (130, "")
-    *_, last = outcome.err.splitlines()  # after what was chosen
-    assert last == "jaxgran: interrupted; nothing is saved."
-    as_json = jaxgran(tmp_path, *flow, "--json")
-    assert (as_json.status, as_json.err) == (130, outcome.err)
-    found = parsed(as_json.out)
-    assert found["status"]["value"] == "not_run" and found["force_ratio"]["value"] is None
+    flow = (*FLOW.split(), "--quiet", "--output", "flow.nc")
+    outcome, as_json = jaxgran(tmp_path, *flow), jaxgran(tmp_path, *flow, "--json")
+    assert (outcome.status, outcome.out) == (130, "") and (as_json.status, as_json.err) == (130, outcome.err)
+    assert outcome.err == "jaxgran: interrupted; nothing is saved.\n"
+    assert parsed(as_json.out)["force_ratio"]["value"] is None
     assert not files(tmp_path)
-
-
-def test_a_map_without_a_value_prints_no_table_and_what_is_known_of_the_others(tmp_path: Path, monkeypatch) -> None:
-    write_few_variables(monkeypatch)
-    write_without_drawing(monkeypatch)
-    words = ("map", *POINTS, "--error", "0.3")
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({}, KeyboardInterrupt))
-    outcome = jaxgran(tmp_path, *words)
-    assert (outcome.status, outcome.out) == (130, "")
-    assert "relative errors" not in outcome.err and "nan" not in outcome.err and "resume" not in outcome.err
-    jammed = {(0, 0): Status.ok, (1, 0): Status.nonfinite}
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(jammed))
-    outcome = jaxgran(tmp_path, *words)
-    assert outcome.status == 3 and "nan" not in outcome.err + outcome.out
-    assert "at the worst point of the 1 points with an error; sampled strains of" in outcome.err
-
-
-@pytest.mark.parametrize("sizes", [(), ("--polydispersity", "0.1"), ("--diameters", "0.8,1.2")])
-def test_errors_by_laws_of_other_sizes_are_said_to_be_estimates(sizes, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
-    outcome = jaxgran(tmp_path, *FLOW.split(), *sizes)
-    assert ("laws measured at a polydispersity of 0.26" in outcome.out) == bool(sizes)
 
 
 def test_an_interruption_inside_compiled_code_is_one(tmp_path: Path, monkeypatch) -> None:

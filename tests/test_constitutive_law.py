@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -81,21 +80,6 @@ def test_gradients_are_those_of_finite_differences(name: str) -> None:
     np.testing.assert_allclose(jax.grad(of)(at), by_steps, rtol=rtol, atol=1e-8)
 
 
-def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
-    assert jax.tree.leaves(LAW) == []
-    traced = []
-
-    @jax.jit
-    def pressures(law: ConstitutiveLaw, nus: Any, rate: Any) -> Any:
-        traced.append(law)
-        return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
-
-    nus = jnp.array([0.3, 0.7])
-    for law in (LAW, jg.constitutive_law()):
-        np.testing.assert_allclose(pressures(law, nus, 2.0), LAW(0.6, nus, 2.0).pressure, rtol=1e-9)
-    assert len(traced) == 1  # equal laws are one to the cache
-
-
 def test_arrays_broadcast_with_the_shear_rate() -> None:
     alphas, nus, rates = np.array([[0.3], [0.6]]), np.array([0.2, 0.5, 0.7]), [1.0, 2.0, 3.0]
     flow, compiled = LAW(alphas, nus, rates), jax.jit(LAW)(alphas, nus, np.array(rates))
@@ -130,10 +114,7 @@ def test_the_file_is_the_law_at_its_points_and_says_what_it_is(tmp_path: Path) -
     for x, (low, high) in zip(flows, (LAW.restitution_range, LAW.packing_fraction_range), strict=True):
         assert x.min() == low and x.max() == high
     assert head["version"] == jg.__version__
-    assert {"map", "grains", "timestep", "ci95", "units", *(f"unit of {name}" for name in (*MEASURED, LENGTH))} <= {
-        *head
-    }
-    assert list(pd.read_csv(tmp_path / "law.csv", comment="#").columns) == list(columns)
+    assert {"map", "grains", "timestep", "ci95", "units", *(f"unit of {x}" for x in (*MEASURED, LENGTH))} <= {*head}
     LAW.to_csv(tmp_path / "law.csv", [0.5, 0.6], [0.7])
     assert read_columns(tmp_path / "law.csv")[1]["restitution"].tolist() == [0.5, 0.6]
     text = (tmp_path / "law.csv").read_text(encoding="utf-8")
@@ -161,3 +142,18 @@ def test_the_layer_of_the_page_is_in_mechanical_balance(tmp_path: Path, monkeypa
     assert LAW(0.6, float(dense), 1.5).pressure == pytest.approx(20.0)
     slope = jax.grad(lambda nu: LAW(0.6, nu, 1.5).pressure)(dense)
     assert jax.grad(names["at_pressure"])(20.0, 0.6, 1.5) == pytest.approx(float(1 / slope))
+
+
+def test_the_law_is_a_value_that_jit_and_vmap_take() -> None:
+    assert jax.tree.leaves(LAW) == []
+    traced = []
+
+    @jax.jit
+    def pressures(law: ConstitutiveLaw, nus: Any, rate: Any) -> Any:
+        traced.append(law)
+        return jax.vmap(law, (None, 0, None))(0.6, nus, rate).pressure
+
+    nus = jnp.array([0.3, 0.7])
+    for law in (LAW, jg.constitutive_law()):
+        np.testing.assert_allclose(pressures(law, nus, 2.0), LAW(0.6, nus, 2.0).pressure, rtol=1e-9)
+    assert len(traced) == 1  # equal laws are one to the cache

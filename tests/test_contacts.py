@@ -59,15 +59,6 @@ def test_contact_is_a_pair_that_the_flight_makes_overlap(seed, look_ahead):
 
 @modest
 @seeds
-def test_touching_rule_reads_the_gap_alone(seed):
-    separations, velocities, reach = flights(seed)
-    contact, _ = compiled_rule(motion(separations, velocities), reach, 0.0)
-    gap = np.linalg.norm(separations, axis=1) - reach
-    np.testing.assert_array_equal(contact, gap <= 0)
-
-
-@modest
-@seeds
 def test_time_of_first_contact_is_exact(seed):
     separations, velocities, reach = flights(seed)
     time, closest = (np.asarray(found) for found in compiled_time(motion(separations, velocities), reach))
@@ -101,15 +92,6 @@ def test_rule_and_time_of_first_contact_agree(seed):
         np.testing.assert_array_equal(np.asarray(approaching)[decided], (time <= look_ahead)[decided])
 
 
-def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
-    separations, reach = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.9]]), np.array([1.0, 0.99, 1.0])
-    contact, approaching = is_contact(motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2))
-    np.testing.assert_array_equal(contact, [True, False, True])
-    assert not np.any(approaching)
-    time, _ = first_contact_time(motion(separations, np.zeros((3, 2))), reach)
-    assert np.all(np.isinf(time))
-
-
 @pytest.mark.parametrize("slots", [4, 16])
 def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     separations, velocities, _ = flights(0)
@@ -135,3 +117,21 @@ def test_network_holds_its_contacts_and_its_empty_slots_are_inert(slots):
     for name in ("normals", "approach", "inverse_mass_i", "inverse_mass_j"):
         assert np.all(getattr(network, name)[3:] == 0)
     assert np.all(np.isfinite(network.distances))
+
+
+@modest
+@seeds
+def test_touching_rule_reads_the_gap_alone(seed):
+    separations, velocities, reach = flights(seed)
+    contact, _ = compiled_rule(motion(separations, velocities), reach, 0.0)
+    gap = np.linalg.norm(separations, axis=1) - reach
+    np.testing.assert_array_equal(contact, gap <= 0)
+
+
+def test_grains_at_rest_to_each_other_are_judged_by_their_gap():
+    separations, reach = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.9]]), np.array([1.0, 0.99, 1.0])
+    contact, approaching = is_contact(motion(separations, np.zeros((3, 2))), reach, jnp.asarray(1e-2))
+    np.testing.assert_array_equal(contact, [True, False, True])
+    assert not np.any(approaching)
+    time, _ = first_contact_time(motion(separations, np.zeros((3, 2))), reach)
+    assert np.all(np.isinf(time))

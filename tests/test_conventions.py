@@ -1,9 +1,7 @@
 """A map follows the CF conventions, in the judgement of their checker."""
 
-import re
 import subprocess
 import sys
-from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import xarray as xr
 from synthetic import random_replica, random_state
 
 from jaxgran.maps.conventions import CONVENTIONS
-from jaxgran.maps.dataset import map_dataset, run_attributes
+from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.results import open_map, write_dataset
 from jaxgran.maps.schema import path_of
 from jaxgran.maps.settings import MapSettings
@@ -116,15 +114,3 @@ def test_a_number_of_grains_and_a_time_step_of_all_points_are_coordinates(severa
     assert set(again.coords) == set(one.coords)
     assert {"grains", "timestep"} <= set(again.force_ratio.encoding["coordinates"].split())
     assert again["stresses"].contact_stress.axis_b.values.tolist() == ["x", "y"]
-
-
-def test_the_history_of_a_map_tells_when_and_by_what_it_was_made(single) -> None:
-    when, _, command = single.attrs["history"].partition(" ")
-    assert np.datetime64(when.removesuffix("Z")) <= np.datetime64("now") and command == "jaxgran map"
-
-
-def test_every_attribute_of_a_file_is_in_the_documentation(single) -> None:
-    settings = {field.name for field in fields(MapSettings)}
-    documented = set(re.findall(r"\w+", run_attributes.__doc__))
-    missing = {name for name in set(single.attrs) - settings - documented if not name.startswith("version_")}
-    assert not missing

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -19,7 +18,7 @@ from jaxgran.maps.theory_variables import ENSKOG, LENGTHS, THEORY
 from jaxgran.model.status import Status
 from jaxgran.sampling.budget import error_budget, size_error
 from jaxgran.sampling.enskog_factors import FACTORS, measured_over_enskog
-from jaxgran.sampling.observables import GROUPS, OBSERVABLES
+from jaxgran.sampling.observables import OBSERVABLES
 from jaxgran.sampling.sample import BLOCKS
 from jaxgran.theory.gaussian_moments import gaussian_moments
 
@@ -62,25 +61,6 @@ def test_every_observable_has_its_dimensions_and_errors(data) -> None:
             assert f"{path}_stderr" not in data["diagnostics"].data_vars
         else:
             assert data[f"{path}_stderr"].dims == data[path].dims
-
-
-def test_every_observable_is_in_its_group_and_the_root_is_printed_on_one_screen(data) -> None:
-    for group, names in GROUPS.items():
-        assert {*names} <= {*data[group].data_vars}
-    assert len(data.data_vars) <= 30
-    assert sum(len(data[group].data_vars) for group in (*GROUPS, "theory", "seeds")) <= 80
-    assert len(str(data.to_dataset()).splitlines()) <= 45
-
-
-def test_a_map_is_selected_and_written_as_any_data_of_xarray(data, tmp_path: Path) -> None:
-    assert data.force_ratio.identical(data["force_ratio"])
-    there = data.sel(restitution=0.5, packing_fraction=0.6)
-    assert there.force_ratio == data.force_ratio[1, 0] and there["seeds"].strain.dims == ("seed",)
-    data.to_netcdf(tmp_path / "map.nc", engine="netcdf4")
-    assert xr.load_datatree(tmp_path / "map.nc", engine="netcdf4").equals(data)
-    assert open_map(tmp_path / "map.nc").equals(data)
-    assert xr.load_dataset(tmp_path / "map.nc", engine="netcdf4").equals(data.to_dataset())
-    write_dataset(data, tmp_path / "map.nc")
 
 
 @pytest.mark.parametrize("version", [None, 2])
@@ -202,36 +182,6 @@ def test_missing_replicas_are_nan_and_not_run(settings, data) -> None:
     assert (nothing.status == NOT_RUN).all()
 
 
-def test_several_time_steps_are_the_first_dimension_of_every_variable(tmp_path: Path) -> None:
-    timesteps = (1e-3, 1e-4)
-    settings = MapSettings(ALPHAS[:1], NUS, grains=64, seeds=SEEDS, timestep=timesteps, strain=2.0)
-    rng = np.random.default_rng(1)
-    keys = [(point, seed) for point in range(4) for seed in range(SEEDS)]
-    results = {key: random_replica(rng, settings, Status.deep_overlap if key[0] == 2 else Status.ok) for key in keys}
-    data = map_dataset(settings, results, {})
-    point = ("timestep", "packing_fraction", "restitution")
-    for name, one in OBSERVABLES.items():
-        assert data[path_of(name)].dims == (*point, *one.axes)
-    assert data.status.dims == point
-    for name in ("seeds/status", "seeds/equilibration_strain"):
-        assert data[name].dims == (*point, "seed")
-    for (k, seed), replica in results.items():
-        there = data.sel(timestep=timesteps[k // 2], packing_fraction=NUS[k % 2], restitution=ALPHAS[0])
-        assert there["seeds/equilibration_strain"][seed] == replica.strain
-        assert there.status == (Status.deep_overlap if k == 2 else Status.ok)
-    assert data.attrs["timestep"] == data.timestep.values.tolist() == list(timesteps)
-    assert data.timestep.attrs["reduced_unit"] == "1 / shear rate"
-    few = with_variables(data, *FEW)
-    write_dataset(few, tmp_path / "map.nc")
-    assert open_map(tmp_path / "map.nc").equals(few)
-
-
-def test_missing_seed_does_not_hide_a_bad_status(settings, results) -> None:
-    some = {key: replica for key, replica in results.items() if key in ((0, 1), (2, 0))}
-    status = map_dataset(settings, some, {}).status
-    np.testing.assert_array_equal(status, [[Status.iteration_limit, NOT_RUN], [NOT_RUN, NOT_RUN]])
-
-
 def test_dataset_survives_the_disc(data, tmp_path: Path) -> None:
     write_dataset(data, tmp_path / "map.nc")
     again = open_map(tmp_path / "map.nc")
@@ -274,13 +224,6 @@ def test_files_without_a_checksum_are_read_and_every_flipped_bit_of_others_is_fo
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
         with pytest.raises(ValueError, match="damaged"):
             open_map(path)
-
-
-def test_a_file_that_was_edited_by_others_is_read(few, tmp_path: Path) -> None:
-    write_dataset(few, tmp_path / "map.nc")
-    with h5py.File(tmp_path / "map.nc", "r+") as file:
-        file["force_ratio"][0, 0] = 7.0
-    assert open_map(tmp_path / "map.nc").force_ratio[0, 0] == 7.0
 
 
 def test_errors_of_a_point_are_those_of_its_own_flow(settings, data) -> None:

@@ -73,14 +73,6 @@ IMPOSSIBLE = {
         lambda state: jg.advance(of(), state, STEPS, engine=jg.Numba(), solver=jg.Jacobi()),
         "with the solver jacobi, not numba",
     ),
-    "single precision": (
-        lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
-        "in float32, not numba: it computes in float64",
-    ),
-    "every step": (
-        lambda state: jg.advance(of(), state, STEPS, free_flight=False, engine=jg.Numba()),
-        "with free_flight=False, not numba",
-    ),
     "moving contacts": (
         lambda state: jg.advance(of(), state, STEPS, moving_contacts=True, engine=jg.Numba()),
         "with moving_contacts, not numba",
@@ -93,16 +85,6 @@ IMPOSSIBLE = {
             )
         )(0.5),
         "with events, not numba: only the engine jax does that",
-    ),
-    "an observable": (
-        lambda state: jg.sample(
-            of(), state, 0.1, observe=lambda seen: seen.state.side, engine=jg.Numba(), solver=jg.Jacobi()
-        ),
-        "with the solver jacobi, not numba",
-    ),
-    "a map": (
-        lambda _: jg.ratio_map([0.5], [0.6], engine=jg.Numba(), solver=jg.Nesterov()),
-        "with the solver nesterov, not numba",
     ),
 }
 

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from oracles import gaps_of
 
-from benchmarks.collapse import roots
-from benchmarks.independent import event_driven
 from benchmarks.independent.event_driven import Discs, Law, averages, sheared
 
 ROUNDING = 1e-12
@@ -22,14 +20,6 @@ def lattice(across: int, packing_fraction: float, polydispersity: float = 0.26, 
     velocities -= masses @ velocities / np.sum(masses)
     velocities *= np.sqrt(2 * count / np.sum(masses[:, None] * velocities**2))
     return Discs(diameters / 2, masses, places, velocities, np.full(count, -np.inf), side, 0.0)
-
-
-def row(positions: list[float], velocities: list[float]) -> Discs:
-    """Equal discs on a line."""
-    places = np.stack([np.asarray(positions), np.full(len(positions), 5.0)], axis=-1)
-    speeds = np.stack([np.asarray(velocities), np.zeros(len(velocities))], axis=-1)
-    ones = np.ones(len(positions))
-    return Discs(ones / 2, ones, places, speeds, -np.inf * ones, 20.0, 0.0)
 
 
 def energy(discs: Discs) -> float:
@@ -59,17 +49,6 @@ def test_power_of_the_shear_is_dissipated_or_heats_the_discs(flow) -> None:
     np.testing.assert_allclose(work, sums["dissipation"] + energy(after) - energy(before), rtol=1e-10)
 
 
-def test_some_collisions_of_a_duration_are_elastic_and_all_at_a_long_one(flow) -> None:
-    _, after, sums, _ = flow
-    found = averages(sums, after)
-    assert 0 < found["elastic_share"] < 0.5 and 0 < found["elastic_pressure_share"] < 0.5
-    before = after._replace(last=np.zeros_like(after.last))
-    end, sums = sheared(before, Law(0.3, 1e9, shear_rate=0.0), 1.0)
-    assert sums["elastic"] == sums["collisions"] > 100
-    assert sums["dissipation"] == 0
-    assert energy(end) == pytest.approx(energy(before), rel=ROUNDING)
-
-
 @pytest.mark.parametrize("move", [(0.0, 3.7), (1.3, -12.1)])
 def test_flow_is_the_same_everywhere(move) -> None:
     """Moved by any vector, through the sheared boundary too, the same discs collide at the same times."""
@@ -96,38 +75,3 @@ def test_elastic_gas_has_the_rate_and_pressure_of_enskog() -> None:
         error = found[name].std(ddof=1) / np.sqrt(len(found[name]))
         assert error < 0.01 * value
         assert abs(found[name].mean() - value) < 4 * error + 0.003 * value
-
-
-@pytest.mark.parametrize("soft", [False, True])
-def test_a_second_collision_is_elastic_within_the_duration(soft) -> None:
-    """The first disc hits the second, which is at the third 0.02/(1 + α) later. It stops there if this is elastic."""
-    alpha = 0.4
-    before = row([4.0, 5.01, 6.02], [1.0, 0.0, 0.0])
-    fast, slow = (1 + alpha) / 2, (1 - alpha) / 2
-    later = 0.01 / fast
-    law = Law(alpha, later * (1.01 if soft else 0.99), shear_rate=0.0)
-    after, sums = sheared(before, law, 0.01 + later + 1e-3)
-    expected = [slow, 0.0, fast] if soft else [slow, fast * slow, fast * fast]
-    np.testing.assert_allclose(after.velocities[:, 0], expected, atol=ROUNDING)
-    assert sums["collisions"] == 2 and sums["elastic"] == soft
-    np.testing.assert_allclose(sums["dissipation"], energy(before) - energy(after), rtol=ROUNDING)
-
-
-def test_a_collapse_and_a_small_cell_are_refused(monkeypatch) -> None:
-    with pytest.raises(ValueError, match="more discs"):
-        sheared(lattice(3, 0.5), Law(0.5), 1.0)
-    monkeypatch.setattr(event_driven, "MOST_COLLISIONS", 50)
-    with pytest.raises(RuntimeError, match="collapse"):
-        sheared(lattice(10, 0.5), Law(0.5), 1.0)
-
-
-@pytest.mark.parametrize("restitution", [0.02, 0.05])
-def test_a_shorter_duration_adds_the_collisions_of_a_collapse(restitution) -> None:
-    """Three discs in a row: the time between collisions falls by λ₋/λ₊ at each, see ``benchmarks.collapse``."""
-    before, exact, added = row([4.0, 5.1, 6.25], [1.0, 0.0, -1.0]), roots(3, restitution), 3
-    found = []
-    for duration in 1e-4 * (exact.smaller / exact.larger) ** np.arange(0, 2 * added, added):
-        after, sums = sheared(before, Law(restitution, duration, shear_rate=0.0), 10.0)
-        assert np.all(np.diff(after.velocities[:, 0]) > 0)
-        found.append(sums["collisions"] - sums["elastic"])
-    assert found[1] - found[0] == added

@@ -92,11 +92,3 @@ def test_every_text_is_inside_the_canvas_and_on_no_other_text(kind: str, name: s
     figure = FIGURES[name].draw(data)
     assert len(drawn_texts(figure)) > 10
     assert unreadable(figure) == []
-
-
-def test_texts_on_each_other_and_outside_are_found() -> None:
-    figure = Figure((3, 2))
-    figure.text(0.5, 0.5, "one", rotation=40)
-    figure.text(0.52, 0.52, "two")
-    figure.text(0.9, 0.1, "outside the canvas")
-    assert unreadable(figure) == ["'outside the canvas' leaves the canvas", "'one' on 'two'"]

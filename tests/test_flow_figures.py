@@ -11,9 +11,8 @@ from matplotlib import animation
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.patches import Polygon
 from PIL import Image, ImageSequence
-from synthetic import refused, snapshot_of
+from synthetic import snapshot_of
 
-import jaxgran as jg
 from jaxgran.analysis.force_chains import pair_forces
 from jaxgran.plotting import flow, movie
 from jaxgran.plotting.drawing import empty_figure
@@ -56,22 +55,6 @@ def test_grains_cut_at_the_edges_and_their_images_make_whole_grains(tilt: float)
     scene = scene_of(seen(tilt))
     grains, *_, cell = drawn(scene)
     assert area_within(grains, cell) == pytest.approx(GRAINS * np.pi / 4 / SIDE**2, rel=2e-3)
-
-
-@pytest.mark.parametrize("tilt", [-0.4, 0.25])
-def test_cell_is_the_sheared_one_around_the_origin(tilt: float) -> None:
-    corners = drawn(scene_of(seen(tilt)))[-1].get_xy()[:4]
-    np.testing.assert_allclose(corners.mean(axis=0), 0, atol=1e-12)
-    np.testing.assert_allclose(corners[1] - corners[0], [SIDE, 0])
-    np.testing.assert_allclose(corners[3] - corners[0], [tilt * SIDE, SIDE])
-
-
-def test_a_picture_does_not_jump_where_the_tilt_begins_anew() -> None:
-    """At a tilt of 1/2 and at one of −1/2 the lattice is the same: so is all that lies in both cells."""
-    before, after = (scene_of(seen(tilt)) for tilt in (0.5, -0.5))
-    for one, other in zip(before.instant.positions, after.instant.positions, strict=True):
-        apart = (one - other) / SIDE
-        assert apart[1] == 0 and apart[0] == pytest.approx(round(apart[0]))
 
 
 def test_lines_join_the_centres_of_grains_that_push_in_widths_by_their_forces() -> None:
@@ -140,29 +123,6 @@ def test_flow_without_forces_or_motion_is_drawn(contacts, tmp_path: Path) -> Non
         flow_figure(still, colour).savefig(tmp_path / "still.png")
 
 
-def without_positions():
-    lost = seen()
-    lost.state.positions[0, 3] = np.nan
-    return lost
-
-
-BAD = {
-    "no snapshot": lambda: jg.flow_figure(3),
-    "a state": lambda: jg.flow_figure(seen().state),
-    "another colour": lambda: jg.flow_figure(seen(), "mass"),
-    "no colour": lambda: jg.flow_figure(seen(), ["speed"]),
-    "not finite": lambda: jg.flow_figure(without_positions()),
-    "another movie": lambda: check_movie(Path("flow.avi")),
-    "no folder": lambda: check_movie(Path("none/flow.gif")),
-}
-
-
-@pytest.mark.parametrize("mistake", BAD)
-def test_mistakes_end_with_one_sentence(mistake: str) -> None:
-    with refused():
-        BAD[mistake]()
-
-
 # Movies
 
 
@@ -189,15 +149,6 @@ def test_gif_has_all_frames_and_they_differ(tmp_path: Path) -> None:
     assert {picture.shape for picture in pictures} == {pictures[0].shape}
     for one, other in pairwise(pictures):
         assert np.mean(one != other) > 0.02
-
-
-def test_a_frame_does_not_depend_on_those_before(tmp_path: Path) -> None:
-    frames = kept(2)
-    frames.scenes, frames.strains = [frames.scenes[k] for k in (0, 1, 0)], [0.5] * 3
-    write_movie(tmp_path / "flow.gif", frames)
-    with Image.open(tmp_path / "flow.gif") as film:
-        first, second, third = (np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film))
-    assert (first == third).all() and (first != second).any()
 
 
 def test_too_many_frames_are_thinned_evenly(monkeypatch) -> None:

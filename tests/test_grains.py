@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from jaxgran.model.checks import InputError
 from jaxgran.model.grains import own_grains, polydisperse
 
 EPS = np.finfo(float).eps
@@ -37,17 +36,3 @@ def test_own_grains_are_in_units_of_their_mean_diameter_and_weigh_what_they_are_
     np.testing.assert_allclose(2 * grains.radii, [0.5, 1.0, 1.5])
     np.testing.assert_allclose(grains.masses, [0.25, 1.0, 2.25])
     np.testing.assert_array_equal(own_grains([2, 4, 6], [7, 8, 9]).masses, [7.0, 8.0, 9.0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (([1.0, -1.0],), "diameters must be a list of positive numbers"),
-        (([[1.0, 2.0]],), "diameters must be a list of positive numbers"),
-        (([1.0, 2.0], [1.0, np.inf]), "masses must be a list of positive numbers"),
-        (([1.0, 2.0], [1.0]), "as many masses as diameters, and there are 1 and 2"),
-    ],
-)
-def test_what_can_be_no_grains_is_refused_in_one_sentence(arguments, words):
-    with pytest.raises(InputError, match=words):
-        own_grains(*arguments)

@@ -1,7 +1,6 @@
 """The error of linear interpolation is zero at the points and for planes, and that of a parabola is exact."""
 
 import numpy as np
-import pytest
 import xarray as xr
 from made_up_maps import ratio_dataset
 
@@ -28,23 +27,3 @@ def test_error_of_a_parabola_is_that_of_its_interpolation() -> None:
     error = np.abs(interpolated(3 * x**2 + 2 * y**2) - 3 * fine_x**2 - 2 * fine_y**2)
     np.testing.assert_allclose(interpolation_error(data, 3 * x**2 + 2 * y**2), error, atol=1e-13)
     assert error.max() > 0.05
-
-
-@pytest.mark.parametrize("point", [(0, 0), (1, 2), (3, 4)])
-def test_missing_points_leave_the_errors_of_others(point: tuple[int, int]) -> None:
-    data, x, y = uneven_map()
-    whole = interpolation_error(data, 3 * x**2)
-    field = 3 * x**2 + 0 * y
-    field[point] = np.nan
-    rest = interpolation_error(data, field)
-    assert np.isfinite(rest).all() and (rest <= whole + 1e-13).all()
-
-
-def test_note_has_the_errors_of_points_that_are_left_out() -> None:
-    data = ratio_dataset(7, 2)
-    x = 1 - data.restitution.values
-    step = x[0] - x[1]
-    note = left_out_note(data, [np.stack([x**2, x**2])], "the parabola")
-    assert note.endswith(f"of the parabola: median {100 * step**2:.2g} %, 90th percentile {100 * step**2:.2g} %")
-    assert "too few" in left_out_note(ratio_dataset(2, 2), [np.ones((2, 2))], "nothing")
-    assert "too few" in left_out_note(data, [np.stack([x**2, x**2])], "nothing", np.zeros((2, 7), bool))

@@ -1,6 +1,5 @@
 """A batch that was cut off anywhere goes on from its journal with the bits that it would have had."""
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -112,11 +111,3 @@ def test_the_journal_of_others_is_refused(tmp_path: Path) -> None:
     journal = Journal(path, KEYS, fake_drive)
     with pytest.raises(CorruptFile, match="another run"):
         journal(None, None, small_state(), np.array([5, 5]))
-
-
-def test_a_journal_that_takes_long_to_write_is_written_less_often(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(journal_module, "SECONDS", 0.0)
-    monkeypatch.setattr(journal_module, "write_arrays", lambda *_: written.append(time.sleep(0.02)))
-    written: list[None] = []
-    walk(Journal(tmp_path / "batch.nc", KEYS, fake_drive), 20)
-    assert len(written) < 3

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from benchmarks.dense_limit import fit, free_fit, ratio_exponent
 from benchmarks.size_limits import (
     AVERAGES,
     Flow,
-    compared_with_larger,
     exponents,
     flows_of,
     law_of,
@@ -46,60 +44,3 @@ def test_the_shared_exponent_is_in_its_interval_and_chi_squared_excludes_a_logar
     assert found["chi_squared"]["ln N"] > found["best"][1] + 50
     for flow, one in zip(flows, limits_of(flows, found["interval"]), strict=True):
         assert one["interval"][0] - 4e-3 < 2 < one["interval"][1] + 4e-3, flow
-
-
-def test_a_larger_flow_is_where_both_laws_say_if_it_obeys_them() -> None:
-    flows, grains = flows_of(study(1e-5), AVERAGES[0]), 102_400
-    large = Flow("", 0.3, 0.5, np.array([grains], float), np.array(()), np.array(()))
-    row = {"restitution": 0.3, "packing_fraction": 0.5, "grains": grains}
-    row[AVERAGES[0]] = [2 * (1 - missing_part(np.array(LAW), large)[0]), 2e-5]
-    laws = {"exponents": {"interval": [LAW[0] - 0.1, LAW[0] + 0.1]}, "law": {"constants": LAW}}
-    found = compared_with_larger(row, flows, AVERAGES[0], laws)
-    value, error = found["measured"]
-    assert abs(value - found["by_law"]) < 4 * error
-    assert found["by_exponent"][0] - 4 * error < value < found["by_exponent"][1] + 4 * error
-    assert found["grains"] == [102_400, 25_600]
-
-
-@pytest.mark.parametrize(
-    ("exponent", "amplitude", "critical"), [(0.35, 0.1, 0.845), (0.5, 0.2, 0.84), (0.81, 0.3, 0.83)]
-)
-def test_a_power_law_with_a_free_exponent_is_found(exponent: float, amplitude: float, critical: float) -> None:
-    """Exact points, which have no other law."""
-    number = np.geomspace(0.01, 0.2, 12)
-    points = {
-        "inertial_number": number,
-        "inertial_number_stderr": 0.01 * number,
-        "packing_fraction": critical - amplitude * number**exponent,
-    }
-    found = free_fit(points, "packing_fraction")
-    (value, error), (offset, offset_error) = found["exponent"], found["offset"]
-    assert abs(value - exponent) <= max(error, 0.0026)
-    assert abs(offset - critical) <= max(offset_error, 1e-4)
-
-
-def test_dense_fit_with_a_correction_finds_the_limit_within_its_error() -> None:
-    rng, number = np.random.default_rng(1), np.geomspace(0.02, 0.17, 16)
-    found = []
-    for _ in range(200):
-        measured = number * (1 + 0.02 * rng.normal(size=16))
-        fraction = 0.8435 - 0.06 * number**0.4 - 0.17 * number
-        found.append(fit(measured, 0.02 * measured, fraction, np.zeros(16), 0.4, 1.0))
-    offsets, errors = np.array([one[:2] for one in found]).T
-    assert offsets.mean() == pytest.approx(0.8435, abs=0.3 * errors.mean())
-    assert 0.7 < offsets.std() / errors.mean() < 1.3
-    assert np.mean([one.reduced_chi_squared for one in found]) == pytest.approx(1, abs=0.15)
-
-
-def test_exponent_of_pressure_over_temperature_is_that_of_the_points() -> None:
-    nu = np.linspace(0.79, 0.83, 8)
-    points = {
-        "packing_fraction": nu,
-        "pressure": (0.84 - nu) ** -3.5,
-        "granular_temperature": (0.84 - nu) ** -1.5,
-        "pressure_stderr": 0.01 * (0.84 - nu) ** -3.5,
-        "granular_temperature_stderr": 0.01 * (0.84 - nu) ** -1.5,
-    }
-    exponent, error = ratio_exponent(points, 0.84)
-    assert exponent == pytest.approx(2)
-    assert 0 < error < 0.05

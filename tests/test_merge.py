@@ -126,12 +126,6 @@ def test_every_point_is_in_one_part_and_parts_cost_alike(count: int) -> None:
     assert max(totals) - min(totals) <= max(costs)
 
 
-@pytest.mark.parametrize("part", ["4/3", "1/7", "one", 3])
-def test_a_part_that_is_none_is_refused(part: Any) -> None:
-    with refused("part must be K/N"):
-        replace(SETTINGS, part=part)
-
-
 @pytest.mark.environment
 def test_an_array_job_of_the_page_makes_the_map_of_one_process(tmp_path: Path) -> None:
     """The commands of the batch script, each in a process of its own, on a map of a few grains."""

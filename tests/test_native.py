@@ -249,7 +249,7 @@ def test_near_pairs_are_those_of_all_images(near_pairs_found, count, packing_fra
     room = count * (count - 1) // 2
     cells = np.empty(max(9, 2 * count) + 1, np.uint32), *np.empty((2, count), np.uint32), np.empty((3, count))
     listed = np.empty((2, room + 1), np.uint32), np.empty((2, room + 1))
-    memory = layout.Pairs(*listed, *3 * [None], *cells, *3 * [None])
+    memory = layout.Pairs(*listed, *4 * [None], *cells, *3 * [None])
     grains = layout.Grains(motion, np.stack([radii, np.ones(count)], axis=-1))
     found = near_pairs_found(grains, memory, side, tilt, reach, skin, room)
     pairs, images = memory.ends, memory.images

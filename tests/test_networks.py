@@ -12,13 +12,11 @@ from benchmarks import networks as module
 from benchmarks.exact_contacts import exact, incidence
 from benchmarks.gauss_seidel import gauss_seidel
 from benchmarks.networks import CHAINS, INFEASIBLE, chain, collection
-from benchmarks.stability import JacobiDiagonal
 from jaxgran.contact.delassus import spectral_bound
 from jaxgran.contact.projected_methods import BarzilaiBorwein, Jacobi, Nesterov
 from jaxgran.contact.solver import solve
 from jaxgran.model.status import Status
 
-SIZE_RATIO, MASS_RATIO, HEXAGONAL = "size ratio 10", "mass ratio 10⁴", "hexagonal cluster"
 compiled_bound = jax.jit(spectral_bound, static_argnums=1)
 
 
@@ -85,42 +83,6 @@ def test_default_converges_to_the_exact_velocities(feasible, solution_of, exact_
         assert solution.status == Status.ok
         error = energy(network, changes(network, solution.impulses) - reference.changes)
         assert error < 1e-12 * energy(network, reference.changes)
-
-
-def test_gauss_seidel_converges_to_the_exact_velocities(networks, exact_of):
-    for group in ("flow ν 0.8, α 0", "flow ν 0.82, α 0.9", "flow ν 0.6, α 0.5", SIZE_RATIO, HEXAGONAL):
-        for network in networks[group]:
-            solution = gauss_seidel(network.contacts, network.grains, 1e-10, 20_000)
-            reference = exact_of(network)
-            assert solution.status == Status.ok
-            np.testing.assert_allclose(
-                solution.response, incidence(network.contacts, network.grains) @ reference.changes.ravel(), atol=1e-7
-            )
-
-
-def test_scaling_by_the_diagonal_diverges_where_it_does_not_bound(feasible, solution_of, exact_of):
-    """Where λmax(diag(W)⁻¹ W) > 2 on the contacts that push, the solution repels Jacobi with diag(W).
-
-    Only where the impulses are unique, with W regular on the contacts that do not part: else Jacobi may end at another
-    solution, or be at one at once, as in a ring that is pressed alike from all sides.
-    """
-    repelled = 0
-    for network in feasible:
-        matrix, approach = operator_and_approach(network)
-        own, impulses = np.diag(matrix), exact_of(network).impulses[np.asarray(network.contacts.used)]
-        rounding = 1e-9 * np.linalg.norm(np.minimum(approach, 0))
-        after, matrix = matrix @ impulses + approach, matrix / np.sqrt(own[:, None] * own[None, :])
-        touching, pushing = after < rounding, own * impulses > rounding
-        if np.linalg.eigvalsh(matrix[np.ix_(touching, touching)])[0] < 1e-9:
-            continue
-        if np.linalg.eigvalsh(matrix[np.ix_(pushing, pushing)])[-1] > 2.1:
-            assert solution_of(network, 1e-8, 20_000).status == Status.ok
-            assert (
-                solution_of(network, 1e-8, 5000, partial(JacobiDiagonal, relaxation=1.0)).status
-                == Status.iteration_limit
-            )
-            repelled += 1
-    assert repelled >= 3  # how many there are depends on the last bits of the flows that the networks are from
 
 
 def test_jacobi_with_the_spectral_bound_lowers_the_objective_in_every_step(feasible, solution_of):

@@ -158,17 +158,6 @@ def test_quotient_of_nothing_is_nan_without_a_warning() -> None:
         assert np.isnan(found[name]).all(), name
 
 
-def test_free_flow_has_no_ratio_but_a_pressure() -> None:
-    counts = ("contacts", "loaded_contacts", "collisions", "solves", "iterations")
-    nothing = dict.fromkeys(("impulse", "binary_impulse", *counts), 0.0)
-    moments = dict.fromkeys(("contact_moment", "binary_moment"), np.zeros((2, 2)))
-    tally = Tally(**{**vars(random_tally(np.random.default_rng(2))), **nothing, **moments})
-    found = averages(tally, np.float64(AREA), GRAINS, np.float64(SHEAR_RATE))
-    assert np.isnan(found["force_ratio"])
-    assert found["pressure"] == pytest.approx(np.trace(found["kinetic_stress"]) / 2) and found["pressure"] > 0
-    assert found["coordination_number"] == found["collision_rate"] == 0
-
-
 def test_every_observable_is_measured_with_a_unit(measured) -> None:
     assert set(measured) == set(OBSERVABLES)
     for name, one in OBSERVABLES.items():

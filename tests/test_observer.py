@@ -8,19 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import GRAINS
-from synthetic import refused
 
 from jaxgran.contact.projected_methods import BarzilaiBorwein
 from jaxgran.dynamics import observed_advance
-from jaxgran.dynamics.advance import advance, call_numba
+from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Jax, Numerics
-from jaxgran.dynamics.numba_engine.layout import record_numbers
 from jaxgran.dynamics.observed_advance import advance_observed
 from jaxgran.dynamics.snapshots import Snapshot, snapshot_of
 from jaxgran.model.checks import InputError
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.grains import Grains
-from jaxgran.model.state import State
 from jaxgran.sampling.sample import BLOCKS, sample
 
 STRAIN = 0.32
@@ -151,38 +147,9 @@ def test_callback_is_told_of_every_block_and_may_end_the_sample(flowing) -> None
     np.testing.assert_allclose(told_end.velocities, end.velocities, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"observe": 3}, "observe must be a function or None, not 3"),
-        ({"callback": "tell"}, "callback must be a function or None, not 'tell'"),
-        ({"observe": lambda seen: seen.impulses}, "observe must return sums over the contacts"),
-        ({"observe": lambda _: 1j}, "observe must return real numbers"),
-        ({"observe": lambda _: "much"}, "observe must return real numbers"),
-    ],
-)
-def test_what_cannot_be_observed_is_refused_in_one_sentence(flowing, changed: dict, words: str) -> None:
-    with refused(words):
-        sample(FLOW, flowing(0.7), STRAIN, **changed)
-
-
 def test_callback_is_refused_under_a_transformation(flowing) -> None:
     with pytest.raises(InputError, match="callback must be None for a batch, and where"):
         jax.jit(lambda state: sample(FLOW, state, STRAIN, callback=print))(flowing(0.7))
-
-
-@pytest.mark.parametrize("grains", [256, 10_000, 170_000, 10**6])
-def test_records_of_a_call_are_within_a_number_of_bytes_or_the_fewest(grains: int) -> None:
-    records = observed_advance.records_of_call(grains)
-    assert records >= 2 and (records == 2 or 8 * records * record_numbers(grains) <= 2**26)
-    call = jax.eval_shape(
-        lambda: call_numba(replace(FLOW, grains=grains), BarzilaiBorwein(), _shapes(grains), jnp.ones(1), records)
-    )
-    assert call.records.shape == (records, record_numbers(grains))
-
-
-def _shapes(grains: int) -> State:
-    return State(Grains(*jnp.ones((2, grains))), *jnp.zeros((2, grains, 2)), jnp.ones(()), jnp.zeros(()))
 
 
 def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monkeypatch) -> None:
@@ -190,11 +157,3 @@ def test_the_fewest_records_of_a_call_give_the_same_sums(flowing, observed, monk
     _, own = sample(FLOW, flowing(0.7), STRAIN, observe=lambda seen: observe(seen))
     same = partial(np.testing.assert_allclose, rtol=1e-14)  # XLA may add up in another order
     jax.tree.map(same, own.observed_sums, observed[1].observed_sums)
-
-
-@pytest.mark.parametrize("engine", [None, Jax()])
-@pytest.mark.parametrize("nothing", [None, {}, ()])
-def test_a_function_that_returns_nothing_is_refused_before_anything_runs(flowing, nothing, engine, monkeypatch) -> None:
-    monkeypatch.setattr("jaxgran.sampling.sample.waited", lambda _: pytest.fail("it ran"))
-    with refused("observe must return at least one number, not"):
-        sample(FLOW, flowing(0.7), STRAIN, observe=lambda _: nothing, engine=engine)

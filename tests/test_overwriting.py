@@ -3,17 +3,13 @@
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import POINTS, assert_one_sentence, files, jaxgran, made_up_replicas, write_few_variables
 from drawn import write_without_drawing
 
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
-from jaxgran.maps.checkpoint import Checkpoint
-from jaxgran.maps.presets import PRESETS
-from jaxgran.maps.results import is_finished, open_map
-from jaxgran.maps.settings import MapSettings
+from jaxgran.maps.results import open_map
 from jaxgran.model.status import Status
 from jaxgran.plotting.theory import SHARES
 from jaxgran.sampling.budget import BUDGET
@@ -55,6 +51,8 @@ def finished(original: Path, tmp_path: Path) -> bytes:
 
 
 def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finished: bytes, tmp_path: Path) -> None:
+    for name in ("timestep", "notes"):  # a picture of an earlier map, and one of the user's
+        (tmp_path / f"jaxgran_map_{name}.png").touch()
     before = files(tmp_path)
     outcome = jaxgran(tmp_path, *MAP, "--strain", "9", "--grains", "64")
     assert_one_sentence(outcome)
@@ -62,11 +60,7 @@ def test_a_map_of_other_parameters_is_refused_and_the_first_of_them_named(finish
     assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished and files(tmp_path) == before
     assert jaxgran(tmp_path, *MAP, "--grains", "64", "--overwrite").status == 0
     assert open_map(tmp_path / "jaxgran_map.nc").attrs["grains"] == 64
-
-
-def test_the_same_map_may_be_repeated(finished: bytes, tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3").status == 0  # as by default
-    assert (tmp_path / "jaxgran_map.nc").read_bytes() != finished  # it has another command
+    assert "jaxgran_map_timestep.png" not in files(tmp_path) and "jaxgran_map_notes.png" in files(tmp_path)
 
 
 def test_what_is_no_map_is_not_replaced(tmp_path: Path) -> None:
@@ -103,47 +97,6 @@ def test_an_interrupted_map_does_not_replace_a_finished_one(finished: bytes, tmp
         unfinished.rmdir()
 
 
-def test_presets_have_outputs_of_their_own(finished: bytes, tmp_path: Path) -> None:
-    assert jaxgran(tmp_path, *MAP, "--preset", "paper").status == 0
-    assert (tmp_path / "jaxgran_map.nc").read_bytes() == finished
-    data = open_map(tmp_path / "jaxgran_map_paper.nc")
-    assert data.attrs["grains"] == PRESETS["paper"]["grains"] and is_finished(data)
-
-
-def test_pictures_of_an_earlier_map_go(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(
-        ratio_map_module, "run_replicas", made_up_replicas({(point, 0): Status.ok for point in range(4)})
-    )
-    names = {"jaxgran_map_curves.png", "jaxgran_map_timestep.png", "jaxgran_map_clusters.png"}
-    assert jaxgran(tmp_path, *MAP, "--timestep", "1e-3,1e-4").status == 0
-    assert files(tmp_path) >= names
-    (tmp_path / "jaxgran_map_notes.png").touch()
-    assert jaxgran(tmp_path, "plot", "jaxgran_map.nc").status == 0
-    assert files(tmp_path) >= names
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(BOTH))
-    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 0
-    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
-    assert "jaxgran_map_timestep.png" not in pictures and "jaxgran_map_notes.png" in pictures
-
-
-@pytest.mark.parametrize("words", [[], ["--resume"]])
-def test_a_map_that_is_there_replaces_no_file_by_a_figure(words: list[str], finished: bytes, tmp_path: Path) -> None:
-    """As where the map was made in Python, without figures, and the file by someone else."""
-    figure, other = tmp_path / "jaxgran_map_curves.png", tmp_path / "jaxgran_map_clusters.png"
-    figure.write_bytes(b"by hand")
-    other.unlink()
-    assert jaxgran(tmp_path, *MAP, *words).status == 0
-    assert figure.read_bytes() == b"by hand" and other.exists()
-    assert jaxgran(tmp_path, *MAP, *words, "--overwrite").status == 0
-    assert figure.read_bytes() != b"by hand"
-
-
-def test_a_part_that_replaces_a_map_leaves_none_of_its_figures(finished: bytes, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(dict(list(BOTH.items())[:1])))
-    assert jaxgran(tmp_path, *MAP, "--part", "1/2", "--overwrite").status == 0
-    assert not [name for name in files(tmp_path) if name.endswith(".png")]
-
-
 def test_plot_and_a_map_without_overwrite_remove_nothing(finished: bytes, tmp_path: Path) -> None:
     names = ("jaxgran_map_timestep.pdf", "other_theory.pdf", "other_theory.svg")
     for name in names:  # none of which is a picture of these maps
@@ -166,16 +119,6 @@ def test_a_new_map_replaces_no_file_by_a_figure(finished: bytes, command: str, t
     assert files(tmp_path) == before and (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"
     assert jaxgran(tmp_path, *words, "--output", "ratio.nc", "--overwrite").status == 0
     assert (tmp_path / "ratio_theory.png").read_bytes() == b"by hand"  # a line of points has no such figure
-
-
-def test_an_interrupted_map_leaves_the_figures_that_are_there(finished: bytes, tmp_path: Path, monkeypatch) -> None:
-    half = dict(list(BOTH.items())[:1])
-    pictures = {name for name in files(tmp_path) if name.endswith(".png")}
-    (tmp_path / "jaxgran_map.nc").write_bytes(b"not a map")  # so that the half is written in its place
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas(half, KeyboardInterrupt))
-    assert jaxgran(tmp_path, *MAP, "--overwrite").status == 130
-    assert open_map(tmp_path / "jaxgran_map.nc").status.size == 2
-    assert pictures and files(tmp_path) >= pictures
 
 
 def test_pages_are_replaced_by_those_of_the_same_map_alone(finished: bytes, tmp_path: Path) -> None:
@@ -205,15 +148,3 @@ def test_frames_are_not_replaced(option: str, tmp_path: Path) -> None:
     assert_one_sentence(outcome)
     assert f"--{option} {file.name!r} already exists; pass --overwrite" in outcome.err
     assert files(tmp_path) == {file.name}
-
-
-def test_two_runs_do_not_write_one_file(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(ratio_map_module, "run_replicas", made_up_replicas({(0, 0): Status.ok}))
-    first = Checkpoint(tmp_path / "flow.nc", MapSettings((0.5,), (0.6,)), False)
-    outcome = jaxgran(tmp_path, *RUN)
-    assert_one_sentence(outcome)
-    assert "another process is writing 'flow.nc'" in outcome.err
-    first.close(finished=True)
-    assert jaxgran(tmp_path, *RUN).status == 0
-    assert files(tmp_path) == {"flow.nc"}
-    np.testing.assert_array_equal(open_map(tmp_path / "flow.nc").status, [[Status.ok]])

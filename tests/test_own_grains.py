@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import GRAINS
-from oracles import build, gaps_of, listed_pairs, move, pairs_within
+from oracles import build, gaps_of, listed_pairs, pairs_within
 from scipy.special import ndtri
 from synthetic import refused
 
@@ -20,7 +20,7 @@ from jaxgran.model.grains import Grains, own_grains, polydisperse
 from jaxgran.model.state import State
 from jaxgran.model.status import Status
 from jaxgran.sampling.packing import pack, require_room
-from jaxgran.sampling.prediction import predicted, size_classes
+from jaxgran.sampling.prediction import size_classes
 from jaxgran.sampling.steady_state import heated, prepare
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
 
@@ -60,23 +60,6 @@ def test_packing_has_the_grains_no_overlap_and_the_packing_fraction(packed_own, 
     np.testing.assert_allclose(2 * radii, LAWS[law] / LAWS[law].mean(), rtol=1e-14)
     assert np.min(gaps_of(state.positions, radii, side, 0.0)) >= 0
     assert np.sum(np.pi * radii**2) / side**2 == pytest.approx(packing_fraction, rel=1e-13)
-
-
-@pytest.mark.parametrize("law", ["1 to 5"])
-@pytest.mark.parametrize("packing_fraction", [0.2, 0.8])
-def test_valid_list_misses_no_touching_pair(packed_own, law, packing_fraction):
-    """Under random motion and shear over several remaps of the tilt, against brute force over all pairs and images."""
-    state, rng = packed_own(law, packing_fraction), np.random.default_rng(1)
-    side, radii = float(state.side), np.asarray(state.grains.radii)
-    hood, touching, rebuilds = build(state.positions, state.grains, state.side, state.tilt), 0, 0
-    for _ in range(80):
-        moves = 0.04 * rng.normal(size=state.positions.shape)
-        hood, rebuilt, positions, tilt = move(hood, state.grains, state.side, moves, jnp.asarray(0.03))
-        assert not (hood.near.overflow | hood.outer.overflow)
-        touch = pairs_within(0, positions, radii, side, tilt)
-        assert touch <= listed_pairs(hood.near)
-        touching, rebuilds = touching + len(touch), rebuilds + bool(rebuilt)
-    assert touching > 20 and rebuilds >= 2
 
 
 @pytest.mark.parametrize("law", ["1 to 5", "lognormal"])
@@ -150,13 +133,6 @@ def test_theory_of_given_grains_is_that_of_their_law():
         assert getattr(doubled, name) == pytest.approx(unit * float(getattr(given, name)), rel=1e-6)
 
 
-def test_theory_of_unlike_masses_is_finite_at_every_restitution():
-    batch = jax.tree.map(lambda x: x[None], own_grains(LAWS["1 to 5"], np.where(EVEN, 10.0, 0.01)))
-    for alpha in (0.0, 0.5, 1.0):
-        flow = jax.tree.map(lambda x: jnp.asarray([x], float), flow_of(restitution=alpha))
-        assert np.all(np.asarray(predicted(flow, batch).granular_temperature) > 0)
-
-
 def test_cell_lists_of_unlike_grains_are_complete_or_flagged():
     """Six hundred grains at random places, found through cells, against brute force."""
     grains = own_grains(np.where(np.arange(600) % 2, 1.0, 5.0))
@@ -195,20 +171,3 @@ def test_a_grain_too_large_for_the_lists_is_refused_and_the_limit_stated_is_one_
     assert relative(below) > 0.8 * limit
     side = cell_side(below.radii, flow.packing_fraction)
     assert float(widest_skin(below, side)) >= 0.2
-
-
-@pytest.mark.parametrize(
-    ("grains", "words"),
-    [
-        (own_grains(np.ones(GRAINS + 1)), "radii and masses of 32 discs"),
-        (Grains(jnp.full(GRAINS, 0.35), jnp.ones(GRAINS)), "mean diameter must be 1, the unit of length, not 0.7"),
-        (Grains(jnp.full(GRAINS, 0.5), jnp.zeros(GRAINS)), "masses must be a list of positive numbers"),
-        (Grains(jnp.full(GRAINS, jnp.nan), jnp.ones(GRAINS)), "radii must be a list of positive numbers"),
-        (Grains(jnp.full(GRAINS, 0.5), jnp.ones(3)), "of shapes"),
-        (0.5, "grains must be Grains"),
-    ],
-)
-def test_grains_that_are_not_the_flows_are_refused_in_one_sentence(grains, words):
-    for function in (pack, prepare, heated):
-        with refused(words):
-            function(flow_of(), jax.random.key(0), grains=grains)

@@ -9,8 +9,6 @@ import pytest
 import xarray as xr
 from synthetic import refused
 
-from jaxgran.contact.projected_methods import Jacobi
-from jaxgran.dynamics.engine import Numba
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import checkpoint, journal
 from jaxgran.maps.own_observables import identity_of
@@ -136,27 +134,3 @@ def test_constants_of_what_a_function_calls_count(where: str) -> None:
     changed = constant.copy()
     changed[1000] += 1
     assert of(constant) == of(constant.copy()) != of(changed)
-
-
-REFUSED = {
-    words: function
-    for function, words in [
-        (3, "must be a function that is passed to `ratio_map`, or None, not 3"),
-        (lambda seen: seen.state.side, "must return a dictionary of numbers or arrays by name"),
-        (lambda seen: {"a": seen.impulses}, "must return sums over the contacts"),
-        (lambda _: {"of all": 1.0}, "names without spaces and signs, not .'of all'."),
-        (lambda _: {"pressure": 1.0}, "names that a map does not have, not 'pressure'"),
-        (lambda _: {"a_ci95": 1.0}, "names that a map does not have, not 'a_ci95'"),
-    ]
-}
-
-
-@pytest.mark.parametrize("words", REFUSED)
-def test_what_a_map_cannot_average_is_refused_before_it_runs(words: str) -> None:
-    with refused(words):
-        ratio_map(**MAP, observe=REFUSED[words])
-
-
-def test_an_engine_that_cannot_observe_is_refused() -> None:
-    with pytest.raises(InputError, match="with the solver jacobi, not numba"):
-        ratio_map(**MAP, engine=Numba(), solver=Jacobi(), observe=observe)

@@ -10,18 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from command_line import jaxgran
-from made_up_maps import ratio_dataset, with_grains, with_timesteps
+from made_up_maps import ratio_dataset, with_grains
 from pages import MARKUP, page_map
-from synthetic import one_sentence, random_instant, random_state
+from synthetic import one_sentence, random_instant
 
 import jaxgran as jg
-from jaxgran.maps.points import PointGrid
 from jaxgran.maps.schema import flattened, path_of
-from jaxgran.maps.states import state_variables
-from jaxgran.model.checks import InputError
-from jaxgran.page.document import Page, document
+from jaxgran.page.document import Page
 from jaxgran.page.grain_data import grain_data, scale_of
 from jaxgran.page.map_data import MOST_POINTS, map_data
 from jaxgran.reference.table import MEASURED, Table, shipped_table
@@ -70,16 +66,10 @@ def test_every_number_of_a_map_is_on_its_page_to_six_digits(found) -> None:
         if not observable.extreme:
             correlated = data["diagnostics/correlation_strain"].sel(observable=name)
             assert_same_numbers(one["samples"], (strain / correlated).values)
+    ratio = data.force_ratio.transpose(*dims).values
+    assert_same_numbers(by_name["excess"]["value"], ratio - 1)
     assert [axis["values"] for axis in found["axes"]] == [[64], [5e-4, 1e-3], [0.5, 0.6], [0.5, 0.7, 0.9]]
     assert not [name for name in by_name if re.search("_stderr|_seed|ci95|snapshot|status", name)]
-
-
-def test_force_ratio_stands_first_and_then_its_excess_over_one(found) -> None:
-    ratio, excess = found["observables"][:2]
-    assert (ratio["name"], excess["name"], excess["meaning"]) == ("force_ratio", "excess", "force ratio − 1")
-    data = flattened(page_map()).sortby("timestep").force_ratio
-    assert_same_numbers(excess["value"], data.transpose("timestep", "packing_fraction", "restitution").values - 1)
-    assert excess["error"] == ratio["error"] and excess["whole"] == ratio["whole"]
 
 
 def test_points_without_a_number_and_with_a_bad_status_are_told_apart(found) -> None:
@@ -107,38 +97,11 @@ def test_instant_is_packed_without_visible_loss() -> None:
     np.testing.assert_allclose(force / 255, np.minimum(one.force / scale.force, 1), atol=1 / 500)
 
 
-@pytest.mark.parametrize(("alphas", "nus"), [(1, 1), (4, 1), (1, 3)])
-def test_map_of_one_point_or_one_row_has_a_page(alphas: int, nus: int) -> None:
-    page = written(jg.explore(ratio_dataset(alphas, nus)))
-    assert [len(axis["values"]) for axis in page["axes"]] == [1, 1, nus, alphas]
-    assert len(page["observables"][0]["value"]) == len(page["status"]) == alphas * nus
-    assert page["again"] is None  # this file does not tell how it was made
-
-
-def test_map_of_another_program_shows_its_own_names() -> None:
-    values = ("restitution", "packing_fraction"), np.arange(6.0).reshape(2, 3)
-    other = xr.Dataset({"stress of mine": values}, {"restitution": [0.9, 0.5], "packing_fraction": [0.1, 0.2, 0.3]})
-    page = map_data(other)
-    (one,) = page["observables"]
-    assert (one["name"], one["unit"]) == ("stress of mine", "") and "error" not in one
-    assert one["value"] == [3, 0, 4, 1, 5, 2]  # by packing fraction, then restitution, both rising
-    assert page["status"] == ["ok"] * 6 and page["axes"][0]["values"] == page["axes"][1]["values"] == []
-
-
-def test_several_numbers_of_grains_are_an_axis_and_an_estimate_without_them_is_shown_at_each() -> None:
-    data = with_grains(ratio_dataset(2, 2), 64, 256)
-    data["limit"] = data.pressure[0].drop_vars("grains")
-    page = map_data(data)
-    assert page["axes"][0]["values"] == [64, 256]
-    (limit,) = (one for one in page["observables"] if one["name"] == "limit")
-    assert_same_numbers(limit["value"], np.stack([data.limit.values] * 2))
-
-
-def test_number_of_grains_that_was_chosen_by_point_stands_at_its_point() -> None:
+def test_numbers_of_grains_are_an_axis_or_stand_at_their_points() -> None:
     data = ratio_dataset(2, 2)
+    assert map_data(with_grains(data, 64, 256))["axes"][0]["values"] == [64, 256]
     page = map_data(data.assign(point_grains=(data.force_ratio.dims, [[64, 90], [128, 256]])))
-    assert page["grains"] == [64, 90, 128, 256] and len(page["observables"]) == 2
-    assert map_data(data)["grains"] is None
+    assert page["grains"] == [64, 90, 128, 256]
 
 
 def test_million_points_are_thinned_with_a_word_about_it() -> None:
@@ -149,28 +112,6 @@ def test_million_points_are_thinned_with_a_word_about_it() -> None:
     (note,) = page["notes"]
     assert one_sentence(note.replace("points. This", "points: this")) and "1000000 points" in note
     assert len(map_data(ratio_dataset(1, 100_000))["status"]) == MOST_POINTS
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (3, "must be a ratio map, and this is a int"),
-        (xr.Dataset(), "it has no packing_fraction, restitution"),
-        (ratio_dataset()[["status"]], "it has no number at its points"),
-        (with_timesteps(ratio_dataset(1, 1), *np.geomspace(1e-5, 1e-3, 101).tolist()), "at most 100 numbers of grains"),
-    ],
-    ids=["number", "nothing", "only statuses", "too many time steps"],
-)
-def test_what_cannot_be_shown_is_refused_in_one_sentence(data, words: str) -> None:
-    with pytest.raises(InputError, match=words) as refused:
-        jg.explore(data)
-    assert one_sentence(str(refused.value))
-
-
-def test_a_page_without_plotly_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
-    with pytest.raises(InputError, match="pip install 'jaxgran\\[explore\\]'"):
-        jg.explore(ratio_dataset())
 
 
 def test_names_and_attributes_cannot_leave_the_data_of_a_page() -> None:
@@ -200,26 +141,12 @@ def test_attribute_that_is_no_option_gives_no_command_to_paste(name: str) -> Non
     assert map_data(flattened(data).assign_attrs({name: "midpoint; rm -rf ~"}))["again"] is None
 
 
-def test_page_of_120_points_of_a_thousand_grains_has_less_than_six_megabytes() -> None:
-    data = ratio_dataset(10, 12)
-    instants = dict.fromkeys(range(120), random_state(0, 1000, 34.0))
-    variables = state_variables(PointGrid(("packing_fraction", "restitution"), (12, 10)), instants)
-    page = jg.explore(xr.DataTree.from_dict({"/": data, "states": xr.Dataset(variables)}))
-    assert len(written(page)["instants"]) == 120
-    assert len(page.text) < 6e6
-
-
 def test_explore_writes_a_page_that_a_notebook_shows(tmp_path: Path) -> None:
     page = jg.explore(ratio_dataset(), tmp_path / "map.html")
     assert (tmp_path / "map.html").read_text(encoding="utf-8") == page.text
     frame = page._repr_html_()
     assert frame.startswith("<iframe") and html.escape(page.text) in frame
     assert "MB" in repr(page)
-
-
-def test_data_of_a_page_have_no_numbers_that_json_lacks() -> None:
-    with pytest.raises(ValueError, match="JSON"):
-        document("map", (), "title", {"value": math.nan})
 
 
 def test_a_page_has_the_verdict_on_every_flow_in_the_range_of_the_reference_map() -> None:
@@ -255,3 +182,9 @@ def test_explore_without_a_file_writes_the_reference_map(tmp_path: Path) -> None
 
 def flows_of(table: Table) -> list[tuple[float, float]]:
     return list(zip(table.columns["restitution"], table.columns["packing_fraction"], strict=True))
+
+
+def test_a_page_without_plotly_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+    with pytest.raises(jg.InputError, match="pip install 'jaxgran\\[explore\\]'"):
+        jg.explore(ratio_dataset())

@@ -7,7 +7,7 @@ import pytest
 
 from jaxgran.maps.batches import predicted_cost
 from jaxgran.maps.parameters import MapParameters
-from jaxgran.maps.progress import Meter, progress
+from jaxgran.maps.progress import Meter
 from jaxgran.maps.replica import Advance
 from jaxgran.maps.settings import chosen_settings
 
@@ -42,23 +42,3 @@ def test_work_before_a_replica_is_finished_counts_up_to_its_expected_cost() -> N
     meter.finished((0, 0))
     meter.finished((0, 1))
     assert shares(meter) == ("1/2 points", f"{200 * cost:.0f} % done")
-
-
-def test_time_left_is_that_of_this_run(monkeypatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    meter = Meter(SETTINGS, quiet=True)
-    meter.resumed([(0, 0), (0, 1)])
-    now[0] = 60.0
-    meter.finished((1, 0))
-    assert meter._line().endswith("0:01:00 left")
-
-
-def test_lines_without_a_terminal_are_ten_seconds_apart(monkeypatch, capsys) -> None:
-    now = [0.0]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    with progress(SETTINGS, quiet=False) as meter:
-        for now[0] in (1.0, 11.0, 12.0, 22.5):
-            meter.advanced(Advance([(0, 0)], [1e-3], [100]))
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 4 and lines[0] == "0/2 points, compiling"

@@ -12,7 +12,7 @@ import xarray as xr
 from flows import in_batches
 from hypothesis import given
 from hypothesis import strategies as st
-from synthetic import random_replica, refused
+from synthetic import random_replica
 
 from jaxgran.io.atomic import read_arrays
 from jaxgran.maps import ratio_map as ratio_map_module
@@ -156,12 +156,6 @@ def test_a_recorder_follows_one_replica_at_a_time(settings, monkeypatch) -> None
     assert sizes == [1] * 60 and len(done) == 60
 
 
-@pytest.mark.parametrize("name", ["seeds", "precision", "engine", "wall_time_seconds", "code_digest", "output"])
-def test_attributes_of_the_users_do_not_replace_those_of_the_map(name: str) -> None:
-    with refused(f"attributes must have names that a map does not have, not '{name}'"):
-        ratio_map(**SETTINGS, attributes={name: 7})
-
-
 def test_a_batch_that_does_not_fit_into_the_memory_is_halved(settings, results, tmp_path, monkeypatch) -> None:
     """Its numbers stay the same; a single replica that does not fit is an error."""
     measured, largest, sizes = run_replicas_module._measured, 1, []
@@ -270,17 +264,6 @@ def test_first_of_several_numbers_of_grains_has_the_numbers_of_a_map_at_it_alone
     xr.testing.assert_equal(first, alone.to_dataset())
     assert not np.any(data.pressure[0] == data.pressure[1])
     assert set(choices_of(data)["grains"]) == {32, 64} and choices_of(data.sel(grains=64))["grains"] == 64
-
-
-WRONG = [{"workers": 0}, {"output": "map.txt"}, {"resume": True}, {"progress": 3}, {"scheduler": 3}, {"attributes": 3}]
-WRONG += [{"overwrite": 1}, {"record": 3}]
-
-
-@pytest.mark.parametrize("mistake", WRONG, ids=str)
-def test_how_a_map_is_run_is_checked(mistake: dict[str, Any]) -> None:
-    with pytest.raises(InputError) as caught:
-        ratio_map(**SETTINGS, **mistake)
-    assert caught.value.field == next(iter(mistake)) and caught.value.field in str(caught.value)
 
 
 def test_the_function_has_the_arguments_of_the_table_and_says_what_they_mean() -> None:

@@ -45,23 +45,6 @@ def test_every_average_is_drawn_over_its_value_at_the_largest_number_of_grains(a
         np.testing.assert_allclose(np.diff(ends)[:, 0], 2 * np.where(np.arange(len(SIZES)) < 2, of_both, 0.0))
 
 
-def test_bad_status_and_missing_values_are_marked_at_their_number_of_grains() -> None:
-    data = with_grains(ratio_dataset(2, 2), *SIZES)
-    data.status[0, 1, 0] = 1
-    for name in NAMES:
-        data[name][2, 0, 0] = np.nan
-    figure = averages_against_grains(data)
-    for axes, name in zip(figure.axes, NAMES, strict=True):
-        rings = [line.get_xydata() for line in axes.lines if line.get_markersize() > 8]
-        np.testing.assert_allclose(np.concatenate(rings), [[256, data[name][0, 1, 0] / data[name][2, 1, 0]]])
-
-
-def test_one_number_of_grains_is_nothing_to_draw_against() -> None:
-    for data in (ratio_dataset(), with_grains(ratio_dataset(), 256)):
-        with pytest.raises(ValueError, match="at least two numbers of grains, and this map has 1"):
-            averages_against_grains(data)
-
-
 def test_parts_are_the_maps_at_every_number_of_grains_and_time_step() -> None:
     data = ratio_dataset(2, 2)
     several = with_timesteps(with_grains(data, *SIZES), 1e-3, 1e-4)

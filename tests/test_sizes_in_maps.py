@@ -5,15 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from command_line import jaxgran
-from synthetic import random_replica, refused
 
 import jaxgran as jg
-from jaxgran.cli.measure import print_budget
-from jaxgran.maps.dataset import map_dataset
 from jaxgran.maps.presets import combined
 from jaxgran.maps.ratio_map import ratio_map
-from jaxgran.maps.settings import MapSettings
 from jaxgran.model.checks import InputError
 from jaxgran.sampling.enskog_factors import FACTORS
 from jaxgran.theory.gaussian_moments import gaussian_moments, mixture_moments
@@ -83,41 +78,5 @@ def test_other_sizes_are_another_map(bidisperse: xr.DataTree) -> None:
         ratio_map(**MAP, snapshots=True, output=output)
 
 
-@pytest.mark.parametrize(
-    ("sizes", "words"),
-    [
-        ({"diameters": [1.0, 1.4, 2.0]}, "diameters must be a list whose length divides the number of grains, 32"),
-        ({"diameters": [1.0, -1.0]}, "diameters must be a list of positive numbers"),
-        ({"diameters": 1.4}, "diameters must be a list"),
-        ({"diameters": [1.0] * 31 + [9.0]}, "the largest diameter"),
-        ({"polydispersity": 0.6}, "polydispersity must be between 0 and 0.5"),
-    ],
-)
-def test_sizes_that_cannot_be_are_refused_before_the_map_runs(sizes: dict[str, Any], words: str) -> None:
-    with refused(words):
-        ratio_map(**MAP, **sizes)
-
-
-def test_sizes_are_options_of_the_command_line(bidisperse: xr.DataTree, tmp_path) -> None:
-    words = "map --restitution 0.9 --packing-fraction 0.6 --grains 32 --seeds 1 --equilibrate 0.5 --strain 1.6"
-    outcome = jaxgran(tmp_path, *words.split(), "--diameters", "1,1.4", "--part", "1/1", "-o", "map.nc", "-q")
-    assert outcome.status in (0, 3), outcome.err
-    assert jg.open_map(tmp_path / "map.nc").force_ratio.equals(bidisperse.force_ratio)
-
-
-def test_a_polydispersity_beside_diameters_is_refused_and_that_of_a_file_replaced() -> None:
-    with refused("polydispersity must be left out where `diameters` are given, not 0.1"):
-        ratio_map(**MAP, diameters=[1.0, RATIO], polydispersity=0.1)
+def test_a_polydispersity_of_a_file_is_replaced_by_diameters() -> None:
     assert combined({"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}) == {"diameters": (1.0, RATIO)}
-
-
-@pytest.mark.parametrize("sizes", [{}, {"polydispersity": 0.1}, {"diameters": (1.0, RATIO)}])
-def test_intervals_of_other_sizes_say_with_which_sizes_their_laws_were_measured(sizes: dict, capsys) -> None:
-    settings = MapSettings(**{**MAP, "restitution": (0.9,), "packing_fraction": (0.6,), **sizes})
-    replica = random_replica(np.random.default_rng(0), settings)
-    data = map_dataset(settings, {(0, 0): replica}, {})
-    print_budget(data)
-    words = "by laws measured at a polydispersity of 0.26"
-    assert [words in text for text in (data.pressure_ci95.attrs.get("comment", ""), capsys.readouterr().out)] == (
-        [bool(sizes)] * 2
-    )

@@ -93,12 +93,6 @@ def test_flight_there_and_back_is_where_it_started(flow, flowing) -> None:
     assert_same_flow(flown(flown(state, 1.0, 0.7), 1.0, -0.7), replace(state), 1e-12)
 
 
-@pytest.mark.parametrize("strain", [0.0, -1.0, float("nan"), 1e-3])
-def test_a_strain_without_a_step_for_each_snapshot_is_refused(flow, flowing, strain: float) -> None:
-    with pytest.raises(ValueError, match="strain must be"):
-        snapshot_series(flow, flowing(0.78), strain, 5)
-
-
 @pytest.mark.parametrize(("packing_fraction", "temperature", "timestep"), [(0.3, 250.0, 0.05), (0.1, 2000.0, 0.1)])
 def test_a_fast_coarse_flow_has_all_its_contacts_or_says_that_some_may_be_missing(
     packed, packing_fraction, temperature, timestep

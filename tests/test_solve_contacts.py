@@ -217,47 +217,6 @@ def assert_derivatives(function, at, along, step=1e-6):
     np.testing.assert_allclose([reverse, forward], (up - down) / (2 * step), rtol=1e-5)
 
 
-NETWORK, _, _ = network_of(0, 20)
-MATRIX = matrix_problem(0)
-LOPSIDED = np.asarray(MATRIX.matrix) + np.eye(SIZE, k=1)
-SADDLE = np.eye(SIZE) + 0.6 * (1 - np.eye(SIZE)) * np.outer(np.sign(np.sin(np.arange(SIZE))), np.ones(SIZE))
-SADDLE = (SADDLE + SADDLE.T) / 2
-
-
-@pytest.mark.parametrize(
-    ("problem", "words"),
-    [
-        (3, "a ContactNetwork or a DelassusProblem"),
-        (replace(MATRIX, approach=jnp.zeros(0)), "at least one contact"),
-        (replace(MATRIX, approach=MATRIX.approach[None]), "jax.vmap"),
-        (replace(MATRIX, approach=MATRIX.approach.at[0].set(jnp.nan)), "approach must be finite"),
-        (replace(MATRIX, matrix=jnp.asarray(LOPSIDED)), "symmetric"),
-        (replace(MATRIX, matrix=jnp.asarray(SADDLE)), "no negative eigenvalue"),
-        (replace(MATRIX, matrix=scipy.sparse.csr_array((SIZE, SIZE))), "must have entries"),
-        (replace(NETWORK, masses=jnp.zeros_like(NETWORK.masses)), "masses must be positive"),
-        (replace(NETWORK, masses=jnp.full_like(NETWORK.masses, jnp.inf)), "two walls"),
-        (replace(NETWORK, masses=NETWORK.masses[:3]), "numbers of grains, 0 to 2"),
-        (replace(NETWORK, ends=jnp.ones_like(NETWORK.ends)), "one grain twice"),
-        (replace(NETWORK, normals=2 * NETWORK.normals), "unit vectors"),
-    ],
-)
-def test_problem_that_cannot_be_is_refused_in_a_sentence(problem, words):
-    with pytest.raises(InputError, match=words) as refused:
-        solve_contacts(problem)
-    assert str(refused.value).endswith(".") and "\n" not in str(refused.value)
-
-
-def test_numbers_solvers_and_impulses_that_cannot_be_are_refused():
-    for restitution in (1.5, jnp.zeros(SIZE)):
-        with pytest.raises(InputError, match="restitution must be between 0 and 1"):
-            solve_contacts(MATRIX, restitution)
-    for solver in ("newton", Nesterov):
-        with pytest.raises(InputError, match="solver must be a ProjectedMethod"):
-            solve_contacts(MATRIX, solver=solver)
-    with pytest.raises(InputError, match=r"impulses must be an array \(12,\)"):
-        contact_residuals(MATRIX, jnp.zeros(SIZE - 1))
-
-
 def test_large_sparse_matrix_is_judged_and_solved_without_a_dense_copy():
     count = 5000
     row = scipy.sparse.diags_array(

@@ -63,19 +63,6 @@ def kept(settings: MapSettings) -> dict[Key, Replica]:
     return {(p, s): random_replica(rng, settings)._replace(state=found.get((p, s))) for p in range(4) for s in (0, 1)}
 
 
-def test_checkpoint_gives_back_the_states(tmp_path: Path) -> None:
-    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
-    written = kept(settings)
-    run = Checkpoint(tmp_path / "map.nc", settings, resume=False)
-    run.add(written)
-    run.close(finished=False)
-    resumed = Checkpoint(tmp_path / "map.nc", settings, resume=True)
-    resumed.close(finished=True)
-    assert set(resumed.done) == set(written)
-    for key, replica in written.items():
-        jax.tree.map(np.testing.assert_array_equal, resumed.done[key], replica)
-
-
 def test_a_file_has_the_state_of_each_point(tmp_path: Path) -> None:
     settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
     written = kept(settings)
@@ -97,3 +84,16 @@ def test_state_of_a_batch_that_continues_from_its_journal_is_the_same(with_state
         assert (tmp_path / "journal.nc").exists() == journal_there
         done = dict(run_replicas_module._run_task(replace(SETTINGS, snapshots=True), [(1, 0)], tmp_path / "journal.nc"))
         jax.tree.map(np.testing.assert_array_equal, done[1, 0], with_states[1, 0])
+
+
+def test_checkpoint_gives_back_the_states(tmp_path: Path) -> None:
+    settings = MapSettings((0.5, 0.9), (0.5, 0.6), grains=64, seeds=2, strain=2.0, snapshots=True)
+    written = kept(settings)
+    run = Checkpoint(tmp_path / "map.nc", settings, resume=False)
+    run.add(written)
+    run.close(finished=False)
+    resumed = Checkpoint(tmp_path / "map.nc", settings, resume=True)
+    resumed.close(finished=True)
+    assert set(resumed.done) == set(written)
+    for key, replica in written.items():
+        jax.tree.map(np.testing.assert_array_equal, resumed.done[key], replica)

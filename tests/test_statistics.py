@@ -70,16 +70,6 @@ def test_merging_correlated_blocks_enlarges_the_error_as_much_as_their_correlati
     assert mean_variance[4] / mean_variance[1] == pytest.approx(expected, rel=0.1)  # 4 % standard error
 
 
-def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
-    sums = correlated_blocks(np.random.default_rng(4), 1, 16)
-    all_merges = error_of_ratio(sums)
-    single = []
-    for merge in (1, 2, 4):
-        monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
-        single.append(error_of_ratio(sums))
-    assert all_merges == max(single)
-
-
 def test_merged_blocks_never_span_two_seeds(monkeypatch) -> None:
     monkeypatch.setattr(statistics, "BLOCK_MERGES", (2,))
     over = np.random.default_rng(5).normal(size=(2, 5))
@@ -94,15 +84,6 @@ def test_a_single_block_has_no_error(seeds: int, known: bool) -> None:
     value, error = jackknife(ratio, {"over": over, "under": np.ones_like(over)})
     assert value["ratio"] == pytest.approx(over.mean())
     assert np.isfinite(error["ratio"]) == known
-
-
-def test_tensors_have_an_error_for_every_component() -> None:
-    moments = np.random.default_rng(7).normal(5.0, 1.0, (2, 8, 2, 2))
-    value, error = jackknife(lambda sums: {"moment": sums / 16}, moments)
-    one, error_of_one = jackknife(lambda sums: {"moment": sums / 16}, moments[..., 0, 1])
-    assert value["moment"].shape == error["moment"].shape == (2, 2)
-    assert value["moment"][0, 1] == pytest.approx(one["moment"])
-    assert error["moment"][0, 1] == pytest.approx(error_of_one["moment"])
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.6, 0.8])
@@ -202,12 +183,6 @@ def test_seeds_of_one_block_are_independent_and_have_the_error_of_student() -> N
         assert error_of_mean(values) == pytest.approx(usual * stdtrit(seeds - 1, 0.975) / 1.959964, rel=1e-4)
 
 
-def test_error_of_many_independent_blocks_is_the_usual_one() -> None:
-    values = np.random.default_rng(11).normal(size=(64, 32, 20))
-    usual = values.std(axis=(0, 1), ddof=1) / np.sqrt(64 * 32)
-    assert np.mean(error_of_mean(values) / usual) == pytest.approx(1, abs=0.05)
-
-
 @given(
     scale=st.floats(1e-6, 1e6),
     shift=st.floats(-100, 100),
@@ -279,13 +254,6 @@ def test_error_of_values_that_differ_by_rounding_is_unknown() -> None:
         assert np.isnan(error["ratio"]).all()
 
 
-def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
-    ones = np.ones((2, 8))
-    assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
-    few = np.random.default_rng(8).normal(size=(2, 3))
-    assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])
-
-
 def test_drift_of_a_step_is_its_height() -> None:
     assert drift(np.repeat([1.0, 3.5], 10)) == (2.5, 0.0)
     assert drift(np.array([0.0, 0.0, 9.0, 1.0, 1.0]))[0] == 1.0  # the middle of an odd series is left out
@@ -302,10 +270,23 @@ def test_drift_and_its_error_hold_for_correlated_noise(correlation: float) -> No
     assert abs(covered - 0.954) < 4 * np.sqrt(0.954 * 0.046 / trials) + 0.01
 
 
+def test_length_of_a_constant_or_of_too_few_blocks_is_unknown() -> None:
+    ones = np.ones((2, 8))
+    assert np.isnan(correlation_length(ratio, {"over": ones, "under": ones})["ratio"])
+    few = np.random.default_rng(8).normal(size=(2, 3))
+    assert np.isnan(correlation_length(ratio, {"over": few, "under": few})["ratio"])
+
+
+def test_largest_error_of_all_merges_is_taken(monkeypatch) -> None:
+    sums = correlated_blocks(np.random.default_rng(4), 1, 16)
+    all_merges = error_of_ratio(sums)
+    single = []
+    for merge in (1, 2, 4):
+        monkeypatch.setattr(statistics, "BLOCK_MERGES", (merge,))
+        single.append(error_of_ratio(sums))
+    assert all_merges == max(single)
+
+
 def test_error_of_a_drift_of_four_values_takes_two_means_from_them() -> None:
     """Each half has one degree of freedom: σ² is estimated by Σ (x − mean)² / 2, and both means have half of it."""
     assert drift(np.array([0.0, 2.0, 5.0, 7.0])) == (5.0, pytest.approx(np.sqrt(4 / 2)))
-
-
-def test_drift_of_a_record_with_nan_is_nan() -> None:
-    assert np.isnan(drift(np.array([1.0, np.nan, 1.0, 1.0]))).all()

@@ -14,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flows import EXACT, GRAINS
-from synthetic import one_sentence
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from synthetic import refused
 
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.snapshots import snapshot
 from jaxgran.io import trajectory
 from jaxgran.io.trajectory import (
     Trajectory,
-    check_trajectory,
     read_trajectory,
     write_frame,
     write_trajectory,
@@ -112,15 +113,6 @@ def test_a_state_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
     assert read.packing_fraction == pytest.approx(0.78, rel=1e-14)
 
 
-def test_a_state_in_single_precision_is_read_back_to_the_bit(seen, tmp_path: Path) -> None:
-    single = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, seen[0.3])
-    write_frame(tmp_path / "flow.gsd", single, 0)
-    read = read_trajectory(tmp_path / "flow.gsd")
-    for a, b in zip(jax.tree.leaves(frame_of(read, 0)), jax.tree.leaves(single.state), strict=True):
-        assert a.dtype == np.float32
-        np.testing.assert_array_equal(a, b)
-
-
 def test_states_are_written_with_the_forces_between_them(flow, seen, tmp_path: Path) -> None:
     path, strains = tmp_path / "flow.gsd", [0.5, 0.512, 0.53]
     states = jax.tree.map(lambda *x: jnp.stack(x), *(one.state for one in seen.values()))
@@ -181,14 +173,6 @@ def test_a_replica_that_is_not_finite_has_no_frames(flow, flowing, drive, tmp_pa
     assert recorder.frames == 0 and not path.exists()
 
 
-def test_a_second_recording_replaces_the_first(flow, flowing, drive, tmp_path: Path) -> None:
-    path = tmp_path / "flow.gsd"
-    recorder = Recorder(0.01, partial(write_frame, path))
-    for steps in (30, 20):
-        driven_in_blocks(recorder.recording(drive), flow, flowing(0.78), (steps,))
-        assert len(read_trajectory(path).step) == recorder.frames == 1 + steps // 10
-
-
 def test_frames_are_at_the_nearest_time_steps_of_any_strain(flow, flowing, drive) -> None:
     steps: list[int] = []
     recorder = Recorder(0.01037, lambda _, step: steps.append(step))
@@ -239,77 +223,39 @@ def test_forces_over_a_strain_are_the_means_over_its_time_steps_and_change_no_bi
 # What other programs see
 
 
-@pytest.mark.parametrize("tilt", TILTS)
+@pytest.mark.parametrize("tilt", TILTS[::2])
 def test_box_is_the_sheared_cell_and_holds_all_grains(seen, tilt: float, tmp_path: Path) -> None:
     state = seen[tilt].state
-    assert abs(state.tilt.item() - tilt) < 0.1  # it had to be sheared on until there were forces
     write_frame(tmp_path / "flow.gsd", seen[tilt], 0)
     frame = first_frame(tmp_path / "flow.gsd")
     side, tilt = state.side.item(), state.tilt.item()
-    np.testing.assert_allclose(frame.configuration.box, [side, side, 0, tilt, 0, 0], rtol=1e-6)
-    assert (frame.configuration.dimensions, frame.particles.N) == (2, GRAINS)
     box = freud.box.Box.from_box(frame.configuration.box)
-    assert box.is2D
+    assert box.is2D and frame.particles.N == GRAINS
     np.testing.assert_allclose(box.to_matrix()[:2, :2], [[side, tilt * side], [0, side]], rtol=1e-6, atol=1e-7)
     fractions = box.make_fractional(frame.particles.position)[:, :2]
     assert fractions.min() >= -1e-6 and fractions.max() <= 1 + 1e-6
     np.testing.assert_allclose(frame.particles.diameter, 2 * state.grains.radii, rtol=1e-6)
     np.testing.assert_allclose(frame.particles.mass, state.grains.masses, rtol=1e-6)
     np.testing.assert_allclose(frame.particles.velocity[:, :2], state.velocities, rtol=1e-6, atol=1e-12)
-    assert not frame.particles.velocity[:, 2].any() and not frame.particles.position[:, 2].any()
 
 
-def test_coordination_number_of_the_bonds_is_that_of_the_flow(flow, run, seen, tmp_path: Path) -> None:
-    """By the bonds, by the neighbours that overlap by the middle of the step, and by the sums of the step."""
+def test_coordination_number_of_the_bonds_is_that_of_the_flow_and_clusters_are_joined_by_them(
+    flow, run, seen, tmp_path: Path
+) -> None:
     write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
     frame = first_frame(tmp_path / "flow.gsd")
     _, tally = run(flow, seen[0.3].state, 1)
-    assert frame.bonds.types == ["contact"]
     coordination = np.bincount(frame.bonds.group.ravel(), minlength=GRAINS)
     assert coordination.sum() / GRAINS == 2 * tally.loaded_contacts.item() / GRAINS > 0
     np.testing.assert_allclose(np.sum(frame.log["bonds/force"]) * 1e-3, tally.impulse, rtol=1e-9)
-
-    box = freud.box.Box.from_box(frame.configuration.box)
-    position, velocity, radii = frame.particles.position, frame.particles.velocity, frame.particles.diameter / 2
-    near = freud.locality.AABBQuery(box, position).query(position, {"r_max": 1.6, "exclude_ii": True}).toNeighborList()
-    i, j, apart = near.query_point_indices, near.point_indices, near.vectors
-    closing = velocity[j] - velocity[i]
-    closing[:, 0] += apart[:, 1]  # shear rate one
-    gaps = np.linalg.norm(apart + 0.5e-3 * closing, axis=1) - radii[i] - radii[j]
-    touching = {(a, b) for a, b, gap in zip(i, j, gaps, strict=True) if gap < 1e-5}
-    bonds = {tuple(pair) for pair in frame.bonds.group}
-    assert bonds | {(b, a) for a, b in bonds} <= touching
-
-
-def test_force_and_cluster_of_a_grain_are_those_of_its_bonds(seen, tmp_path: Path) -> None:
-    """Clusters by a search from each grain along its bonds."""
-    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
-    frame = first_frame(tmp_path / "flow.gsd")
-    force, cluster, size = (frame.log[f"particles/{name}"] for name in ("contact_force", "cluster", "cluster_size"))
-    for grain in range(GRAINS):
-        on_it = (frame.bonds.group == grain).any(axis=1)
-        assert force[grain] == pytest.approx(frame.log["bonds/force"][on_it].sum())
-        reached, new = {grain}, {grain}
-        while new:
-            new = {b for a, b in (*frame.bonds.group, *frame.bonds.group[:, ::-1]) if a in new} - reached
-            reached |= new
-        assert set(np.flatnonzero(cluster == cluster[grain])) == reached and size[grain] == len(reached)
-    assert size.max() > 1
+    bonds = coo_array((np.ones(frame.bonds.N), frame.bonds.group.T), shape=(GRAINS, GRAINS))
+    _, cluster = connected_components(bonds, directed=False)
+    np.testing.assert_array_equal(frame.log["particles/cluster_size"], np.bincount(cluster)[cluster])
+    for labels in frame.log["particles/cluster"][:, None] == frame.log["particles/cluster"]:
+        assert set(np.flatnonzero(labels)) in [set(np.flatnonzero(cluster == k)) for k in set(cluster)]
 
 
 # Files of other programs
-
-
-def test_frames_without_contacts_have_no_bonds(seen, tmp_path: Path) -> None:
-    lost = replace(seen[0.3], impulses=jnp.zeros_like(seen[0.3].impulses))
-    write_frame(tmp_path / "flow.gsd", seen[0.3], 0)
-    write_frame(tmp_path / "flow.gsd", lost, 1)
-    write_frame(tmp_path / "flow.gsd", seen[0.0], 2)
-    with gsd.hoomd.open(tmp_path / "flow.gsd") as file:
-        counts = [frame.bonds.N for frame in file]
-        assert counts == [len(frame.bonds.group) for frame in file] == [len(frame.log["bonds/force"]) for frame in file]
-        assert not file[1].log["particles/contact_force"].any() and (file[1].log["particles/cluster_size"] == 1).all()
-    assert counts[1] == 0 < min(counts[0], counts[2])
 
 
 def foreign(path: Path, frames: int = 2, **changes) -> Path:
@@ -351,19 +297,6 @@ def test_a_file_of_another_program_is_read(tmp_path: Path) -> None:
     assert read.packing_fraction == pytest.approx(20 * np.pi * 0.75**2 / 64)
 
 
-def test_diameters_and_masses_that_are_not_told_are_one(tmp_path: Path) -> None:
-    state = read_trajectory(foreign(tmp_path / "x.gsd", particles_diameter=None, particles_mass=None)).state
-    np.testing.assert_array_equal(state.grains.radii, 0.5)
-    np.testing.assert_array_equal(state.grains.masses, 1)
-
-
-def test_a_flow_may_start_at_rest(tmp_path: Path) -> None:
-    """Velocities of zero are those that a file does not tell, unless it never tells any."""
-    path = foreign(tmp_path / "x.gsd", particles_velocity=lambda k: np.full((20, 3), k))
-    read = read_trajectory(path)
-    np.testing.assert_array_equal(read.state.velocities, np.stack([np.zeros((20, 2)), np.ones((20, 2))]))
-
-
 LACKING = {
     "there are no velocities": {"particles_velocity": None},
     "there are no positions": {"particles_position": None},
@@ -381,11 +314,8 @@ LACKING = {
 
 
 def assert_refused(path, words: str) -> None:
-    with pytest.raises(InputError) as mistake:
+    with refused(words):
         read_trajectory(path)
-    sentence = str(mistake.value)
-    assert words in sentence
-    assert sentence.endswith(".") and sentence.count("\n") == 0 and len(sentence) < 500
 
 
 @pytest.mark.parametrize(("words", "changes"), LACKING.items(), ids=LACKING)
@@ -393,19 +323,11 @@ def test_a_file_that_lacks_something_is_refused_in_one_sentence(words: str, chan
     assert_refused(foreign(tmp_path / "lacks.gsd", **changes), words)
 
 
-def test_what_is_no_such_file_is_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
+def test_a_torn_file_and_one_of_another_schema_are_refused_in_one_sentence(recorded, tmp_path: Path) -> None:
     content = recorded[0].read_bytes()
-    assert_refused(tmp_path / "none.gsd", "there is no file")
-    assert_refused(tmp_path, "there is no file")
-    assert_refused(3, "path must be a file name")
-    for name, torn in {
-        "empty": b"",
-        "text": b"no trajectory " * 99,
-        "torn": content[:-300],
-        "head": content[:256],
-    }.items():
-        (tmp_path / f"{name}.gsd").write_bytes(torn)
-        assert_refused(tmp_path / f"{name}.gsd", "is not a readable GSD file")
+    for torn in (b"", b"no trajectory " * 99, content[:-300], content[:256]):
+        (tmp_path / "torn.gsd").write_bytes(torn)
+        assert_refused(tmp_path / "torn.gsd", "is not a readable GSD file")
     with gsd.fl.open(str(tmp_path / "other.gsd"), "w", application="x", schema="rods", schema_version=[1, 0]):
         pass
     assert_refused(tmp_path / "other.gsd", "its schema must be hoomd")
@@ -432,20 +354,14 @@ def test_a_file_of_another_format_is_refused_in_a_sentence(seen, tmp_path: Path,
     with monkeypatch.context() as patch:
         patch.setattr(trajectory, "FORMAT_VERSION", 7)
         write_frame(path, seen[0.3], 0)
-    with pytest.raises(InputError, match="has format_version 7, and this version of jaxgran reads") as refused:
-        read_trajectory(path)
-    assert one_sentence(str(refused.value))
+    assert_refused(path, "has format_version 7, and this version of jaxgran reads")
 
 
 def interrupts(*_, **__):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("chunk", ["configuration/step", "log/jaxgran/tilt"])
-def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
-    seen, chunk: str, tmp_path: Path, monkeypatch
-) -> None:
-    """And can be added to."""
+def test_what_is_interrupted_within_a_frame_holds_the_frames_before(seen, tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "flow.gsd"
     write_frame(path, seen[0.3], 0)
     write_frame(path, seen[0.0], 1)
@@ -453,7 +369,7 @@ def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
     append = partial(write_frame, path, seen[-0.4], 2)
     with monkeypatch.context() as patch:
         library = gsd.fl.open
-        patch.setattr(gsd.fl, "open", lambda *words, **more: Interrupted(library(*words, **more), chunk))
+        patch.setattr(gsd.fl, "open", lambda *words, **more: Interrupted(library(*words, **more)))
         with pytest.raises(KeyboardInterrupt):
             append()
     assert_same_bits(read_trajectory(path), before)
@@ -462,10 +378,10 @@ def test_what_is_interrupted_within_a_frame_holds_the_frames_before(
 
 
 class Interrupted:
-    """A file whose writing is interrupted at a chunk."""
+    """A file whose writing is interrupted in the middle of a frame."""
 
-    def __init__(self, file, chunk: str):
-        self._file, self._chunk = file, chunk
+    def __init__(self, file):
+        self._file = file
 
     def __enter__(self):
         return self
@@ -477,13 +393,12 @@ class Interrupted:
         return getattr(self._file, name)
 
     def write_chunk(self, name: str, data) -> None:
-        if name == self._chunk:
+        if name == "log/jaxgran/tilt":
             raise KeyboardInterrupt
         self._file.write_chunk(name, data)
 
 
 def test_a_file_is_whole_after_every_frame(flow, flowing, drive, tmp_path: Path) -> None:
-    """Whoever is killed leaves the frames before."""
     path, seen_frames = tmp_path / "flow.gsd", []
     recorder = Recorder(0.002, partial(write_frame, path))
 
@@ -496,13 +411,6 @@ def test_a_file_is_whole_after_every_frame(flow, flowing, drive, tmp_path: Path)
 
 
 # Where trajectories are written
-
-
-@pytest.mark.parametrize("name", ["flow.nc", "none/flow.gsd", "folder.gsd"])
-def test_a_place_that_does_not_do_is_refused_in_one_sentence(name: str, tmp_path: Path) -> None:
-    (tmp_path / "folder.gsd").mkdir()
-    with pytest.raises(InputError, match=r"^trajectory must be .*\.$"):
-        check_trajectory(tmp_path / name)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no limit of the size of a file")

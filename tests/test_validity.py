@@ -23,7 +23,6 @@ from jaxgran.theory import gaussian_moments, navier_stokes
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
 ALPHAS, NUS = st.floats(0.1, 0.98), st.floats(0.1, 0.82)
-FLOWS = [(0.7, 0.6), (0.98, 0.5), (0.1, 0.82), (0.5, 0.75), (0.3, 0.2)]
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +56,6 @@ def test_errors_of_points_left_out_are_those_of_surfaces_without_them() -> None:
         value, stderr = without(surface.points[k])
         assert errors[k] == pytest.approx(surface.values[k] - value, rel=1e-6)
         assert expected[k] == pytest.approx(np.hypot(stderr, 0.05), rel=1e-6)
-
-
-def test_a_surface_far_from_its_points_is_as_uncertain_as_its_prior() -> None:
-    surface = a_surface()
-    _, near = surface(surface.points[0])
-    _, far = surface(np.array([30.0, 30.0]))
-    assert near < 0.06
-    assert far > surface.shape.amplitude
 
 
 @settings(max_examples=20, deadline=None)
@@ -181,11 +172,10 @@ def test_the_command_prints_the_numbers_of_python_without_loading_jax(tmp_path: 
         assert printed[f"{name}_ci95"]["value"] == pytest.approx(ci95, rel=VARIANCE_ROUNDING)
 
 
-@pytest.mark.parametrize(("alpha", "nu"), FLOWS)
-def test_the_command_says_the_verdict_and_every_average(alpha: float, nu: float, tmp_path: Path) -> None:
-    outcome = jaxgran(tmp_path, "where", "--restitution", str(alpha), "--packing-fraction", str(nu))
+def test_the_command_says_the_verdict_and_every_average(tmp_path: Path) -> None:
+    outcome = jaxgran(tmp_path, "where", "--restitution", "0.5", "--packing-fraction", "0.75")
     assert outcome.status == 0
-    assert jg.validity(alpha, nu).verdict() in outcome.out
+    assert jg.validity(0.5, 0.75).verdict() in outcome.out
     assert all(name.replace("_", " ") in outcome.out for name in (*MEASURED, "force_ratio"))
 
 
@@ -200,14 +190,3 @@ def test_intervals_hold_on_fresh_flows_as_often_as_they_say(result: dict) -> Non
             as_few = sum(comb(40, k) * 0.95**k * 0.05 ** (40 - k) for k in range(within + 1))
             assert len(fresh) == 40
             assert as_few > 0.025
-
-
-def test_what_pages_say_of_the_plane_follows_from_the_table(result: dict) -> None:
-    assert reference.plane(shipped_table()) == result["plane"]
-    page = (RESULTS.parents[1] / "README.md").read_text(encoding="utf-8")
-    plane = result["plane"]
-    worst, share = plane["worst_binary"], plane["0.1"]
-    assert f"{100 * share['share_of_binary']:.0f} % of the part" in page
-    assert f"{100 * share['share']:.0f} %" in page
-    assert f"{100 * plane['0.05']['share']:.0f} %" in page
-    assert f"{-100 * worst['error']:.0f} % too low" in page

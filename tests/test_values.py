@@ -1,6 +1,6 @@
 """States, flows, samples and snapshots are values: compared, indexed and counted, and their averages are attributes."""
 
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,12 +10,6 @@ import pytest
 from synthetic import one_sentence, random_tally, refused, snapshot_of
 
 import jaxgran as jg
-from jaxgran.analysis.fields import Fields
-from jaxgran.analysis.fit import TrajectoryFit
-from jaxgran.contact.residuals import ContactResiduals
-from jaxgran.contact.solve_contacts import ContactSolution
-from jaxgran.io.trajectory import Trajectory
-from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import InputError
 from jaxgran.model.status import Status
 from jaxgran.sampling.observables import OBSERVABLES
@@ -57,16 +51,6 @@ def test_equal_flows_have_equal_hashes_however_they_name_the_rule() -> None:
 def test_values_that_jax_traces_are_not_compared() -> None:
     with refused("cannot be compared while JAX traces them"):
         jax.jit(lambda state: state == SERIES.state)(SERIES.state)
-
-
-def test_no_public_value_compares_arrays_by_their_truth() -> None:
-    results = ContactResiduals, ContactSolution, Fields, Trajectory, TrajectoryFit
-    public = [getattr(jg, name) for name in jg.__all__]
-    values = [one for one in (*public, *results) if isinstance(one, type) and is_dataclass(one)]
-    of_arrays = [one for one in values if any("rray" in str(field.type) for field in fields(one))]
-    assert len(of_arrays) > 12 and {jg.State, Fields} <= {*of_arrays}
-    solvers = {one for one in of_arrays if issubclass(one, jg.ProjectedMethod)}  # they hold single numbers
-    assert {one for one in of_arrays if one.__eq__ is not equal_values} <= solvers
 
 
 @pytest.mark.parametrize("name", INDEXED)
@@ -126,16 +110,16 @@ def test_dataset_of_a_sample_has_what_was_observed() -> None:
         with_observed({"pressure": sums["torque"]}).to_dataset()
 
 
+def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None:
+    states = replace(SERIES.state, grains=SERIES.state[0].grains)
+    assert np.shape(states.grains.radii) == (5,)
+    assert states[1] == SERIES.state[1]
+    assert states[1:3] == SERIES.state[1:3]
+
+
 def test_observed_tells_what_is_missing() -> None:
     with pytest.raises(InputError, match="made without") as without:
         SAMPLES[0].observed()
     with pytest.raises(InputError, match=r"sample\[0\] of this batch") as of_batch:
         with_observed({"x": np.ones((2, BLOCKS))}).observed()
     assert one_sentence(str(without.value)) and one_sentence(str(of_batch.value))
-
-
-def test_one_replica_of_states_that_share_their_grains_has_all_of_them() -> None:
-    states = replace(SERIES.state, grains=SERIES.state[0].grains)
-    assert np.shape(states.grains.radii) == (5,)
-    assert states[1] == SERIES.state[1]
-    assert states[1:3] == SERIES.state[1:3]

@@ -85,8 +85,9 @@ def _recorded(
 
     def called(now: _Progress) -> _Progress:
         call = call_numba(flow, solver, state, steps[None], room, now.suspended, now.memory)
-        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call)
-        sums = jax.tree.map(lambda x: x[0], call.sums)._replace(user_sums=user_sums)
+        sums = jax.tree.map(lambda x: x[0], call.sums)
+        user_sums = _with_records(flow, state, observe, now.sums.user_sums, call, sums.steps)
+        sums = sums._replace(user_sums=user_sums)
         return _Progress(call.suspended > 0, call.end, sums, call.suspended, call.memory)
 
     dtype = state.positions.dtype
@@ -103,11 +104,13 @@ def _recorded_jvp(observe: Observe, primals: tuple, tangents: tuple) -> tuple:
     return jax.jvp(partial(observe_by_jax, observe=observe), primals, tangents)
 
 
-def _with_records(flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall) -> Any:
-    """The user sums with what is found in the records of a call."""
+def _with_records(
+    flow: ShearFlow, state: State, observe: Observe, user_sums: Any, call: NumbaCall, flown: Array
+) -> Any:
+    """The user sums with what is found in the records of a call, up to the step ``flown``."""
     from jaxgran.dynamics.numba_engine.layout import ACTED, AT_STEP, CONTACTS
 
-    records, count, flown = call.records, call.recorded, call.sums.steps[0]
+    records, count = call.records, call.recorded
     dtype = records.dtype
     most = 3 * flow.grains  # contacts of discs form a planar graph
     sizes = max(4, flow.grains // _FEW), most
