@@ -274,6 +274,9 @@ def sample(
     replica has the results of its own call. ``jax.vmap`` of this function does the same. A batch is faster with the
     engine ``Jax``, and is compiled for 1, 2, 4, 8, … replicas only.
 
+    The numba engine takes all blocks in one call, unless there is ``observe`` or ``callback``. Then every block begins
+    with a new list of near pairs, and its trajectory differs by rounding, which grows as in any chaotic flow.
+
     The result of ``observe`` is averaged over **every** time step, in the same run (see ``observer``). A few instants
     do not suffice for contact forces: at a short time step, most instants of a collisional flow have no contact with a
     force. A function of the forces, which are ``impulses / timestep``, is averaged exactly. Positions and velocities
