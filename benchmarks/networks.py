@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxgran as jg
 from jaxgran.contact.network import Contacts
-from jaxgran.dynamics.collision import contacts_now
+from jaxgran.dynamics.snapshots import contacts_now
 
 SLOTS, GRAINS = (32, 128, 256, 768, 3072), 256  # sizes of the buffers of contacts and grains: few shapes to compile
 FLOWS = ((0.80, 0.0), (0.82, 0.0), (0.835, 0.0), (0.82, 0.9), (0.6, 0.5))  # packing fraction, restitution

@@ -13,7 +13,7 @@ grains within a distance r now have |Δy| ≤ r, so no such pair is missed as lo
 
 with δ counted from the build of the list and γ_ref the strain of the frame at that time. The outer list is judged by
 this before a near list is filtered from it, with r the largest diameter and the skin of the near list. The near list is
-judged in ``dynamics.flight`` by a bound on the speed at which a gap closes, which costs less and is as safe.
+judged in ``dynamics.step`` by a bound on the speed at which a gap closes, which costs less and is as safe.
 """
 
 from dataclasses import dataclass
@@ -135,7 +135,7 @@ def no_lists(positions: Float[Array, "grains 2"], tilt: Array) -> PairLists:
 def pair_lists(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairLists:
     """Both lists, built from the positions; the frame starts here."""
     at_rest = Frame(jnp.zeros_like(positions), jnp.zeros_like(side))
-    outer = _outer_pairs(positions, grains, side, tilt)
+    outer = outer_pairs(positions, grains, side, tilt)
     skin = jnp.minimum(_nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side), outer.skin)
     near = _near_pairs(outer, at_rest, skin, grains)
     return PairLists(outer, near, at_rest, at_rest, positions, tilt)
@@ -157,7 +157,7 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
 
     def searched() -> tuple:
         positions, tilt = present(lists, side)
-        new = _outer_pairs(positions, grains, side, tilt), at_rest, positions, tilt
+        new = outer_pairs(positions, grains, side, tilt), at_rest, positions, tilt
         return where_active(search, new, kept)
 
     kept = lists.outer, lists.frame, lists.positions, lists.tilt
@@ -276,7 +276,7 @@ def _near_pairs(outer: PairList, frame: Frame, largest: Array, grains: Grains) -
     return _pair_list(i, j, separations, filled, grains, skin, overflow | outer.overflow)
 
 
-def _outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairList:
+def outer_pairs(positions: Float[Array, "grains 2"], grains: Grains, side: Array, tilt: Array) -> PairList:
     """All pairs within the outer skin, by comparing all pairs or, for many grains, through a cell list."""
     count = positions.shape[0]
     capacity = _capacity(OUTER_PAIRS_PER_GRAIN, count)

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.contact.law import gap_coefficients, overlaps_within, time_to_touch
+from jaxgran.contact.near_pairs import set_bits
 from jaxgran.model.batches import equal_values
+from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
 
@@ -57,6 +59,18 @@ class PairMotion(NamedTuple):
     def moved(self, time: Array) -> "PairMotion":
         """The pairs after free flight for a time."""
         return self._replace(x=self.x + time * self.ux, y=self.y + time * self.uy)
+
+
+def pair_motion(
+    i: Int[Array, " pairs"],
+    j: Int[Array, " pairs"],
+    separations: Float[Array, "pairs 2"],
+    velocities: Float[Array, "grains 2"],
+    shear_rate: float | Array,
+) -> PairMotion:
+    """How pairs of grains i and j with these separations move, from the peculiar velocities of the grains."""
+    u = relative_velocity(velocities, i, j, separations, shear_rate)
+    return PairMotion(separations[:, 0], separations[:, 1], u[:, 0], u[:, 1])
 
 
 def is_contact(
@@ -122,3 +136,26 @@ def contact_network(
         inverse_mass_j=jnp.where(used, taken(inverse_masses, j), 0),
         used=used,
     )
+
+
+class Touching(NamedTuple):
+    """The pairs of the near list, or those compacted from it, (pairs,) each, and which of them are contacts."""
+
+    i: Int[Array, " pairs"]
+    j: Int[Array, " pairs"]
+    reach: Float[Array, " pairs"]
+    motion: PairMotion
+    contact: Bool[Array, " pairs"]
+
+    def compacted(self, size: int, words: Array) -> "Touching":
+        """The first contacts in a buffer of a size; ``words`` are those of ``bit_words(contact)``."""
+        pairs = self.contact.size
+        place = set_bits(words, size, pairs)
+        used = place < pairs
+        index = jnp.where(used, place, 0)
+        i, j, reach, motion = jax.tree.map(lambda x: taken(x, index), self[:-1])
+        return Touching(i, j, reach, motion, used)
+
+    def network(self, grains: Grains) -> Contacts:
+        """The contact network."""
+        return contact_network(self.contact, self.i, self.j, self.motion, grains)

@@ -30,6 +30,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import Operator, delassus_product, diagonal
 from jaxgran.contact.law import JAMMED_RESPONSE, relative_residual, residual_target
+from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import Iterate, ProjectedMethod, dot
 from jaxgran.model.control_flow import any_replica, where_active
 from jaxgran.model.status import Status
@@ -154,6 +155,14 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
         iterations=none,
         status=none,
     )
+
+
+def single_contact(network: Contacts, grains: int) -> Solution:
+    """The closed form of a single contact, for which the iteration would need one product."""
+    own = diagonal(network, grains)
+    impulses = jnp.maximum(0, -network.approach / own)
+    status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
+    return Solution(impulses, own * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status)
 
 
 class _Progress(NamedTuple):

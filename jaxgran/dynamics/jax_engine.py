@@ -12,38 +12,33 @@ what a shift of its time by dτ does, to first order, with the values as they ar
 grains. Where a grain strikes a cluster, only the impulse that its own approach accounts for moves in time.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxgran.contact.near_pairs import PairLists, no_lists, present
-from jaxgran.contact.network import Contacts, PairMotion
+from jaxgran.contact.near_pairs import present
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod, require_solver
-from jaxgran.dynamics.collision import AdvanceOptions, Observe, collide, contact_buffers, shifted
-from jaxgran.dynamics.flight import (
+from jaxgran.dynamics.observer import Observe
+from jaxgran.dynamics.step import (
+    Advance,
     Carry,
-    add_flight,
-    closing_speed,
-    fly,
-    is_stale,
-    steps_of_list,
-    steps_to_contact,
-    with_new_lists,
+    event,
+    needs_lists,
+    refresh_lists,
+    start,
+    unfinished,
 )
-from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_flight
-from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
-from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
+from jaxgran.dynamics.tally import RunningSums, Tally
+from jaxgran.dynamics.velocity_scales import readings
 from jaxgran.model.checks import require_number, require_whole
 from jaxgran.model.choices import MAX_STEPS
-from jaxgran.model.control_flow import any_replica, where_active
+from jaxgran.model.control_flow import any_replica
 from jaxgran.model.flow import ShearFlow
-from jaxgran.model.grains import Grains
 from jaxgran.model.state import (
     State,
     kinetic_energy,
@@ -65,6 +60,11 @@ def require_advance(flow: ShearFlow, state: State, steps: Any) -> None:
     require_match(flow, state)
 
 
+def contact_buffers(grains: int) -> tuple[int, ...]:
+    """Sizes of the buffers for the contacts of dilute and of dense flows, smallest first."""
+    return tuple(sorted({max(4, grains // 3), max(4, grains)}))
+
+
 def advance_by_jax(
     flow: ShearFlow,
     solver: ProjectedMethod,
@@ -79,24 +79,68 @@ def advance_by_jax(
     Arguments, derivatives and results are those of ``dynamics.advance``.
     """
     derivatives = events is not None or moving_contacts  # those of a solve of each size would be compiled
-    options = AdvanceOptions(solver, () if derivatives else contact_buffers(flow.grains), moving_contacts)
-    loop = _event_loop(flow, state, steps, free_flight, options)
+    advance = _advance_of(flow, solver, state, steps)._replace(
+        free_flight=free_flight,
+        buffers=() if derivatives else contact_buffers(flow.grains),
+        moving_contacts=moving_contacts,
+    )
+    begin = start(advance, state)
     if events is None:
-        end = loop.end()
-        return _ended(state, end, loop.unfinished)
+        return _ended(advance, state, _last(advance, begin))
     require_whole("events", events, 1, MAX_STEPS, "the most steps of an advance")
-    end = loop.scanned(events)
-    return _nan_where(loop.unfinished(end), _ended(state, end, loop.unfinished))
+    end = _after_events(advance, begin, events)
+    return _nan_where(unfinished(advance, end), _ended(advance, state, end))
 
 
 def observe_by_jax(
     flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Int[Array, ""], observe: Observe
 ) -> tuple[State, Tally, Any]:
     """``advance_by_jax``, and the sum over all its time steps of what a function finds in them, see ``observer``."""
-    options = AdvanceOptions(solver, contact_buffers(flow.grains), observe=observe)
-    loop = _event_loop(flow, state, steps, True, options)
-    end = loop.end()
-    return *_ended(state, end, loop.unfinished), end.sums.user_sums.sums
+    advance = _advance_of(flow, solver, state, steps)._replace(
+        buffers=contact_buffers(flow.grains), observe=partial(observe, flow)
+    )
+    end = _last(advance, start(advance, state))
+    return *_ended(advance, state, end), end.sums.user_sums.sums
+
+
+def _advance_of(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> Advance:
+    """The advance of a state, with the numbers of the flow in its precision."""
+    numbers = jax.tree.map(lambda x: jnp.asarray(x, state.side.dtype), flow)
+    return Advance(numbers, state.grains, state.side, steps, solver)
+
+
+def _until_stale(advance: Advance, now: Carry) -> Carry:
+    """New lists, and the events until one replica of the batch needs the next; at least one event."""
+
+    def keep_going(at: tuple[Array, Carry]) -> Array:
+        is_first, now = at
+        stale = any_replica(needs_lists(advance, now))
+        return any_replica(unfinished(advance, now)) & (is_first | ~stale)
+
+    begin = jnp.bool_(True), refresh_lists(advance, now)
+    return lax.while_loop(keep_going, lambda at: (jnp.bool_(False), event(advance, at[1])), begin)[1]
+
+
+def _last(advance: Advance, begin: Carry) -> Carry:
+    """The end of as many events as there are: a loop over lists round one over events."""
+    return lax.while_loop(lambda now: any_replica(unfinished(advance, now)), partial(_until_stale, advance), begin)
+
+
+def _next(advance: Advance, now: Carry) -> Carry:
+    """The next event, with new lists where they are needed."""
+    stale = any_replica(needs_lists(advance, now))
+    listed = lax.cond(stale, partial(refresh_lists, advance), lambda now: now, now)
+    return event(advance, listed)
+
+
+def _after_events(advance: Advance, begin: Carry, events: int) -> Carry:
+    """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else again."""
+
+    def visit(now: Carry, _: None) -> tuple[Carry, None]:
+        going = any_replica(unfinished(advance, now))
+        return lax.cond(going, partial(_next, advance), lambda now: now, now), None
+
+    return lax.scan(jax.checkpoint(visit), begin, length=events)[0]
 
 
 def _nan_where(invalid: Array, values: T) -> T:
@@ -105,9 +149,9 @@ def _nan_where(invalid: Array, values: T) -> T:
     return jax.tree.map(lambda x: x * factor.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x, values)
 
 
-def _ended(state: State, end: Carry, unfinished: Callable) -> tuple[State, Tally]:
+def _ended(advance: Advance, state: State, end: Carry) -> tuple[State, Tally]:
     """The state and the tally at the end of an advance from a state."""
-    short = jnp.where(unfinished(end), Status.capacity, Status.ok).astype(jnp.int32)
+    short = jnp.where(unfinished(advance, end), Status.capacity, Status.ok).astype(jnp.int32)
     sums = end.sums._replace(status=jnp.maximum(end.sums.status, short))
     return ended(state, *present(end.lists, state.side), end.velocities, sums)
 
@@ -138,152 +182,10 @@ def count_events(
     """
     require_advance(flow, state, steps)
     require_solver(solver)
-    options = AdvanceOptions(solver)  # as in the loop of fixed length
-    return _event_loop(flow, state, steps, free_flight, options).length()
+    advance = _advance_of(flow, solver, state, steps)._replace(free_flight=free_flight)  # as with a fixed length
 
+    def keep_going(at: tuple[Array, Carry]) -> Array:
+        return any_replica(unfinished(advance, at[1]))
 
-class EventLoop(NamedTuple):
-    """The loop over events, in parts: see its methods for how they are put together."""
-
-    start: Carry
-    event: Callable[[Carry], Carry]
-    listed: Callable[[Carry], Carry]  # with a new list of near pairs
-    unfinished: Callable[[Carry], Array]
-    stale: Callable[[Carry], Array]  # whether the list has to be made anew
-
-    def until_stale(self, now: Carry) -> Carry:
-        """A new list, and the events until one replica of the batch needs the next; at least one event."""
-
-        def goes_on(at: tuple[Array, Carry]) -> Array:
-            begins, now = at
-            return any_replica(self.unfinished(now)) & (begins | ~any_replica(self.stale(now)))
-
-        start = jnp.bool_(True), self.listed(now)
-        return lax.while_loop(goes_on, lambda at: (jnp.bool_(False), self.event(at[1])), start)[1]
-
-    def end(self) -> Carry:
-        """The end of as many events as there are: a loop over lists round one over events."""
-        return lax.while_loop(lambda now: any_replica(self.unfinished(now)), self.until_stale, self.start)
-
-    def next(self, now: Carry) -> Carry:
-        """The next event, with a new list where that is needed."""
-        return self.event(lax.cond(any_replica(self.stale(now)), self.listed, lambda now: now, now))
-
-    def scanned(self, events: int) -> Carry:
-        """The end of a loop of fixed length; reverse mode keeps what is carried and computes all else again."""
-
-        def one(now: Carry, _: None) -> tuple[Carry, None]:
-            return lax.cond(any_replica(self.unfinished(now)), self.next, lambda now: now, now), None
-
-        return lax.scan(jax.checkpoint(one), self.start, length=events)[0]
-
-    def length(self) -> Int[Array, ""]:
-        """How many events there are."""
-
-        def going(at: tuple[Array, Carry]) -> Array:
-            return any_replica(self.unfinished(at[1]))
-
-        return lax.while_loop(going, lambda at: (at[0] + 1, self.next(at[1])), (jnp.int32(0), self.start))[0]
-
-
-def _event_loop(flow: ShearFlow, state: State, steps: Array, free_flight: bool | Array, options: AdvanceOptions):
-    """Start and body of the loop of an advance, and whether it has to continue."""
-    grains, side, observe = state.grains, state.side, options.observe
-    observe = None if observe is None else partial(observe, flow)
-    flow = jax.tree.map(lambda x: jnp.asarray(x, side.dtype), flow)
-    dt, shear_rate = flow.timestep, flow.shear_rate
-
-    def observer_at(lists: PairLists, velocities: Array) -> ObserveNow | None:
-        """What the user observes of the flow as it is; None where nothing is observed."""
-        return None if observe is None else partial(_observed_at, observe, lists, grains, velocities, side)
-
-    def unfinished(now: Carry):
-        return (now.step < steps) & (now.sums.status < Status.nonfinite)
-
-    def event(now: Carry) -> Carry:
-        go = unfinished(now)
-        lists, pairs, slack, loss = now.lists, now.pairs, now.slack, now.loss
-        least = now.solved.astype(jnp.int32)
-        jump = steps_to_contact(pairs, lists.near.reach, flow, least)
-        jump = jnp.minimum(jump, steps_of_list(now, flow))
-        jump = jnp.where(free_flight, jump, 0)
-        remaining = steps - now.step
-        jump = jnp.clip(jnp.minimum(jump, remaining.astype(jump.dtype)).astype(jnp.int32), least, remaining)
-        flight = jump.astype(slack.dtype) * dt
-
-        sums = add_flight(now.sums, now.velocities, grains, jump, flight, shear_rate)
-        observe_now = observer_at(lists, now.velocities)
-        sums = sums if observe_now is None else sums._replace(user_sums=with_flight(sums.user_sums, observe_now, jump))
-        frame, velocities = fly(lists.frame, now.velocities, flight, shear_rate)
-        lists, slack = replace(lists, frame=frame), slack - loss * flight
-        pairs = pairs.moved(flight)
-        step = now.step + jump
-        spare = slack - loss * flow.activation_fraction * dt
-        expired = spare < -16 * jnp.finfo(slack.dtype).eps * lists.near.skin
-        meets = go & (step < steps) & ~(expired & (jump > 0))  # a new list comes first
-        observe_now = observer_at(lists, velocities)
-        velocities, pairs, sums, shift = collide(
-            flow, lists.near, grains, velocities, pairs, sums, meets, options, observe_now
-        )
-        if shift is not None:
-            frame, velocities, pairs = shifted(shift, shear_rate, lists, velocities, pairs)
-            lists = replace(lists, frame=frame)
-        status = jnp.where(lists.near.overflow | (expired & meets), Status.capacity, Status.ok)
-        status = jnp.where(jnp.isfinite(loss), status, Status.nonfinite).astype(jnp.int32)
-        sums = sums._replace(status=jnp.maximum(sums.status, status))
-        loss = closing_speed(flow, grains, velocities, lists.near.skin)
-        sums, counted = with_readings(sums, now.counted, lists, velocities)
-        return where_active(go, Carry(lists, pairs, slack, loss, velocities, step, meets, sums, counted), now)
-
-    def with_readings(sums: RunningSums, counted: Array, lists: PairLists, velocities: Array) -> tuple:
-        """The sums with readings of the state, and the collisions until then, where it is time for some."""
-        due = sums.collisions - counted >= READ_AFTER * grains.radii.size / 2
-
-        def read() -> tuple:
-            positions, tilt = present(lists, side)
-            now = State(grains, positions, velocities, side, tilt)
-            return where_active(due, (sums.with_reading(readings(now)), sums.collisions), (sums, counted))
-
-        # The loop of a fixed length, for reverse mode, is too short for a second reading.
-        return lax.cond(any_replica(due), read, lambda: (sums, counted)) if options.buffers else (sums, counted)
-
-    def stale(now: Carry) -> Array:
-        return unfinished(now) & is_stale(now, flow)
-
-    def listed(now: Carry) -> Carry:
-        return with_new_lists(now, flow, grains, side, stale(now))
-
-    lists = no_lists(state.positions, state.tilt)
-    pairs = PairMotion(*4 * [jnp.zeros_like(lists.near.reach)])
-    sums = empty_sums(state.positions.dtype)
-    sums = sums._replace(status=status_if_finite(state.positions, state.velocities))
-    observe_now = observer_at(lists, state.velocities)
-    if observe_now is not None:
-        sums = sums._replace(user_sums=nothing_observed(observe_now, lists.near.reach.size, state.positions.dtype))
-    loss = jnp.full_like(side, jnp.inf)  # there is no list yet
-    start = Carry(
-        lists,
-        pairs,
-        lists.near.skin,
-        loss,
-        state.velocities,
-        jnp.int32(0),
-        jnp.bool_(False),
-        sums,
-        jnp.zeros_like(side),
-    )
-    return EventLoop(start, event, listed, unfinished, stale)
-
-
-def _observed_at(
-    observe: Callable[[State, Contacts, Array], Any],
-    lists: PairLists,
-    grains: Grains,
-    velocities: Array,
-    side: Array,
-    contacts: Contacts,
-    p: Array,
-) -> Any:
-    """What is observed of one time step with the given contacts and impulses p."""
-    positions, tilt = present(lists, side)
-    return observe(State(grains, positions, velocities, side, tilt), contacts, p)
+    begin = jnp.int32(0), start(advance, state)
+    return lax.while_loop(keep_going, lambda at: (at[0] + 1, _next(advance, at[1])), begin)[0]

@@ -18,10 +18,9 @@ from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.network import Contacts
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
-from jaxgran.dynamics.collision import Observe
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
 from jaxgran.dynamics.jax_engine import ended, observe_by_jax
-from jaxgran.dynamics.observer import added, nothing_observed, without_contacts
+from jaxgran.dynamics.observer import Observe, added, nothing_observed, without_contacts
 from jaxgran.dynamics.tally import RunningSums, Tally, empty_sums
 from jaxgran.model.cell import wrap
 from jaxgran.model.flow import ShearFlow

@@ -18,8 +18,11 @@ from jaxtyping import Array, Float
 
 from jaxgran.contact.network import Contacts
 from jaxgran.model.checks import InputError, short_repr
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.state import State
 
 _NUMBERS = (bool, int, float, np.generic, np.ndarray, jax.Array)
+Observe = Callable[[ShearFlow, State, Contacts, Array], Any]  # of a time step: state, contacts, their impulses
 ObserveNow = Callable[[Contacts, Array], Any]  # what is found in a step with these contacts and impulses
 
 

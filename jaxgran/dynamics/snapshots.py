@@ -16,19 +16,22 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import grain_impulses
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.near_pairs import bit_words, outer_pairs
+from jaxgran.contact.network import Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
-from jaxgran.dynamics.collision import contacts_now
 from jaxgran.dynamics.engine import Engine, Numerics, checked_numerics
 from jaxgran.dynamics.replicas import checked_batch, compiled_over_replicas
+from jaxgran.dynamics.step import closing_speed_bound
 from jaxgran.model.batches import Indexable, equal_values
 from jaxgran.model.cell import remap_tilt, wrap
 from jaxgran.model.checks import as_array, require, require_whole
 from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps_of_strain
 from jaxgran.model.state import State, require_state
+from jaxgran.model.status import Status
 
+MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
 
 
@@ -74,6 +77,25 @@ def snapshot(flow: ShearFlow, state: State, solver: ProjectedMethod = DEFAULT_SO
     return snapshot_of(
         flow, state, network, (1 + restitution) * solution.impulses, jnp.maximum(status, solution.status)
     )
+
+
+def contacts_now(flow: ShearFlow, state: State) -> tuple[Contacts, Int[Array, ""]]:
+    """The contact network that the next time step of a flow would solve, in a buffer that holds any packing.
+
+    The status is ``capacity`` where contacts may be missing: a step looks further ahead than the list of pairs, or has
+    more contacts than discs that hardly overlap.
+    """
+    grains, velocities = state.grains, state.velocities
+    pairs = outer_pairs(state.positions, grains, state.side, state.tilt)
+    motion = pair_motion(pairs.i, pairs.j, pairs.separations, velocities, flow.shear_rate)
+    look_ahead = flow.activation_fraction * flow.timestep
+    contact, _ = is_contact(motion, pairs.reach, look_ahead)
+    room = MOST_CONTACTS * grains.radii.size
+    suffices = pairs.skin >= closing_speed_bound(flow, grains, velocities, pairs.skin) * look_ahead
+    missing = ~suffices | pairs.overflow | (jnp.sum(contact, dtype=jnp.int32) > room)
+    status = jnp.where(missing, Status.capacity, Status.ok).astype(jnp.int32)
+    touching = Touching(pairs.i, pairs.j, pairs.reach, motion, contact)
+    return touching.compacted(room, bit_words(contact)).network(grains), status
 
 
 def snapshot_of(flow: ShearFlow, state: State, contacts: Contacts, impulses: Array, status: Array) -> Snapshot:

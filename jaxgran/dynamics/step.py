@@ -1,0 +1,360 @@
+"""One event of the engine ``Jax``: a free flight over whole steps, and the next contacts.
+
+Its functions take what does not change (``Advance``) and what does (``Carry``), and return a new
+``Carry``:
+
+- ``refresh_lists``: new lists of near pairs.
+- ``fly``: free flight over a number of steps.
+- ``collide``: the contacts of one step change the velocities.
+- ``event``: a flight up to the step in which some pair next becomes an approaching contact, and
+  the contacts of that step.
+
+In a batch, a replica that is finished or has no step to solve keeps what it has, see
+``model.control_flow``.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxgran.contact.law import first_step, flight_of, kinetic_means
+from jaxgran.contact.near_pairs import (
+    Frame,
+    PairLists,
+    bit_words,
+    no_lists,
+    present,
+    refresh,
+    separations_now,
+)
+from jaxgran.contact.network import (
+    Contacts,
+    PairMotion,
+    Touching,
+    first_contact_time,
+    is_contact,
+    pair_motion,
+)
+from jaxgran.contact.projected_methods import ProjectedMethod
+from jaxgran.contact.solver import single_contact, solve
+from jaxgran.dynamics.contact_sums import impulses_of, sums_of_contacts
+from jaxgran.dynamics.moving_contacts import contact_delays, delayed_shift, displaced, is_binary
+from jaxgran.dynamics.observer import ObserveNow, nothing_observed, with_contacts, with_flight
+from jaxgran.dynamics.tally import RunningSums, empty_sums
+from jaxgran.dynamics.velocity_scales import READ_AFTER, readings
+from jaxgran.model.control_flow import any_replica, switch_replica, where_active
+from jaxgran.model.flow import ShearFlow
+from jaxgran.model.grains import Grains
+from jaxgran.model.indexing import taken
+from jaxgran.model.reductions import largest, smallest
+from jaxgran.model.state import State, status_if_finite
+from jaxgran.model.status import Status
+
+LONGEST_FLIGHT = 0.05  # strain; a bound on the change of the peculiar velocities within one flight
+_SINGLE_SLOTS = 4  # for one contact: in one slot XLA would compute the terms once for each sum
+
+
+class Advance(NamedTuple):
+    """What does not change in an advance; the last three are static."""
+
+    flow: ShearFlow
+    grains: Grains
+    side: Float[Array, ""]
+    steps: Int[Array, ""]  # to fly in all
+    solver: ProjectedMethod
+    free_flight: bool | Array = True  # whether steps without an approaching contact are jumped over
+    buffers: tuple[int, ...] = ()  # contacts for which a solve is compiled, smallest first, beside all pairs
+    moving_contacts: bool = False  # whether derivatives include that a contact moves in time
+    observe: Callable[[State, Contacts, Array], Any] | None = None  # a function of the user's
+
+
+class Carry(NamedTuple):
+    """What an event changes."""
+
+    lists: PairLists
+    pairs: PairMotion  # of the near list
+    slack: Float[Array, ""]  # unused skin of the near list; the look-ahead of a step takes a part
+    closing_speed: Float[Array, ""]  # bound on how fast any gap closes
+    velocities: Float[Array, "grains 2"]
+    step: Int[Array, ""]  # steps flown
+    solved: Bool[Array, ""]  # whether the contacts of the present step have been dealt with
+    sums: RunningSums
+    collisions_read: Float[Array, ""]  # collisions until the last reading of the velocity scales
+
+
+def start(advance: Advance, state: State) -> Carry:
+    """The carry before the first step, without lists."""
+    lists, dtype = no_lists(state.positions, state.tilt), state.positions.dtype
+    sums = empty_sums(dtype)._replace(status=status_if_finite(state.positions, state.velocities))
+    now = Carry(
+        lists=lists,
+        pairs=PairMotion(*4 * [jnp.zeros_like(lists.near.reach)]),
+        slack=lists.near.skin,
+        closing_speed=jnp.full_like(advance.side, jnp.inf),  # so that the lists are stale
+        velocities=state.velocities,
+        step=jnp.int32(0),
+        solved=jnp.bool_(False),
+        sums=sums,
+        collisions_read=jnp.zeros_like(advance.side),
+    )
+    observe_now = observer_of(advance, now)
+    if observe_now is None:
+        return now
+    nothing = nothing_observed(observe_now, lists.near.reach.size, dtype)
+    return now._replace(sums=sums._replace(user_sums=nothing))
+
+
+def unfinished(advance: Advance, now: Carry) -> Bool[Array, ""]:
+    """Whether there is a step to fly, and all numbers are finite."""
+    return (now.step < advance.steps) & (now.sums.status < Status.nonfinite)
+
+
+def needs_lists(advance: Advance, now: Carry) -> Bool[Array, ""]:
+    """Whether the near list may miss a contact of the next step, which looks θ·dt beyond itself."""
+    flow = advance.flow
+    suffices = now.slack >= now.closing_speed * (1 + flow.activation_fraction) * flow.timestep
+    return unfinished(advance, now) & ~suffices
+
+
+def refresh_lists(advance: Advance, now: Carry) -> Carry:
+    """A new near list where it is needed, and a new outer one where that is used up."""
+    stale = needs_lists(advance, now)
+    lists = refresh(now.lists, advance.grains, advance.side, stale)
+    skin = lax.stop_gradient(lists.near.skin)
+    separations = separations_now(lists.near, lists.frame)
+    new = now._replace(
+        lists=lists,
+        pairs=pair_motion(lists.near.i, lists.near.j, separations, now.velocities, advance.flow.shear_rate),
+        slack=skin,
+        closing_speed=closing_speed_bound(advance.flow, advance.grains, now.velocities, skin),
+    )
+    return where_active(stale, new, now)
+
+
+def closing_speed_bound(flow: ShearFlow, grains: Grains, velocities: Array, skin: Array) -> Float[Array, ""]:
+    """Bound on how fast the gap of a pair outside of the near list closes, in σγ̇.
+
+    A gap closes no faster than 2 max|c| from the peculiar velocities and γ̇ Δx Δy / r ≤ γ̇ r / 2 from
+    the shear, where r ≤ d + skin until a pair from outside the list touches. Within a flight |c|
+    grows by a factor 1 + γ̇ t at most.
+    """
+    cx, cy = lax.stop_gradient(velocities).T  # the choice of pairs has no derivative
+    longest = jnp.maximum(LONGEST_FLIGHT, flow.shear_rate * flow.timestep)
+    speed = jnp.sqrt(largest(cx * cx + cy * cy)) * (1 + longest)
+    return 2 * speed + flow.shear_rate * (2 * jnp.max(lax.stop_gradient(grains.radii)) + skin) / 2
+
+
+def event(advance: Advance, now: Carry) -> Carry:
+    """A flight to the next step with an approaching contact, and the contacts of that step.
+
+    A flight ends earlier where the near list does; a new list then comes before the contacts.
+    """
+    flow, near = advance.flow, now.lists.near
+    going = unfinished(advance, now)
+    jump = _steps_to_fly(advance, now)
+    flown = fly(advance, now, jump)
+
+    spare = flown.slack - now.closing_speed * flow.activation_fraction * flow.timestep
+    expired = spare < -16 * jnp.finfo(spare.dtype).eps * near.skin
+    needs_solve = going & (flown.step < advance.steps) & ~(expired & (jump > 0))
+    collided = collide(advance, flown, needs_solve)
+
+    missing = near.overflow | (expired & needs_solve)
+    listed = jnp.where(missing, Status.capacity, Status.ok)
+    status = jnp.where(jnp.isfinite(now.closing_speed), listed, Status.nonfinite).astype(jnp.int32)
+    sums = collided.sums._replace(status=jnp.maximum(collided.sums.status, status))
+    speed = closing_speed_bound(flow, advance.grains, collided.velocities, near.skin)
+    after = collided._replace(closing_speed=speed, solved=needs_solve, sums=sums)
+    return where_active(going, _with_readings(advance, after), now)
+
+
+def _steps_to_fly(advance: Advance, now: Carry) -> Int[Array, ""]:
+    """Steps to the next contact that the near list holds; at least one if the present one is solved."""
+    flow, least = advance.flow, now.solved.astype(jnp.int32)
+    time, closest = first_contact_time(now.pairs, now.lists.near.reach)
+    steps = jnp.maximum(first_step(time, flow.timestep, flow.activation_fraction), least.astype(time.dtype))
+    to_contact = smallest(jnp.where(steps * flow.timestep < closest, steps, jnp.inf))
+    longest = jnp.divide(LONGEST_FLIGHT, flow.shear_rate) / flow.timestep
+    of_list = now.slack / now.closing_speed / flow.timestep - flow.activation_fraction
+    jump = jnp.minimum(to_contact, jnp.floor(jnp.minimum(of_list, longest)))
+    wanted = jnp.where(advance.free_flight, jump, 0)
+    remaining = advance.steps - now.step
+    return jnp.clip(jnp.minimum(wanted, remaining.astype(wanted.dtype)).astype(jnp.int32), least, remaining)
+
+
+def fly(advance: Advance, now: Carry, steps: Int[Array, ""]) -> Carry:
+    """Exact free flight (SLLOD) over a number of steps: the laboratory velocities stay as they are."""
+    frame, shear_rate = now.lists.frame, advance.flow.shear_rate
+    time = steps.astype(now.slack.dtype) * advance.flow.timestep
+    sums = _with_flight(now.sums, now.velocities, advance.grains, steps, time, shear_rate)
+    observe_now = observer_of(advance, now)
+    if observe_now is not None:
+        sums = sums._replace(user_sums=with_flight(sums.user_sums, observe_now, steps))
+    cy = now.velocities[:, 1]
+    dx, dy, cx = flight_of(now.velocities[:, 0], cy, frame.strain, time, shear_rate)
+    displacements = frame.displacements + jnp.stack([dx, dy], axis=-1)
+    return now._replace(
+        lists=replace(now.lists, frame=Frame(displacements, frame.strain + shear_rate * time)),
+        pairs=now.pairs.moved(time),
+        slack=now.slack - now.closing_speed * time,
+        velocities=jnp.stack([cx, cy], axis=-1),
+        step=now.step + steps,
+        sums=sums,
+    )
+
+
+def _with_flight(
+    sums: RunningSums,
+    velocities: Array,
+    grains: Grains,
+    steps: Array,
+    time: Array,
+    shear_rate: float | Array,
+) -> RunningSums:
+    """The sums with the time of a flight and ∫ Σ m c ⊗ c dt along it, where c_x falls by γ̇ c_y t."""
+    cx, cy = velocities[:, 0], velocities[:, 1]
+    px, py = grains.masses * cx, grains.masses * cy
+    products = ((px, cx), (px, cy), (py, cy))
+    xx, xy, yy = (jnp.dot(p, c, precision=lax.Precision.HIGHEST) for p, c in products)
+    means = kinetic_means(xx, xy, yy, shear_rate * time)
+    flight = jnp.stack([time, steps.astype(time.dtype), *(time * mean for mean in means)])
+    return sums._replace(flight=sums.flight + flight)
+
+
+class Collision(NamedTuple):
+    """What the contacts of one step do to the grains, and what they add to the sums."""
+
+    momenta: Float[Array, "grains 2"]
+    contact_sums: Float[Array, " contact"]
+    largest_overlap: Float[Array, ""]
+    iterations: Int[Array, ""]
+    residual: Float[Array, ""]
+    status: Int[Array, ""]
+    user_sums: Any
+    shift: Float[Array, "grains 2"] | None  # of ``moving_contacts``
+
+
+def collide(advance: Advance, now: Carry, needs_solve: Bool[Array, ""]) -> Carry:
+    """The contacts of one step change the velocities; not where none approaches or no step needs it.
+
+    The contacts are compacted from the near list into the smallest buffer that holds them, and
+    solved and summed there; more than the largest buffer holds are solved and summed on the list.
+    """
+    near, grains, flow = now.lists.near, advance.grains, advance.flow
+    look_ahead = flow.activation_fraction * flow.timestep
+    all_contacts, approaching = is_contact(now.pairs, near.reach, look_ahead)
+    acts = needs_solve & jnp.any(bit_words(approaching) > 0)
+    contact, motion, delays = all_contacts & acts, now.pairs, None
+    if advance.moving_contacts:
+        delays = contact_delays(now.pairs, near.reach, approaching, flow.timestep)
+        motion = now.pairs.moved(jnp.where(is_binary(near, contact, grains), delays, 0))
+    touching, words = Touching(near.i, near.j, near.reach, motion, contact), bit_words(contact)
+
+    sizes = (1, *advance.buffers) if advance.buffers else ()
+    in_buffer = partial(_collision_in_buffer, advance, now, touching, words)
+    on_list = partial(_collision, advance, now, touching, delays)
+    programs = [*(partial(in_buffer, size) for size in sizes), on_list]
+    count = jnp.sum(lax.population_count(words).astype(jnp.int32), dtype=jnp.int32)
+    branch = jnp.sum(count > jnp.asarray([0, *sizes], jnp.int32), dtype=jnp.int32)
+    collision = switch_replica(branch, _no_collision(now, delays), programs)
+
+    kicks = collision.momenta / grains.masses[:, None]
+    x, y = kicks.T
+    ux, uy = (taken(a, near.i) - taken(a, near.j) for a in (x, y))
+    kicked = now._replace(
+        pairs=now.pairs._replace(ux=now.pairs.ux + ux, uy=now.pairs.uy + uy),
+        velocities=now.velocities + kicks,
+        sums=_with_collision(now.sums, collision, acts),
+    )
+    if collision.shift is None:
+        return kicked
+    frame, velocities, pairs = displaced(collision.shift, flow.shear_rate, now.lists, kicked.velocities, kicked.pairs)
+    return kicked._replace(lists=replace(now.lists, frame=frame), velocities=velocities, pairs=pairs)
+
+
+def _no_collision(now: Carry, delays: Array | None) -> Collision:
+    """No contact approaches."""
+    still, zero = jnp.zeros_like(now.velocities), jnp.zeros_like(now.sums.largest[0])
+    no_sums, shift = jnp.zeros_like(now.sums.contact), None if delays is None else still
+    return Collision(still, no_sums, zero, jnp.int32(0), zero, jnp.int32(0), now.sums.user_sums, shift)
+
+
+def _collision_in_buffer(
+    advance: Advance, now: Carry, touching: Touching, words: Array, size: int, active: Array
+) -> Collision:
+    """What no more than ``size`` contacts do; a single one is solved in closed form."""
+    if size > 1:
+        return _collision(advance, now, touching.compacted(size, words), None, active)
+    return _collision(advance, now, touching.compacted(_SINGLE_SLOTS, words), None, active, single=True)
+
+
+def _collision(
+    advance: Advance,
+    now: Carry,
+    touching: Touching,
+    delays: Array | None,
+    active: Array,
+    single: bool = False,
+) -> Collision:
+    """What contacts do, from their network and its solution."""
+    flow, grains = advance.flow, advance.grains
+    network, count = touching.network(grains), grains.radii.size
+    if single:
+        solution = single_contact(network, count)
+    else:
+        solution = solve(network, count, flow.shear_rate, advance.solver, active)
+    impulses = impulses_of(flow, network, grains, solution)
+    contact_sums, largest_overlap = sums_of_contacts(flow, touching.reach, network, impulses)
+    user_sums, observe_now = now.sums.user_sums, observer_of(advance, now)
+    if observe_now is not None:
+        user_sums = with_contacts(user_sums, observe_now, network, impulses.contacts)
+    shift = None if delays is None else delayed_shift(delays, network, grains, impulses)
+    outcome = solution.iterations, solution.residual, solution.status
+    return Collision(impulses.grains, contact_sums, largest_overlap, *outcome, user_sums, shift)
+
+
+def _with_collision(sums: RunningSums, collision: Collision, acts: Array) -> RunningSums:
+    """The sums with what the contacts of one step add."""
+    solves = acts, collision.iterations, collision.status != Status.ok
+    largest_values = jnp.stack([collision.largest_overlap, collision.residual])
+    return sums._replace(
+        contact=sums.contact + collision.contact_sums,
+        solve=sums.solve + jnp.stack([x.astype(sums.solve.dtype) for x in solves]),
+        largest=jnp.maximum(sums.largest, largest_values),
+        status=jnp.maximum(sums.status, collision.status),
+        user_sums=collision.user_sums,
+    )
+
+
+def observer_of(advance: Advance, now: Carry) -> ObserveNow | None:
+    """What the user observes now, given contacts and impulses; None where nothing is observed."""
+    observe = advance.observe
+    if observe is None:
+        return None
+    return lambda contacts, impulses: observe(_state_of(advance, now), contacts, impulses)
+
+
+def _state_of(advance: Advance, now: Carry) -> State:
+    positions, tilt = present(now.lists, advance.side)
+    return State(advance.grains, positions, now.velocities, advance.side, tilt)
+
+
+def _with_readings(advance: Advance, now: Carry) -> Carry:
+    """With readings of the velocity scales where it is time for some."""
+    if not advance.buffers:  # loops for derivatives are too short for a second reading
+        return now
+    sums, collisions_read = now.sums, now.collisions_read
+    due = sums.collisions - collisions_read >= READ_AFTER * advance.grains.radii.size / 2
+
+    def read() -> tuple[RunningSums, Array]:
+        state = _state_of(advance, now)
+        read_now = sums.with_reading(readings(state)), sums.collisions
+        return where_active(due, read_now, (sums, collisions_read))
+
+    sums_after, read_after = lax.cond(any_replica(due), read, lambda: (sums, collisions_read))
+    return now._replace(sums=sums_after, collisions_read=read_after)
