@@ -30,7 +30,8 @@ Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pa
 Units: mean grain diameter σ, mass m of a grain of that diameter, and the time unit t of the shear rate (t = 1/γ̇ at the
 default γ̇ = 1).
 
-Importing this package is quick and changes no flag of JAX. Names are loaded when they are first used.
+Importing this package is quick. Only ``jg.use_cache()`` changes flags of JAX, so that later processes need not compile.
+Names are loaded when they are first used.
 """
 
 import lazy_loader

@@ -11,6 +11,7 @@ from flows import GRAINS, assert_same_bits
 from synthetic import refused
 
 import jaxgran as jg
+from jaxgran.cache import persistent_jit
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics import advance
 from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine
@@ -75,7 +76,7 @@ IMPOSSIBLE = {
     ),
     "single precision": (
         lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
-        "in float32, not numba: it computes in float64",
+        "in float32, not numba: it runs on the device cpu, in float64, with the solver barzilai-borwein",
     ),
     "every step": (
         lambda state: jg.advance(of(), state, STEPS, free_flight=False, engine=jg.Numba()),
@@ -92,7 +93,7 @@ IMPOSSIBLE = {
                 ** 2
             )
         )(0.5),
-        "with events, not numba: only the engine jax does that",
+        "with events, not numba: it runs on the device cpu",
     ),
     "an observable": (
         lambda state: jg.sample(
@@ -171,6 +172,7 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
     flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
     with jax.default_device(jax.devices("cpu")[0]):
         assert not in_lockstep()
+        assert persistent_jit._folder() is not None  # programs for the processor are kept on disk
         _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
     assert np.all(np.asarray(tally.steps) == int(STEPS))
 
