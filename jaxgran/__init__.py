@@ -14,6 +14,7 @@ Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis.
     jax.config.update("jax_enable_x64", True)
     import jaxgran as jg
 
+    jg.use_cache()  # compiled programs are kept on disk
     alphas, nus = (x.ravel() for x in jnp.meshgrid(jnp.array([0.3, 0.6, 0.9]), jnp.array([0.5, 0.6, 0.7])))
     flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
     states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # packed, heated, sheared until steady
