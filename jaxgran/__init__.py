@@ -14,6 +14,7 @@ Many flows are one batch: numbers and states get a leading ``(replicas,)`` axis.
     jax.config.update("jax_enable_x64", True)
     import jaxgran as jg
 
+    jg.use_cache()  # compiled programs are kept on disk
     alphas, nus = (x.ravel() for x in jnp.meshgrid(jnp.array([0.3, 0.6, 0.9]), jnp.array([0.5, 0.6, 0.7])))
     flows = jg.ShearFlow(grains=64, restitution=alphas, packing_fraction=nus, timestep=1e-3)
     states = jg.prepare(flows, jax.random.split(jax.random.key(0), len(alphas)))  # packed, heated, sheared until steady
@@ -30,7 +31,8 @@ Axes: arrays of grains are ``(grains, 2)`` or ``(grains,)``, of near pairs ``(pa
 Units: mean grain diameter σ, mass m of a grain of that diameter, and the time unit t of the shear rate (t = 1/γ̇ at the
 default γ̇ = 1).
 
-Importing this package is quick and changes no flag of JAX. Names are loaded when they are first used.
+Importing this package is quick. Only ``jg.use_cache()`` changes flags of JAX, so that later processes need not compile.
+Names are loaded when they are first used.
 """
 
 import lazy_loader

@@ -4,6 +4,7 @@ from .analysis.coarse_graining import gaussian
 from .analysis.fields import fields_at, grid
 from .analysis.fit import fit_trajectory
 from .analysis.jax_md_space import jax_md_space
+from .cache.folder import use_cache
 from .contact.problem import ContactNetwork, DelassusProblem
 from .contact.projected_methods import (
     BarzilaiBorwein,
@@ -87,6 +88,7 @@ __all__ = [
     "snapshot_series",
     "solve_contacts",
     "theory_errors",
+    "use_cache",
     "validity",
     "write_trajectory",
 ]

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 
 def versions(packages: Iterable[str]) -> dict[str, str]:
@@ -82,6 +83,14 @@ def devices() -> list[str]:
     except (RuntimeError, AssertionError) as failure:  # JAX asserts that a requested platform exists
         message = " ".join(str(failure).split()).rstrip(".")
         raise RuntimeError(message or f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')} has none") from failure
+
+
+def default_device() -> Any:
+    """The device that JAX computes on by default."""
+    import jax
+
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
+    return jax.devices(device)[0] if device is None or isinstance(device, str) else device
 
 
 def precision() -> str:

@@ -32,6 +32,7 @@ import jaxgran as jg
 from jaxgran.model.display import with_error
 
 jax.config.update("jax_enable_x64", True)
+jg.use_cache()
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
 quick = bool(os.environ.get("QUICK"))
 restitution = [0.2, 0.5, 0.8] if quick else [0.1, 0.3, 0.5, 0.7, 0.9]

@@ -32,6 +32,7 @@ from jaxgran.model.display import with_error
 from jaxgran.reference.corrected_shear import MEASURED_LAWS, corrected_shear, correlation_length
 
 jax.config.update("jax_enable_x64", True)
+jg.use_cache()
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
 quick = bool(os.environ.get("QUICK"))
 restitution = [0.3, 0.55, 0.8] if quick else [0.2, 0.4, 0.6, 0.8, 0.95]

@@ -35,6 +35,7 @@ from jaxgran.model.display import with_error
 from jaxgran.sampling.timestep import stress_error
 
 jax.config.update("jax_enable_x64", True)
+jg.use_cache()
 plt.rcParams.update({"font.size": 8, "figure.dpi": 150, "figure.constrained_layout.use": True})
 quick = bool(os.environ.get("QUICK"))
 grains, strain, seeds = (64, 2.0, 4) if quick else (256, 20.0, 8)

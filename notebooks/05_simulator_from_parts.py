@@ -35,6 +35,7 @@ import jaxgran as jg
 from jaxgran.model.display import with_error
 
 jax.config.update("jax_enable_x64", True)
+jg.use_cache()
 warnings.filterwarnings("ignore", "scatter inputs have incompatible types")  # of jax-md's lists, harmless
 quick = bool(os.environ.get("QUICK"))
 alphas, nus = ([0.3], [0.5, 0.7]) if quick else ([0.3, 0.9], [0.5, 0.6, 0.7])

@@ -53,13 +53,15 @@ import jax
 import jaxgran as jg
 
 def folder():
-    return jax.config.values["jax_compilation_cache_dir"]
+    return jax.config.jax_compilation_cache_dir
 
 before = jax.config.values | {}
 pair = jg.DelassusProblem([[1.0]], [-1.0])
 assert jax.config.values == before, "importing changes flags"
-print(folder())
 assert float(jg.solve_contacts(pair).impulses[0]) == 1
+assert jax.config.values == before, "a function of the package changes flags"
+print(folder())
+jg.use_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # whatever the speed of the machine
 assert float(jax.jit(lambda x: 2 * x + 1)(1.0)) == 3
 print(folder())
@@ -74,7 +76,7 @@ def first_call(**variables: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
-def test_a_script_keeps_programs_where_the_command_line_does_from_its_first_compilation(tmp_path: Path) -> None:
+def test_a_script_keeps_programs_where_the_command_line_does_once_it_asks_for_it(tmp_path: Path) -> None:
     first, second = (first_call(XDG_CACHE_HOME=str(tmp_path)) for _ in range(2))
     imported, called = first.stdout.split()
     assert imported == "None" and Path(called).parent == tmp_path / "jaxgran"

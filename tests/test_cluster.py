@@ -18,7 +18,7 @@ SCRIPT = Path(__file__).parents[1] / "docs" / "how-to" / "slurm_map.py"
 
 
 def run(folder: Path, *words: str) -> subprocess.CompletedProcess:
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.values["jax_compilation_cache_dir"]}
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir}
     return subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
 
 

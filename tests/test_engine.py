@@ -11,6 +11,7 @@ from flows import GRAINS, assert_same_bits
 from synthetic import refused
 
 import jaxgran as jg
+from jaxgran.cache import persistent_jit
 from jaxgran.contact.projected_methods import solver_name
 from jaxgran.dynamics import advance
 from jaxgran.dynamics.engine import Numerics, _warn_once, in_lockstep, select_engine
@@ -73,6 +74,10 @@ IMPOSSIBLE = {
         lambda state: jg.advance(of(), state, STEPS, engine=jg.Numba(), solver=jg.Jacobi()),
         "with the solver jacobi, not numba",
     ),
+    "single precision": (
+        lambda state: jg.advance(of(), single(state), STEPS, engine=jg.Numba()),
+        "in float32, not numba: it runs on the device cpu, in float64, with the solver barzilai-borwein",
+    ),
     "moving contacts": (
         lambda state: jg.advance(of(), state, STEPS, moving_contacts=True, engine=jg.Numba()),
         "with moving_contacts, not numba",
@@ -84,7 +89,7 @@ IMPOSSIBLE = {
                 ** 2
             )
         )(0.5),
-        "with events, not numba: only the engine jax does that",
+        "with events, not numba: it runs on the device cpu",
     ),
 }
 
@@ -153,6 +158,7 @@ def test_the_default_device_chooses_the_engine_not_the_backend(flowing, monkeypa
     flows, states = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), (of(), flowing(0.7)))
     with jax.default_device(jax.devices("cpu")[0]):
         assert not in_lockstep()
+        assert persistent_jit._folder() is not None  # programs for the processor are kept on disk
         _, tally = jg.advance(flows, states, STEPS, engine=jg.Numba())
     assert np.all(np.asarray(tally.steps) == int(STEPS))
 

@@ -122,9 +122,11 @@ def test_example_of_the_readme_runs_and_stands_in_the_help(capsys: pytest.Captur
     (example,) = python_of("../README.md")
     assert len(example.splitlines()) <= 13
     assert all(line.strip() in jg.__doc__ for line in example.splitlines())
-    assert example.split("import jaxgran as jg\n")[1].strip().splitlines()[:2] == [
-        line for line in python_of("tutorial.md")[1].splitlines() if line.startswith(("alphas", "flows"))
-    ]
+    batch, in_tutorial = (
+        [line for line in text.splitlines() if line.startswith(("alphas", "flows"))]
+        for text in (example, python_of("tutorial.md")[1])
+    )
+    assert len(batch) == 2 and batch == in_tutorial
     exec(example, {})
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     printed, shown = (

@@ -65,7 +65,7 @@ WITHOUT_ARRAYS = """
     ContactNetwork DelassusProblem Grains InputError ShearFlow Snapshot State Status Tally
     averages_against_grains cluster_shares explore ratio_against_timestep ratio_contours
     ratio_curves BarzilaiBorwein Jacobi Nesterov ProjectedMethod Jax Numba merge_maps open_map
-    read_trajectory save_figures theory_errors enskog_factors write_trajectory
+    read_trajectory save_figures theory_errors enskog_factors write_trajectory use_cache
 """
 
 

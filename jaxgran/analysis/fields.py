@@ -27,7 +27,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxgran.analysis.coarse_graining import CoarseGraining
-from jaxgran.cache.folder import use_cache
 from jaxgran.dynamics.snapshots import Snapshot, collided
 from jaxgran.model.batches import equal_values
 from jaxgran.model.cell import displacement
@@ -145,7 +144,6 @@ def fields_at(snapshot: Snapshot, points: Float[Array, "points 2"], graining: Co
     points, accepted = as_array(points), "an array (points, 2) of finite numbers"
     require("points", points, lambda x: x.ndim == 2 and x.shape[1] == 2 and np.isfinite(x), accepted)
     _check(graining, snapshot.state)
-    use_cache()
     return _fields_at(snapshot, points, graining)
 
 

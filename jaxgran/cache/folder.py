@@ -4,47 +4,47 @@ import os
 import stat
 import tempfile
 import warnings
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from platformdirs import user_cache_path
 
-from jaxgran.environment import processor_kind
+from jaxgran.environment import default_device, processor_kind
 
 _SHORTEST_COMPILATION = 0.3  # seconds; faster compilations are not cached
 
 
-@cache
 def use_cache() -> None:
-    """Cache compiled programs on disk from now on, unless the user has chosen otherwise; once in a process.
+    """Keep compiled programs on disk from now on, so that later processes start without compiling.
 
-    The functions that compile call it first. A folder of the user's in ``jax_compilation_cache_dir``, and a cache that
-    ``jax_enable_compilation_cache`` turns off, are left as they are. Each kind of processor has a folder of its own,
-    since several machines may share a home folder. If the user's cache folder is not writable, a temporary one is used
-    and a warning names it.
+    It sets JAX's ``jax_compilation_cache_dir`` to a folder in the user's cache folder, one for each kind of processor,
+    and ``jax_persistent_cache_min_compile_time_secs`` to 0.3. Programs of the user are then kept, too. A folder that
+    JAX has already, and a cache that ``jax_enable_compilation_cache`` turns off, are left as they are. If the user's
+    cache folder is not writable, a temporary one is used and a warning names it. Call it before the first computation;
+    the command line does.
     """
     import jax
 
-    if jax.config.values["jax_compilation_cache_dir"] or not jax.config.values["jax_enable_compilation_cache"]:
+    config: Any = jax.config  # whose flags are attributes
+    if config.jax_compilation_cache_dir or not config.jax_enable_compilation_cache:
         return
     if message := fallback_message():
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(message, stacklevel=2)
     folder = cache_folder()
     if folder is None:
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder / processor_kind()))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
-    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and jax.default_backend() == "cpu":  # JAX itself sets 1
-        _silence_loader(jax.config)
+    config.update("jax_compilation_cache_dir", str(folder / processor_kind()))
+    config.update("jax_persistent_cache_min_compile_time_secs", _SHORTEST_COMPILATION)
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1" and default_device().platform == "cpu":  # JAX itself sets 1
+        _silence_loader(config)
 
 
 def programs_folder() -> Path | None:
     """The folder where JAX caches compiled programs; None if it caches none."""
     import jax
 
-    values = jax.config.values
-    folder = values["jax_enable_compilation_cache"] and values["jax_compilation_cache_dir"]
+    config: Any = jax.config
+    folder = config.jax_enable_compilation_cache and config.jax_compilation_cache_dir
     return Path(folder) if folder else None
 
 
@@ -53,7 +53,7 @@ def _silence_loader(config: Any) -> None:
 
     JAX sets the level of XLA's log together with that of its own, but sets back only its own.
     """
-    before = config.values["jax_logging_level"]
+    before = config.jax_logging_level
     if before in (None, "NOTSET"):
         config.update("jax_logging_level", "CRITICAL")
         config.update("jax_logging_level", before)

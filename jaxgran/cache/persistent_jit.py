@@ -23,8 +23,8 @@ from jax import monitoring
 from jax.core import Tracer
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from jaxgran.cache.folder import programs_folder, use_cache
-from jaxgran.environment import processor_features
+from jaxgran.cache.folder import programs_folder
+from jaxgran.environment import default_device, processor_features
 from jaxgran.files import file_lock, read_cached, write_cached
 
 _MOST_PROGRAMS = 64  # of up to 4 MB each
@@ -36,7 +36,7 @@ _SAFE_CALLS = ("jaxgran_advance", "Sharding")  # others need a library that JAX 
 
 
 def persistent_jit(function: Callable, register: Callable[[], None] = lambda: None) -> Callable:
-    """``jax.jit`` of a function, with its compiled programs cached on disk, see ``use_cache``.
+    """``jax.jit`` of a function, with its compiled programs cached on disk, after a call of ``use_cache``.
 
     Args:
       function: a function of pytrees of arrays, without static arguments. JAX's flags are read at the first call with
@@ -68,9 +68,9 @@ def persistent_jit(function: Callable, register: Callable[[], None] = lambda: No
 
 def _folder() -> Path | None:
     """The folder of cached programs; None if programs are not cached."""
-    use_cache()
     folder = programs_folder()
-    return folder / "programs" if folder and jax.default_backend() == "cpu" and jax.device_count() == 1 else None
+    on_processor = default_device().platform == "cpu" and jax.device_count() == 1
+    return folder / "programs" if folder and on_processor else None
 
 
 def _has_foreign_class(structure: Any) -> bool:
@@ -148,7 +148,7 @@ def _jax_cache_read_only() -> Iterator[list[str]]:
         if event == "/jax/compilation_cache/cache_hits":
             hits.append(event)
 
-    before = jax.config.values[_MIN_COMPILE_TIME]
+    before = getattr(jax.config, _MIN_COMPILE_TIME)
     monitoring.register_event_listener(listen)
     jax.config.update(_MIN_COMPILE_TIME, float("inf"))
     try:

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxgran.cache.folder import use_cache
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
 from jaxgran.contact.problem_checks import judged
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
@@ -83,7 +82,6 @@ def solve_contacts(
       >>> solution.impulses.round(3).tolist(), solution.velocities.round(3).tolist()
       ([1.333, 0.667], [1.0, 0.0])
     """
-    use_cache()
     problem = judged(problem)
     require_number("restitution", restitution, *RANGES["restitution"])
     require_solver(solver)

@@ -1,34 +1,24 @@
-"""The engines that advance a flow, and the choice of one for the backend, precision and solver.
+"""The engines that advance a flow, and the choice of one for the device, precision, solver and options.
 
-=========  =====================================  ==========================================================
-engine     for                                    needs
-=========  =====================================  ==========================================================
-Numba      processors                             float64, the default solver
-Jax        everything else, and as the reference  nothing: every backend, precision, solver and derivative
-=========  =====================================  ==========================================================
-
-Both engines solve the same steps to the same tolerance, and differ in speed and rounding. Derivatives and steps without
-free flight run in the engine ``Jax`` only. Where no engine is given, ``Numba`` is taken on a processor if it can do
-what is asked for, and otherwise ``Jax``. A given engine that cannot raises an InputError.
+Both engines solve the same steps to the same tolerance, and differ in speed and rounding. ``LIMITS`` is the table of
+what each can do. Where no engine is given, ``Numba`` is taken if it can do what is asked for, and otherwise ``Jax``.
+A given engine that cannot raises an InputError.
 """
 
 import warnings
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
-from jaxgran.cache.folder import use_cache
 from jaxgran.contact.projected_methods import (
     DEFAULT_SOLVER,
-    BarzilaiBorwein,
     ProjectedMethod,
     require_solver,
     solver_name,
 )
-from jaxgran.environment import precision
+from jaxgran.environment import default_device, precision
 from jaxgran.model.checks import InputError, short_repr
 from jaxgran.model.flow import ShearFlow
 from jaxgran.model.state import State
@@ -67,12 +57,27 @@ class Numba:
     """
 
     name: ClassVar[str] = "numba"
-    platform: ClassVar[str] = "cpu"
-    options: ClassVar[tuple[str, ...]] = ("observe",)
     solver: ClassVar[str] = "gauss-seidel, barzilai-borwein where stiff"
 
 
 Engine = Jax | Numba
+
+
+class Needs(NamedTuple):
+    """What a flow needs of an engine; in ``LIMITS`` what an engine accepts, None for everything."""
+
+    device: Any
+    precision: Any
+    solver: Any
+    option: Any
+
+
+_WORDS = Needs("on the device {}", "in {}", "with the solver {}", "with {}")
+LIMITS: dict[type, Needs] = {
+    #            device    precision     solver                 option
+    Numba: Needs(("cpu",), ("float64",), ("barzilai-borwein",), ("", "observe")),
+    Jax: Needs(None, None, None, None),
+}
 
 
 def engine_named(name: str) -> Engine | None:
@@ -105,7 +110,6 @@ DEFAULT_NUMERICS = Numerics()
 
 def checked_numerics(solver: Any, engine: Any) -> Numerics:
     """Solver and engine as one value; InputError unless they are a projected method, and an engine or None."""
-    use_cache()  # what is checked here is compiled next
     require_solver(solver)
     if engine is not None and not isinstance(engine, Engine):
         raise InputError(f"engine must be jg.Jax(), jg.Numba() or None, not {short_repr(engine)}.")
@@ -113,7 +117,7 @@ def checked_numerics(solver: Any, engine: Any) -> Numerics:
 
 
 def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = None, option: str = "") -> Engine:
-    """The engine that advances a flow, for the backend, precision and solver.
+    """The engine that was asked for, or else the first of ``LIMITS`` that can advance a flow.
 
     Args:
       flow: gives the number of grains; it may be a batch.
@@ -124,21 +128,28 @@ def select_engine(flow: ShearFlow, numerics: Numerics, state: State | None = Non
     Raises:
       InputError: the engine that was asked for cannot do this.
     """
-    requested = numerics.engine
-    if isinstance(requested, Jax):
-        return requested
-    device = default_device()
-    option = "" if option in Numba.options else option
-    why = _why_unsupported(numerics.solver, state, option, device)
-    if why is None:
-        return Numba()
-    if requested is None:
-        other = option or not _is_default(numerics.solver) or device.platform != Numba.platform
-        if state is not None and not other and precision() == "float32":
+    engine = numerics.engine or Numba()
+    dtype = precision() if state is None else str(state.positions.dtype)
+    needs = Needs(default_device().platform, dtype, solver_name(numerics.solver), option)
+    limits = LIMITS[type(engine)]
+    unmet = {
+        name: words.format(value)
+        for name, words, value, accepted in zip(Needs._fields, _WORDS, needs, limits, strict=True)
+        if accepted is not None and value not in accepted
+    }
+    if not unmet:
+        return engine
+    if numerics.engine is None:
+        if state is not None and [*unmet] == ["precision"] and precision() == "float32":
             _warn_once(_SINGLE_PRECISION)
         return Jax()
-    where, reason = why
-    raise InputError(f"engine must be jax or chosen automatically {where}, not {Numba.name}: {reason}.")
+    wrong = " and ".join(unmet.values())
+    accepted = [" or ".join(value or "no option" for value in values) for values in limits]
+    runs = ", ".join(words.format(values) for words, values in zip(_WORDS, accepted, strict=True))
+    hint = ' (jax.config.update("jax_enable_x64", True))' if "precision" in unmet else ""
+    raise InputError(
+        f"engine must be jax or chosen automatically {wrong}, not {engine.name}: it runs {runs} only{hint}."
+    )
 
 
 def in_lockstep() -> bool:
@@ -157,34 +168,6 @@ def solver_in_use(engine: Engine, solver: ProjectedMethod) -> str:
       ('barzilai-borwein', 'gauss-seidel, barzilai-borwein where stiff')
     """
     return solver_name(solver) if isinstance(engine, Jax) else engine.solver
-
-
-def _is_default(solver: ProjectedMethod) -> bool:
-    """Whether this is the method that both engines have, with any tolerance."""
-    return type(solver) is BarzilaiBorwein
-
-
-def _why_unsupported(solver: ProjectedMethod, state: State | None, option: str, device: Any) -> tuple[str, str] | None:
-    """When the engine ``Numba`` cannot advance a flow, and why, as two parts of a sentence; None if it can."""
-    if device.platform != Numba.platform:
-        return f"on a {device.platform.upper()}", "it is made for processors"
-    if option:
-        return f"with {option}", f"only the engine {Jax.name} does that"
-    if not _is_default(solver):
-        return f"with the solver {solver_name(solver)}", "it has a contact solve of its own"
-    if _dtype(state) != jnp.float64:
-        return f"in {_dtype(state)}", 'it computes in float64 (jax.config.update("jax_enable_x64", True))'
-    return None
-
-
-def _dtype(state: State | None) -> jnp.dtype:
-    return jnp.dtype(jnp.result_type(float)) if state is None else state.positions.dtype
-
-
-def default_device() -> Any:
-    """The device that JAX computes on by default."""
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]  # set by ``jax.default_device``
-    return jax.devices(device)[0] if device is None or isinstance(device, str) else device
 
 
 @cache

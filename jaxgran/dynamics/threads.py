@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import jax
 
 from jaxgran.dynamics.interruption import PATIENCE, engines_stopped
-from jaxgran.environment import precision
 
 _MESSAGE, _RESULT, _ERROR = range(3)
 Send = Callable[[Any], None]
@@ -43,7 +42,8 @@ def in_threads(
     """
     waiting, cancelled = iter(list(enumerate(tasks))), Event()  # the threads share this iterator
     events: SimpleQueue[tuple[int, Any]] = SimpleQueue()
-    x64, device = precision() == "float64", jax.config.values["jax_default_device"]
+    config: Any = jax.config
+    x64, device = config.jax_enable_x64, config.jax_default_device
 
     def send(message: Any) -> None:
         if cancelled.is_set():

@@ -30,9 +30,8 @@ import jax
 import numpy as np
 
 from jaxgran.contact.projected_methods import solver_text
-from jaxgran.dynamics.engine import default_device
 from jaxgran.dynamics.tally import TABLE, flat_tally, tally_from_flat
-from jaxgran.environment import precision
+from jaxgran.environment import default_device, precision
 from jaxgran.files import same_file
 from jaxgran.io.atomic import CorruptFile, read_arrays, write_arrays
 from jaxgran.maps.own_observables import identity_of, sums_by_name

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import jax
 
+from jaxgran.cache.folder import programs_folder, use_cache
 from jaxgran.environment import precision
 from jaxgran.maps.provenance import made_with, versions_of
 from jaxgran.model.checks import InputError
@@ -21,6 +22,8 @@ def run_on_cluster(
     address: str, function: Callable[..., T], tasks: Sequence[tuple], made: Provenance | None = None
 ) -> Generator[tuple[int, T | None]]:
     """Run a function on the arguments of every task on a cluster, with the precision of this process.
+
+    Workers keep compiled programs on disk if this process does.
 
     Args:
       address: address of the scheduler, such as ``tcp://127.0.0.1:8786``.
@@ -43,10 +46,10 @@ def run_on_cluster(
         client = Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers at {address!r}: {' '.join(str(error).split())[:80]}.") from None
-    x64, here = precision() == "float64", versions_of(made_with())
+    x64, caching, here = precision() == "float64", programs_folder() is not None, versions_of(made_with())
     with client:
         futures = {
-            client.submit(_with_precision, x64, function, task, pure=False, priority=-number): number
+            client.submit(_on_worker, x64, caching, function, task, pure=False, priority=-number): number
             for number, task in enumerate(tasks)
         }
         for future in as_completed(list(futures), loop=client.loop):
@@ -65,7 +68,9 @@ def run_on_cluster(
             future.release()
 
 
-def _with_precision(x64: bool, function: Callable[..., Any], task: tuple) -> tuple[dict[str, str], Any]:
+def _on_worker(x64: bool, caching: bool, function: Callable[..., Any], task: tuple) -> tuple[dict[str, str], Any]:
     """What a worker computes with, and the result of the function."""
     jax.config.update("jax_enable_x64", x64)
+    if caching:
+        use_cache()
     return made_with(), function(*task)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 from jaxgran import environment
 from jaxgran.cache.persistent_jit import sources_digest
-from jaxgran.dynamics.engine import default_device
 
 _PACKAGES = ("jaxgran", "jax", "jaxlib", "jax-md", "numba", "numpy", "xarray")
 DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
@@ -15,7 +14,7 @@ DECIDING = ("jaxgran", "jax", "jaxlib", "numba", "numpy")
 
 def made_with() -> dict[str, str]:
     """Precision, device, platform, versions, sources and commit of this process."""
-    device = default_device()
+    device = environment.default_device()
     return {
         "precision": environment.precision(),
         "device": f"{device.platform}: {device.device_kind}",

@@ -1,6 +1,6 @@
 """Loads the numba engine from an object file, compiles it if there is none, and registers it with XLA.
 
-The name of the file is a hash of all that its content depends on: the sources that are compiled together, the compiler
+The name of the file is a hash of all that its content depends on: the sources of its folders, the compiler
 and the processor. So a change in any of them gives another file, in a user's cache and in the tests. An object file is
 loaded without importing numba. If the cache cannot be written, every process compiles, with a warning.
 """
@@ -8,7 +8,6 @@ loaded without importing numba. If the cache cannot be written, every process co
 import ctypes
 import hashlib
 import os
-import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,23 +29,13 @@ STOP = "jaxgran_stop"  # a word in the object file; the engine runs while it is 
 THREADS = "jaxgran_threads"  # a word in the object file: threads that advance the replicas of a call
 _LOCK = Lock()
 _MOST_KEPT = 8  # object files in the cache
-_IMPORTS = re.compile(r"^\s*from jaxgran\.([\w.]+) import (\([^)]*\)|.*)", re.MULTILINE)
 _CACHE_FOLDER = "NUMBA_CACHE_DIR"  # environment variable, honoured as numba does
 
 
 def sources() -> list[Path]:
-    """The files that are compiled together: this folder, and what it imports of the package."""
-    here = Path(__file__).parent
-    package, found, left = here.parents[1], set(), list(here.glob("*.py"))
-    while left:
-        path = left.pop()
-        if path not in found:
-            found.add(path)
-            for module, names in _IMPORTS.findall(path.read_text(encoding="utf-8")):
-                place = package.joinpath(*module.split("."))
-                files = [place, *(place / name for name in re.findall(r"\w+", names))]
-                left += [file for name in files if (file := name.with_suffix(".py")).is_file()]
-    return sorted(found)
+    """The files on which the machine code may depend: all of ``dynamics``, and of the folders that it may import."""
+    package = Path(__file__).parents[2]
+    return sorted(path for folder in ("contact", "dynamics", "model") for path in (package / folder).rglob("*.py"))
 
 
 def object_file() -> Path:
