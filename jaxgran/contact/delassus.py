@@ -84,10 +84,10 @@ def _(problem: DelassusProblem, grains: int) -> Array:
     matrix = problem.matrix
     if is_sparse(matrix):
         rows, columns, values = entries(matrix)
-        own = _row_sums(matrix, jnp.where(rows == columns, values, 0))
+        entries_on_diagonal = _row_sums(matrix, jnp.where(rows == columns, values, 0))
     else:
-        own = jnp.diagonal(matrix)
-    return jnp.where(own > 0, own, 1)
+        entries_on_diagonal = jnp.diagonal(matrix)
+    return jnp.where(entries_on_diagonal > 0, entries_on_diagonal, 1)
 
 
 @spectral_bound.register

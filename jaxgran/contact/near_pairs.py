@@ -151,9 +151,9 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
     """
     at_rest = Frame(jnp.zeros_like(lists.positions), jnp.zeros_like(lists.tilt))
     nominal = _nominal_skin(NEAR_PAIRS_PER_GRAIN, grains, side)
-    left = lists.outer.skin - consumed_skin(lists.frame, at_rest, 2 * jnp.max(grains.radii) + nominal)
-    left = lax.stop_gradient(left)
-    search = stale & ~(left >= nominal)
+    consumed = consumed_skin(lists.frame, at_rest, 2 * jnp.max(grains.radii) + nominal)
+    remaining = lax.stop_gradient(lists.outer.skin - consumed)
+    search = stale & ~(remaining >= nominal)
 
     def searched() -> tuple:
         positions, tilt = present(lists, side)
@@ -162,7 +162,7 @@ def refresh(lists: PairLists, grains: Grains, side: Array, stale: Bool[Array, ""
 
     kept = lists.outer, lists.frame, lists.positions, lists.tilt
     outer, frame, positions, tilt = lax.cond(any_replica(search), searched, lambda: kept)
-    near = _near_pairs(outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, left)), grains)
+    near = _near_pairs(outer, frame, jnp.minimum(nominal, jnp.where(search, outer.skin, remaining)), grains)
     return where_active(stale, PairLists(outer, near, frame, frame, positions, tilt), lists)
 
 
@@ -199,9 +199,9 @@ def set_bits(words: UInt32[Array, " words"], size: int, length: int) -> Int[Arra
     else:
         running = jnp.cumsum(set_in_word, dtype=jnp.int32)
         word = jnp.searchsorted(running, wanted, side="right", method="scan_unrolled").astype(jnp.int32)
-    found = jnp.minimum(word, count - 1)
-    place = set_bit(taken(words, found), wanted - taken(running - set_in_word, found))
-    return jnp.where(word < count, found * _WORD + place, length)
+    within = jnp.minimum(word, count - 1)
+    place = set_bit(taken(words, within), wanted - taken(running - set_in_word, within))
+    return jnp.where(word < count, within * _WORD + place, length)
 
 
 def _nominal_skin(pairs_per_grain: int, grains: Grains, side: Array) -> Float[Array, ""]:

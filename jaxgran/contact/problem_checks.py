@@ -20,29 +20,35 @@ _BATCH = "a batch of problems is solved by jax.vmap(jaxgran.solve_contacts)"
 _FINITE = "finite numbers"
 
 
-def judged(problem: Any) -> ContactProblem:
-    """The problem with all its numbers in one precision.
+def check_problem(problem: Any) -> None:
+    """Raise an InputError unless this is a contact problem whose shapes fit and whose values can be.
 
-    Raises:
-      InputError: (a ValueError) it is no contact problem, its shapes do not fit, or a value cannot be; see
-        ``solve_contacts``.
+    See ``solve_contacts`` for what is checked.
     """
-    if isinstance(problem, ContactNetwork):
-        ends: Any = np.asarray(problem.ends) if isinstance(problem.ends, (list, tuple)) else problem.ends
-        numbers = map(as_array, (problem.normals, problem.masses, problem.approach))
-        problem = ContactNetwork(ends, *numbers)
-        _require_network(problem)
-        kind = _precision(problem.normals, problem.masses, problem.approach)
-        normals, masses, approach = (jnp.asarray(x, kind) for x in (problem.normals, problem.masses, problem.approach))
-        return ContactNetwork(jnp.asarray(problem.ends, jnp.int32), normals, masses, approach)
+    if not isinstance(problem, ContactNetwork | DelassusProblem):
+        raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}.")
+    arrays = _as_arrays(problem)
+    _require_network(arrays) if isinstance(arrays, ContactNetwork) else _require_delassus(arrays)
+
+
+def as_problem(problem: ContactProblem) -> ContactProblem:
+    """A contact problem that was checked, with all its numbers in one precision."""
+    arrays = _as_arrays(problem)
+    if isinstance(arrays, ContactNetwork):
+        numbers = arrays.normals, arrays.masses, arrays.approach
+        kind = _precision(*numbers)
+        return ContactNetwork(jnp.asarray(arrays.ends, jnp.int32), *(jnp.asarray(x, kind) for x in numbers))
+    matrix, kind = arrays.matrix, _precision(arrays.matrix, arrays.approach)
+    matrix_of_kind = matrix.astype(kind) if is_sparse(matrix) else jnp.asarray(matrix, kind)
+    return DelassusProblem(matrix_of_kind, jnp.asarray(arrays.approach, kind))
+
+
+def _as_arrays(problem: ContactProblem) -> ContactProblem:
+    """The problem with arrays in place of lists."""
     if isinstance(problem, DelassusProblem):
-        problem = DelassusProblem(as_array(problem.matrix), as_array(problem.approach))
-        _require_delassus(problem)
-        matrix = problem.matrix
-        kind = _precision(matrix, problem.approach)
-        matrix = matrix.astype(kind) if is_sparse(matrix) else jnp.asarray(matrix, kind)
-        return DelassusProblem(matrix, jnp.asarray(problem.approach, kind))
-    raise InputError(f"problem must be a ContactNetwork or a DelassusProblem, not {short_repr(problem)}.")
+        return DelassusProblem(as_array(problem.matrix), as_array(problem.approach))
+    ends: Any = np.asarray(problem.ends) if isinstance(problem.ends, (list, tuple)) else problem.ends
+    return ContactNetwork(ends, *map(as_array, (problem.normals, problem.masses, problem.approach)))
 
 
 def require_impulses(problem: ContactProblem, impulses: Any) -> jax.Array:
@@ -81,9 +87,9 @@ def _require_network(network: ContactNetwork) -> None:
         )
     if ends is None:
         return
-    selfish = (lengths > 0) & (ends[:, 0] == ends[:, 1])
-    if np.any(selfish):
-        raise InputError(f"ends must be two different grains, and contact {np.argmax(selfish)} has one grain twice.")
+    same_grain = (lengths > 0) & (ends[:, 0] == ends[:, 1])
+    if np.any(same_grain):
+        raise InputError(f"ends must be two different grains, and contact {np.argmax(same_grain)} has one grain twice.")
     if masses is not None and np.any(held := (lengths > 0) & np.all(np.isinf(masses[ends]), axis=1)):
         raise InputError(f"contact {np.argmax(held)} joins two walls, which no impulse moves: leave it out.")
 
@@ -110,11 +116,11 @@ def _require_delassus(problem: DelassusProblem) -> None:
 def _require_definite(matrix: Any) -> None:
     """Symmetric, with a positive diagonal and no negative eigenvalue, all to rounding."""
     epsilon = float(np.finfo(matrix.dtype).eps) if matrix.dtype.kind == "f" else 0.0
-    own = matrix.diagonal()
-    if not np.all(own > 0):
-        at = int(np.argmin(own))
-        raise InputError(f"matrix must have a positive diagonal, and entry {at} of it is {own[at]:.6g}.")
-    root = np.sqrt(own.astype(float))
+    on_diagonal = matrix.diagonal()
+    if not np.all(on_diagonal > 0):
+        at = int(np.argmin(on_diagonal))
+        raise InputError(f"matrix must have a positive diagonal, and entry {at} of it is {on_diagonal[at]:.6g}.")
+    root = np.sqrt(on_diagonal.astype(float))
     scaled = matrix / root[:, None] / root if isinstance(matrix, np.ndarray) else _scaled(matrix, 1 / root)
     uneven, largest = abs(scaled - scaled.T).max(), abs(scaled).max()
     if uneven > np.sqrt(epsilon):
@@ -122,8 +128,8 @@ def _require_definite(matrix: Any) -> None:
             f"matrix must be symmetric, and entries differ from their mirror images by up to {uneven:.2g} of the "
             "diagonal: give (W + W.T) / 2 if that is rounding."
         )
-    slack = 16 * len(own) * epsilon
-    if largest > 1 + slack or (len(own) <= LARGEST_FACTORED and not _is_definite(scaled, slack)):
+    slack = 16 * len(on_diagonal) * epsilon
+    if largest > 1 + slack or (len(on_diagonal) <= LARGEST_FACTORED and not _is_definite(scaled, slack)):
         raise InputError("matrix must have no negative eigenvalue, as W = H M⁻¹ Hᵀ has none, and this one has.")
 
 

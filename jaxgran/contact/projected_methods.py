@@ -167,7 +167,7 @@ class BarzilaiBorwein(ProjectedMethod):
     """
 
     def init(self, approach: Array) -> Any:
-        return 1.0, -1.0, float("inf")  # step length; momentum, negative until it is Nesterov's; last judged residual
+        return 1.0, -1.0, float("inf")  # step length; momentum, negative until it is Nesterov's; residual a window ago
 
     def propose(self, now: Iterate) -> tuple[Array, Array]:
         stride, k, _ = now.memory
@@ -175,22 +175,27 @@ class BarzilaiBorwein(ProjectedMethod):
         return now.point + momentum / (momentum + 3) * (now.point - now.previous), stride
 
     def learn(self, now: Iterate, start: Array, point: Array, bound: Array, best_residual: Array) -> Any:
-        _, k, before = now.memory
-        judged = now.iterations % WINDOW == WINDOW - 1
-        guarded = (k >= 0) | (judged & ~(best_residual < PROGRESS * before))
+        _, k, last_residual = now.memory
+        window_ends = now.iterations % WINDOW == WINDOW - 1
+        guarded = (k >= 0) | (window_ends & ~(best_residual < PROGRESS * last_residual))
         step, response = point - now.point
-        long = now.iterations % 2 == 1
-        along_step = long | guarded
-        left = jnp.where(along_step, bound * jnp.where(guarded, start[0] - point[0], step), response / bound)
-        own, mixed = dot(left, jnp.where(along_step, step, response)), dot(step, response)
-        over, under = jnp.where(long, own, mixed), jnp.where(long, mixed, own)
-        curved = under > 0
-        stride = jnp.where(curved, jnp.minimum(over / jnp.where(curved, under, 1), LONGEST_STRIDE), LONGEST_STRIDE)
-        momentum = jnp.where(own > 0, 0, jnp.maximum(k, -1) + 1)  # own is the descent along Nesterov's step
+        is_long = now.iterations % 2 == 1
+        along_step = is_long | guarded
+        scaled_step = bound * jnp.where(guarded, start[0] - point[0], step)
+        scaled = jnp.where(along_step, scaled_step, response / bound)
+        # sᵀDs of the long step or (Ws)ᵀD⁻¹Ws of the short one; the descent along the step of Nesterov's method
+        square = dot(scaled, jnp.where(along_step, step, response))
+        curvature = dot(step, response)  # sᵀWs
+        numerator = jnp.where(is_long, square, curvature)
+        denominator = jnp.where(is_long, curvature, square)
+        curved = denominator > 0
+        quotient = numerator / jnp.where(curved, denominator, 1)
+        stride = jnp.where(curved, jnp.minimum(quotient, LONGEST_STRIDE), LONGEST_STRIDE)
+        momentum = jnp.where(square > 0, 0, jnp.maximum(k, -1) + 1)
         return (
             jnp.where(guarded, 1, stride),
             jnp.where(guarded, momentum, -1),
-            jnp.where(judged, best_residual, before),
+            jnp.where(window_ends, best_residual, last_residual),
         )
 
 

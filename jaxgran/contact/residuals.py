@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.contact.delassus import delassus_product, diagonal
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
-from jaxgran.contact.problem_checks import judged, require_impulses
+from jaxgran.contact.problem_checks import as_problem, check_problem, require_impulses
 from jaxgran.contact.projected_methods import dot
 from jaxgran.model.batches import equal_values
 from jaxgran.model.checks import require_number
@@ -76,7 +76,8 @@ def contact_residuals(problem: ContactProblem, impulses: Any, restitution: float
       >>> [float(contact_residuals(pair, jnp.array([p])).natural_map) for p in (1.0, 0.5)]
       [0.0, 0.5]
     """
-    problem = judged(problem)
+    check_problem(problem)
+    problem = as_problem(problem)
     impulses = require_impulses(problem, impulses)
     require_number("restitution", restitution, *RANGES["restitution"])
     return residuals_of(problem, impulses, jnp.asarray(restitution, impulses.dtype))
@@ -88,12 +89,12 @@ def residuals_of(problem: ContactProblem, impulses: Array, restitution: Array) -
     network = isinstance(problem, ContactNetwork)
     operator = as_contacts(problem) if network else problem
     grains = problem.masses.size if network else 0
-    own, one_plus_alpha = diagonal(operator, grains), 1 + restitution
+    w_diagonal, one_plus_alpha = diagonal(operator, grains), 1 + restitution
     after = delassus_product(operator, impulses, grains) + one_plus_alpha * operator.approach
     stopped = one_plus_alpha * jnp.minimum(operator.approach, 0)
-    speed, energy = jnp.sqrt(dot(stopped, stopped)), dot(stopped, stopped / own)
+    speed, energy = jnp.sqrt(dot(stopped, stopped)), dot(stopped, stopped / w_diagonal)
     speed, energy = (jnp.where(x > 0, x, 1) for x in (speed, energy))
-    push, work = own * impulses, impulses * after
+    push, work = w_diagonal * impulses, impulses * after
     least, merged = jnp.minimum(push, after), _fischer_burmeister(push, after)
     found = ContactResiduals(
         natural_map=jnp.sqrt(dot(least, least)) / speed,

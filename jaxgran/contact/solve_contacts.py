@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.problem import ContactNetwork, ContactProblem, as_contacts
-from jaxgran.contact.problem_checks import judged
+from jaxgran.contact.problem_checks import as_problem, check_problem
 from jaxgran.contact.projected_methods import BarzilaiBorwein, ProjectedMethod, require_solver
 from jaxgran.contact.residuals import ContactResiduals, residuals_of
 from jaxgran.contact.solver import solve
@@ -82,7 +82,8 @@ def solve_contacts(
       >>> solution.impulses.round(3).tolist(), solution.velocities.round(3).tolist()
       ([1.333, 0.667], [1.0, 0.0])
     """
-    problem = judged(problem)
+    check_problem(problem)
+    problem = as_problem(problem)
     require_number("restitution", restitution, *RANGES["restitution"])
     require_solver(solver)
     kind: Any = problem.approach.dtype

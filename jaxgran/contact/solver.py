@@ -66,7 +66,7 @@ def solve(
 
     Impulses and response have derivatives with respect to the network, see the module; all else has none.
     """
-    b, own = contacts.approach, diagonal(contacts, grains)
+    b, w_diagonal = contacts.approach, diagonal(contacts, grains)
     bound = solver.bound(contacts, grains)
     closing = jnp.minimum(b, 0)
     scale = jnp.sqrt(dot(closing, closing))
@@ -83,7 +83,7 @@ def solve(
         impulses = jnp.maximum(0, start[0] - step * (start[1] + b) / bound)
         response = delassus_product(contacts, impulses, grains)
         point = jnp.stack([impulses, response])
-        error = jnp.minimum(own * impulses, response + b)
+        error = jnp.minimum(w_diagonal * impulses, response + b)
         residual = jnp.sqrt(dot(error, error))
         better = residual < at.best_residual
         best_residual = jnp.where(better, residual, at.best_residual)
@@ -123,13 +123,13 @@ def solve(
 def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
     contacts, shear_rate, solver, active = primals
     solution = solve(contacts, grains, shear_rate, solver, active)
-    impulses, pressing = solution.impulses, solution.impulses > 0
-    own = diagonal(contacts, grains)
+    impulses, loaded = solution.impulses, solution.impulses > 0
+    w_diagonal = diagonal(contacts, grains)
 
-    def of_pressing(change: Array) -> Array:
+    def loaded_product(change: Array) -> Array:
         """W_AA on the contacts that press, and the identity on the others."""
-        felt = delassus_product(contacts, jnp.where(pressing, change, 0), grains)
-        return jnp.where(pressing, felt, change)
+        felt = delassus_product(contacts, jnp.where(loaded, change, 0), grains)
+        return jnp.where(loaded, felt, change)
 
     def solved(operator, wanted: Array) -> Array:
         change, _ = cg(
@@ -137,7 +137,7 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
             wanted,
             tol=_DERIVATIVE_TOLERANCE,
             maxiter=_DERIVATIVE_ITERATIONS * impulses.size,
-            M=lambda x: x / own,
+            M=lambda x: x / w_diagonal,
         )
         missed = wanted - operator(change)
         good = dot(missed, missed) <= _WORST_DERIVATIVE**2 * dot(wanted, wanted)
@@ -145,8 +145,8 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
 
     change = tangents[0]
     _, response_change = jax.jvp(lambda operator: delassus_product(operator, impulses, grains), (contacts,), (change,))
-    wanted = jnp.where(pressing, -(response_change + change.approach), 0)
-    impulse_change = lax.custom_linear_solve(of_pressing, wanted, solved, symmetric=True)
+    wanted = jnp.where(loaded, -(response_change + change.approach), 0)
+    impulse_change = lax.custom_linear_solve(loaded_product, wanted, solved, symmetric=True)
     none: Any = np.zeros((), jax.dtypes.float0)
     return solution, Solution(
         impulses=impulse_change,
@@ -159,10 +159,10 @@ def _solve_jvp(grains: int, primals: tuple, tangents: tuple) -> tuple[Solution, 
 
 def single_contact(network: Contacts, grains: int) -> Solution:
     """The closed form of a single contact, for which the iteration would need one product."""
-    own = diagonal(network, grains)
-    impulses = jnp.maximum(0, -network.approach / own)
+    w_diagonal = diagonal(network, grains)
+    impulses = jnp.maximum(0, -network.approach / w_diagonal)
     status = jnp.where(jnp.any(jnp.isnan(impulses)), Status.nonfinite, Status.ok).astype(jnp.int32)
-    return Solution(impulses, own * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status)
+    return Solution(impulses, w_diagonal * impulses, jnp.zeros((), impulses.dtype), jnp.int32(1), status)
 
 
 class _Progress(NamedTuple):

@@ -30,7 +30,7 @@ class Observed(NamedTuple):
     """Sums over the time steps so far, a pytree of arrays, and whether the contacts of the present step are in them."""
 
     sums: Any
-    acted: Float[Array, ""]
+    step_observed: Float[Array, ""]
 
 
 def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> Observed:
@@ -60,15 +60,15 @@ def nothing_observed(observe_now: ObserveNow, slots: int, dtype: jnp.dtype) -> O
 
 def with_flight(user_sums: Observed, observe_now: ObserveNow, steps: Array) -> Observed:
     """The sums with a flight of so many steps; where the contacts of its first step acted, that step is in already."""
-    dtype = user_sums.acted.dtype
-    weight = steps.astype(dtype) - user_sums.acted
+    dtype = user_sums.step_observed.dtype
+    weight = steps.astype(dtype) - user_sums.step_observed
     found = without_contacts(observe_now, dtype)
-    return Observed(added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.acted))
+    return Observed(added(user_sums.sums, found, weight), jnp.zeros_like(user_sums.step_observed))
 
 
 def with_contacts(user_sums: Observed, observe_now: ObserveNow, network: Contacts, impulses: Array) -> Observed:
     """The sums with the present step, whose contacts act."""
-    one = jnp.ones_like(user_sums.acted)
+    one = jnp.ones_like(user_sums.step_observed)
     return Observed(added(user_sums.sums, observe_now(network, impulses), one), one)
 
 
