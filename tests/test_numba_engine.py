@@ -1,4 +1,4 @@
-"""The numba engine is compiled anew when any of its sources changes, and runs without a place to keep it."""
+"""The numba engine: a file for each version of its sources, and blocks of steps that are those of one call each."""
 
 import os
 import re
@@ -6,13 +6,20 @@ import shutil
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import jaxlib
+import numpy as np
 import pytest
+from flows import GRAINS
 
 import jaxgran
+from jaxgran.dynamics.advance import advance, advance_blocks
+from jaxgran.dynamics.engine import Numba, Numerics
 from jaxgran.dynamics.numba_engine import ffi, handler
+from jaxgran.dynamics.tally import TABLE
 from jaxgran.files import read_cached, write_cached
 from jaxgran.model.checks import InputError
+from jaxgran.model.flow import ShearFlow
 
 PACKAGE = Path(jaxgran.__file__).parent
 
@@ -110,3 +117,18 @@ def test_a_jaxlib_that_refuses_the_version_of_the_handler_is_an_input_error(monk
     monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
     with pytest.raises(InputError, match=f"engine must be jax with jaxlib {jaxlib.__version__}, not numba: handler"):
         ffi._register.__wrapped__()
+
+
+@pytest.mark.parametrize("packing_fraction", [0.6, 0.8])
+def test_blocks_of_one_call_are_those_of_one_call_each(flowing, packing_fraction: float) -> None:
+    """Up to rounding, as the list of near pairs lasts longer than a block; one block has no step."""
+    flow, state = ShearFlow(GRAINS, 0.6, packing_fraction, 1e-3), flowing(packing_fraction)
+    steps = jnp.asarray([20, 0, 1, 7, 30, 12])
+    end, tallies = advance_blocks(flow, Numerics(engine=Numba()), state, steps)
+    for k, count in enumerate(steps):
+        state, tally = advance(flow, state, count, engine=Numba())
+        for name in TABLE:
+            values = getattr(tallies, name)[k], getattr(tally, name)
+            np.testing.assert_allclose(*values, rtol=1e-8, atol=1e-9, err_msg=f"{name} of block {k}")
+    np.testing.assert_allclose(end.velocities, state.velocities, rtol=1e-8, atol=1e-9)
+    assert float(tallies.collisions.sum()) > 10 and np.all(tallies.wave_kinetic[steps > 0] > 0)
