@@ -6,12 +6,14 @@ the same sums. It differs in what it visits:
 - *Search.* One list of near pairs is found through a grid of cells (``near_pairs``). It is valid as long as the fastest
   pair cannot have crossed its skin.
 - *Fly.* Of every near pair the ``calendar`` knows in which steps it will be a contact. The next step to visit is its
-  smallest entry. Flight moves nothing: positions in the laboratory are r + v t, with t counted from the search.
+  smallest entry. Where an event has few contacts among many pairs, bounds of blocks of the calendar find it. Flight
+  moves nothing: positions in the laboratory are r + v t, with t counted from the search.
 - *Collide.* The contacts of a step fall into clusters. Isolated pairs have a closed form; the others are solved
   cluster by cluster (``cluster_solver``). A cluster in which nothing approaches needs no impulses. Each cluster may
   leave a share of the permitted squared residual that earlier ones have not used, in proportion to its contacts.
 - *Renew the calendar.* An impulse changes the entries of the struck grains' pairs, and no others.
 - *Move.* When a list expires, the grains are moved to their present positions.
+- *Begin a block.* At the end of a block of steps the next row of sums begins, and list and calendar stay.
 - *Suspend.* When the records are full, the loop stops. The next call continues in the same memory, so the trajectory
   and its sums are those of one call, to the bit.
 """
