@@ -138,15 +138,13 @@ def _advance_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, st
 def _blocks_by_numba(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
     """Advance one replica with the numba engine, by blocks of steps."""
     call = call_numba(flow, solver, state, steps)
-    end, last = _end_of(state, call)
-    if steps.size == 1:
-        return end, jax.tree.map(lambda x: x[None], last)
-    energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic[:-1]])
-    before = jax.vmap(lambda sums, **ends: sums.tally(**ends))(
-        jax.tree.map(lambda x: x[:-1], call.sums), energy_change=jnp.diff(energies), momentum_drift=call.drift[:-1]
+    energies = jnp.concatenate([kinetic_energy(state.grains, state.velocities)[None], call.kinetic])
+    tallies = jax.vmap(lambda sums, **ends: sums.tally(**ends))(
+        call.sums, energy_change=jnp.diff(energies), momentum_drift=call.drift
     )
-    last = replace(last, energy_change=last.energy_change - (energies[-1] - energies[0]))
-    return end, jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), before, last)
+    end, last = _end_of(state, call)  # with the energy change of all blocks
+    last = replace(last, energy_change=last.energy_change - (energies[-2] - energies[0]))
+    return end, jax.tree.map(lambda all_blocks, x: all_blocks.at[-1].set(x), tallies, last)
 
 
 def _blocks_by_jax(flow: ShearFlow, solver: ProjectedMethod, state: State, steps: Array) -> tuple[State, Tally]:
