@@ -14,6 +14,8 @@ from jaxgran.model.cell import relative_velocity
 from jaxgran.model.grains import Grains
 from jaxgran.model.indexing import taken
 
+MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Int
 
 from jaxgran.contact.delassus import grain_impulses
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.network import MOST_CONTACTS, Contacts
 from jaxgran.contact.projected_methods import ProjectedMethod
 from jaxgran.dynamics.advance import NumbaCall, call_numba, numba_memory
 from jaxgran.dynamics.engine import Jax, Numerics, select_engine
@@ -53,7 +53,7 @@ def _depends_on_traced(observe: Observe, flow: ShearFlow, state: State) -> bool:
         return without_contacts(partial(observe, flow, state), state.positions.dtype)
 
     # First what it returns is judged: other things than numbers cannot be traced.
-    nothing_observed(partial(observe, flow, state), 3 * flow.grains, state.positions.dtype)
+    nothing_observed(partial(observe, flow, state), MOST_CONTACTS * flow.grains, state.positions.dtype)
     return any(isinstance(x, Tracer) for x in jax.make_jaxpr(found)(flow, state).consts)
 
 
@@ -91,7 +91,7 @@ def _recorded(
 
     dtype = state.positions.dtype
     at_start = partial(observe, flow, state)
-    sums = empty_sums(dtype)._replace(user_sums=nothing_observed(at_start, 3 * flow.grains, dtype).sums)
+    sums = empty_sums(dtype)._replace(user_sums=nothing_observed(at_start, MOST_CONTACTS * flow.grains, dtype).sums)
     memory = jnp.zeros(numba_memory(flow).shape, dtype)
     start = _Progress(jnp.bool_(True), state, sums, jnp.zeros((), dtype), memory)
     end, sums = lax.while_loop(lambda now: now.unfinished, called, start)[1:3]
@@ -111,7 +111,7 @@ def _with_records(
 
     records, count = call.records, call.recorded
     dtype = records.dtype
-    most = 3 * flow.grains  # contacts of discs form a planar graph
+    most = MOST_CONTACTS * flow.grains
     sizes = max(4, flow.grains // _FEW), most
 
     def with_record(k: Array, user_sums: Any) -> Any:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxgran.contact.delassus import grain_impulses
 from jaxgran.contact.near_pairs import bit_words, outer_pairs
-from jaxgran.contact.network import Contacts, Touching, is_contact, pair_motion
+from jaxgran.contact.network import MOST_CONTACTS, Contacts, Touching, is_contact, pair_motion
 from jaxgran.contact.projected_methods import DEFAULT_SOLVER, ProjectedMethod
 from jaxgran.contact.solver import solve
 from jaxgran.dynamics.advance import advance
@@ -31,7 +31,6 @@ from jaxgran.model.flow import ShearFlow, require_strain, steps_of_blocks, steps
 from jaxgran.model.state import State, require_state
 from jaxgran.model.status import Status
 
-MOST_CONTACTS = 3  # of a grain: the contacts of discs form a planar graph
 _MOST_GRAIN_SNAPSHOTS = 10**9  # snapshots times grains of one series; memory is limited
 
 

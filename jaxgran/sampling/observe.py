@@ -14,7 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Array
 
-from jaxgran.contact.network import Contacts
+from jaxgran.contact.network import MOST_CONTACTS, Contacts
 from jaxgran.dynamics.advance import advance
 from jaxgran.dynamics.engine import Numerics
 from jaxgran.dynamics.observed_advance import advance_observed
@@ -50,7 +50,7 @@ def observed_shapes(observe: Observable, flow: ShearFlow) -> Any:
 
     def sums(state: State) -> Any:
         now = partial(_observe_step, observe, flow, state)
-        return nothing_observed(now, 3 * flow.grains, state.positions.dtype).sums
+        return nothing_observed(now, MOST_CONTACTS * flow.grains, state.positions.dtype).sums
 
     return jax.eval_shape(sums, _abstract_state(flow.grains))
 
